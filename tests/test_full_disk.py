@@ -11,7 +11,8 @@ from torch import nn
 
 from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
 from tests.data.lerobot.lerobot_folder import write_version_2
-from torch_denkf.applications.car import read_kitti_drive, with_motion, write_drives, write_trajectory
+from torch_denkf.applications.car import read_kitti_drive, with_motion, write_drives
+from torch_denkf.applications.car.kitti.trajectories import write_trajectory
 from torch_denkf.applications.car.odometry.paths import read_path, write_path
 from torch_denkf.applications.car.odometry.tracking import TrackedBelief
 from torch_denkf.applications.ur5 import UR5ExperienceReplay

@@ -17,7 +17,7 @@ from torch_denkf.applications.car import read_kitti_drive, with_motion
 from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 from torch_denkf.applications.car.kitti.frames import MOTION_KEYS
 from torch_denkf.applications.car.kitti.gaps import steps_between
-from torch_denkf.applications.car.vision import static_region
+from torch_denkf.applications.car.vision.signs import static_region
 from torch_denkf.data.cache import cached
 from torch_denkf.envs import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 

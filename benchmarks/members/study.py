@@ -21,7 +21,7 @@ COLUMNS = Columns(
     whole=("members",),
     order=lambda row: (row["task"], row["filter"], row.get("members", 0)),
 )
-TITLES = {"walks": "ten walks", "lorenz96": "Lorenz-96", "ur5": "UR5 arm", "reacher": "reacher", "wheels": "wheels"}
+TITLES = {"walks": "ten walks", "lorenz96": "Lorenz-96", "ur5": "UR5 arm"}  # others are titled by their name
 DEFAULT = 3.0  # threshold where no validation data choose one
 
 
@@ -30,10 +30,10 @@ class Study:
     """How many members does an ensemble need, with and without localisation by significance?"""
 
     out: Path | None = None  # folder for members.csv, members.md and members.png; rows that are there stay
-    demos: Path = Path("runs/members/ur5")  # of the UR5, collected where they are missing
+    runs: Path = Path("runs/members")  # demos of the UR5 and the trained motion of the manipulator, made where missing
     members: tuple[int, ...] = (8, 16, 32, 64, 128, 256, 512)
     thresholds: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0)  # of which validation data choose one
-    tasks: tuple[str, ...] = ("walks", "reacher", "lorenz96", "wheels", "ur5")
+    tasks: tuple[str, ...] = ("walks", "reacher", "manipulator", "lorenz96", "wheels", "ur5")
     smoke: bool = False  # two small tasks: do they run?
 
 
@@ -44,7 +44,9 @@ def made(study: Study, name: str) -> Task:
     if name == "lorenz96":
         return tasks.lorenz96(*((1, 5) if study.smoke else ()))
     if name == "ur5":
-        return tasks.ur5(study.demos)
+        return tasks.ur5(study.runs / "ur5")
+    if name == "manipulator":
+        return tasks.manipulator(study.runs / name)
     return {"wheels": tasks.wheels, "reacher": tasks.reacher}[name]()
 
 
@@ -125,7 +127,7 @@ def draw(rows: list[dict], study: Study, errors: dict[str, str], file: Path) -> 
             if row["filter"] not in (PLAIN, BELIEVED):
                 above.axhline(row["error"], color="gray", linewidth=1, label=row["filter"])
         below.axhline(90, color="gray", linewidth=1, linestyle=":")
-        above.set(title=TITLES[name], ylabel=errors[name], xscale="log")
+        above.set(title=TITLES.get(name, name), ylabel=errors[name], xscale="log")
         if max(row["error"] for row in own) > 5 * min(row["error"] for row in own):
             above.set_yscale("log")
             above.yaxis.set_major_formatter("{x:g}")

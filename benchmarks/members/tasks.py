@@ -12,6 +12,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from benchmarks.arms.arms import ARMS
+from benchmarks.arms.study import Study, collect, trained
 from benchmarks.common.lorenz96 import lorenz96_step
 from benchmarks.wheels.task import ensemble_filter, gaussian_filter, recordings
 from torch_denkf import DEnKF, Filter, KalmanFilter, from_pretrained
@@ -22,7 +24,7 @@ from torch_denkf.functional.inflation import inflate
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
 
-__all__ = ["Score", "Task", "lorenz96", "reacher", "ur5", "walks", "wheels"]
+__all__ = ["Score", "Task", "lorenz96", "manipulator", "reacher", "ur5", "walks", "wheels"]
 
 LEVEL = 0.9  # of the intervals
 WALKS, WALK_STD, READING_STD = 10, 0.1, 0.5  # walks, each step of one, each reading of one
@@ -174,14 +176,36 @@ def lorenz96(seeds: int = 4, cycles: int = 600, inflations: tuple[float, ...] = 
     return Task("lorenz96", "error of the analysis", score, validate)
 
 
+def manipulator(folder: Path, demos: int = 100, updates: int = 8000) -> Task:
+    """Joint velocities of dm_control's manipulator by the filter of ``benchmarks.arms``, which learned its motion.
+
+    Cosine, sine and velocity of its joints are 24 numbers, of which noisy encoders read 16.
+    """
+    arm = ARMS["manipulator"]
+    shipped = trained(arm, False, Study(demos=demos, motion_updates=updates), folder)
+    test, other = (collect(arm, False, 20, 200, seed) for seed in (1000, 2000))
+
+    def score(data: TensorDict, members: int, threshold: float | None) -> Score:
+        shipped.initial.ensemble_size = members
+        localise(shipped, threshold)
+        return filtered(shipped, data, 1, slice(2 * arm.joints, None))
+
+    return Task("manipulator", "velocities, rad/s", partial(score, test), partial(score, other))
+
+
+def localise(filter: torch.nn.Module, threshold: float | None) -> None:
+    """Switches significance on or off in a filter that is there."""
+    for module in filter.modules():
+        if isinstance(module, EnsembleAnalysis):
+            module.localisation, module.threshold = (None, 3.0) if threshold is None else ("significance", threshold)
+
+
 def resized(filter: Any, members: int, threshold: float | None) -> Any:
     """A filter that comes with the library, with so many members; their noise models stay those of its training."""
     new = type(filter)(replace(filter.settings, ensemble_size=members))
     new.load_state_dict(filter.state_dict())
     new.eval()
-    analyses = [module for module in new.modules() if isinstance(module, EnsembleAnalysis)]
-    for analysis in analyses:
-        analysis.localisation, analysis.threshold = (None, 3.0) if threshold is None else ("significance", threshold)
+    localise(new, threshold)
     return new
 
 

@@ -18,7 +18,8 @@ from benchmarks.kitti.study import rows_of
 from benchmarks.kitti.tables import COLUMNS, by_drive, markdown
 from benchmarks.kitti.training import calibration_error, certain_gain, log_gains, run_filter
 from tests.applications.car.odometry.test_streams import readings
-from torch_denkf.applications.car import PairObservation, dead_reckoning
+from torch_denkf.applications.car import dead_reckoning
+from torch_denkf.applications.car.modules.pairs import PairObservation
 from torch_denkf.applications.car.odometry.streams import all_frames, lose_frames, take_spans
 
 

@@ -14,7 +14,8 @@ from benchmarks.common.lorenz96 import lorenz96_step
 from tests.borders.test_constructors import NAN, refuses
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.particle_for_tests import bootstrap
-from torch_denkf.applications.car import bridge_gaps, track
+from torch_denkf.applications.car import track
+from torch_denkf.applications.car.kitti.gaps import bridge_gaps
 from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
 from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.applications.car.odometry.training import train_car_filter

@@ -10,8 +10,9 @@ import torch
 
 from tests.applications.car.kitti.test_drive import make
 from tests.borders.test_constructors import refused
-from torch_denkf.applications.car import KITTIReplayEnv, bridge_gaps, read_kitti_drive, with_motion
+from torch_denkf.applications.car import KITTIReplayEnv, read_kitti_drive, with_motion
 from torch_denkf.applications.car.kitti.frames import frames_at
+from torch_denkf.applications.car.kitti.gaps import bridge_gaps
 from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.data.times import increasing
 

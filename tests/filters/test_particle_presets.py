@@ -6,8 +6,8 @@ from tensordict import TensorDict
 
 from tests.filters.factories import OBS, M, NoisyLinear, assert_equal, linear_system, toy_frames
 from tests.filters.particle_for_tests import BELIEF, E, bootstrap, toy_parts
-from torch_denkf.applications.car import PairObservation, UnicycleTransition
-from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition
+from torch_denkf.applications.car import UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation
 from torch_denkf.filters import DPF, MixtureParticleFilter, ParticleFilter
 from torch_denkf.modules import (
     AroundState,

@@ -8,9 +8,9 @@ import torch
 from torch.distributions import MultivariateNormal
 
 from tests.functional.checks import Shapes, assert_refused
-from torch_denkf.functional import analyse, ensemble_anomalies, ensemble_mean, kalman_update
+from torch_denkf.functional import analyse, ensemble_mean, kalman_update
 from torch_denkf.functional.inflation import random_rotation
-from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.moments import ensemble_anomalies, ensemble_cov
 
 SCHEMES = ["sensor", "perturbed", "etkf", "sakov"]
 SPACES = ["observation", "ensemble"]

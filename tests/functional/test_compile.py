@@ -6,7 +6,6 @@ from tests.functional.checks import assert_compiled_is_eager
 from torch_denkf.functional import (
     crps_ensemble,
     energy_score,
-    ensemble_anomalies,
     ensemble_mean,
     ensemble_var,
     kalman_predict,
@@ -14,7 +13,7 @@ from torch_denkf.functional import (
 )
 from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.functional.inflation import inflate, relax_to_prior_spread
-from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.moments import ensemble_anomalies, ensemble_cov
 
 
 def everything(ensemble, target, observed):

@@ -8,6 +8,7 @@ from torch_denkf.functional.linalg import (
     inverse_square_root,
     inverse_square_root_difference,
     semidefinite_root,
+    semidefinite_solve,
 )
 
 # Eigenvalues with repetitions, zeros, and eight decades between them.
@@ -103,3 +104,10 @@ def test_gradient_of_a_root_is_that_of_a_root(float64):
     square = lambda cov: semidefinite_root(cov) @ semidefinite_root(cov).mT  # noqa: E731
     _, moved = torch.autograd.functional.jvp(square, some @ some.mT, direction)
     torch.testing.assert_close(moved, direction, rtol=1e-10, atol=1e-10)
+
+
+def test_what_is_solved_keeps_its_dtype_under_another_default(float64):
+    cov = torch.tensor([[4.0, 1.0], [1.0, 2.0]], dtype=torch.float32)
+    solution = semidefinite_solve(cov, torch.eye(2, dtype=torch.float32))
+    expected = torch.tensor([[2.0, -1.0], [-1.0, 4.0]], dtype=torch.float32) / 7  # the inverse by hand
+    torch.testing.assert_close(solution, expected, rtol=0, atol=1e-5)  # the ridge is 2.4e-6

@@ -10,7 +10,7 @@ import torch
 
 from tests.functional.checks import assert_compiled_is_eager
 from tests.functional.jaxlie_values import FILE
-from torch_denkf.functional.angles import wrap_angle
+from torch_denkf.functional.angles import wrap_angles
 from torch_denkf.functional.manifolds import (
     SE2,
     SE3,
@@ -389,10 +389,10 @@ def test_means_of_numbers_and_angles():
     members, weights = torch.randn(3, 7, 2), torch.rand(3, 7).softmax(-1)
     assert Euclidean(2).mean(members).equal(members.mean(-2))
     torch.testing.assert_close(Euclidean(2).mean(members, weights), torch.einsum("be,bep->bp", weights, members))
-    across = wrap_angle(torch.tensor([[3.0], [3.4], [3.5]]))
-    torch.testing.assert_close(Circle().mean(across), wrap_angle(torch.tensor([3.3])), **EXACT)
+    across = wrap_angles(torch.tensor([[3.0], [3.4], [3.5]]))
+    torch.testing.assert_close(Circle().mean(across), wrap_angles(torch.tensor([3.3])), **EXACT)
     torch.testing.assert_close(
-        Circle().mean(across, torch.tensor([0.5, 0.25, 0.25])), wrap_angle(torch.tensor([3.225])), **EXACT
+        Circle().mean(across, torch.tensor([0.5, 0.25, 0.25])), wrap_angles(torch.tensor([3.225])), **EXACT
     )
     one = points(SE3(), 5, 1)
     assert_same_points(SE3(), SE3().mean(one), one.squeeze(-2))

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from tests.functional.checks import assert_refused
-from torch_denkf.functional import ensemble_anomalies, ensemble_mean, ensemble_var
-from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.moments import ensemble_anomalies, ensemble_cov
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])

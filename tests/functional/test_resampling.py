@@ -12,12 +12,11 @@ from torch_denkf.functional import (
     crps_ensemble,
     crps_weighted,
     ensemble_var,
-    jitter_copies,
     soft_resample,
     systematic_resample,
     transport_resample,
 )
-from torch_denkf.functional.resampling import effective_sample_size
+from torch_denkf.functional.resampling import effective_sample_size, jitter_copies
 from torch_denkf.functional.weighted import weighted_mean, weighted_median, weighted_var
 
 pytestmark = pytest.mark.usefixtures("float64")

@@ -8,7 +8,7 @@ import torch
 from scipy import stats
 
 from tests.functional.checks import assert_refused
-from torch_denkf.functional import wrap_angle
+from torch_denkf.functional import wrap_angles
 from torch_denkf.metrics import pit, spread_skill_ratio
 from torch_denkf.metrics.calibration import ensemble_interval, histogram_band, rank_histogram, spread_error
 
@@ -77,7 +77,7 @@ def test_a_particle_counts_as_often_as_its_weight_says(angles):
     weights = (often / 6).log().expand(500, 6)
     if angles:
         for part in (members, repeated, truth):
-            part[..., 0] = wrap_angle(part[..., 0] + 3)
+            part[..., 0] = wrap_angles(part[..., 0] + 3)
     counts = rank_histogram(members, truth, log_weight=weights, angles=angles)
     torch.testing.assert_close(counts, rank_histogram(repeated, truth, angles=angles))
     torch.testing.assert_close(counts, rank_histogram(members, truth, log_weight=weights + 7, angles=angles))

@@ -45,6 +45,6 @@ def test_gradients_go_through_wrapped_angles():
 
 def test_errors_say_what_to_do():
     assert_refused(ValueError, "for ensembles pass the mean", state_errors, torch.zeros(4, 8, 3), torch.zeros(4, 3))
-    with pytest.raises(IndexError, match="dimension 3 of a state of 3"):
+    with pytest.raises(ValueError, match="angles are components of 3"):
         state_errors(torch.zeros(4, 3), torch.zeros(4, 3), angles=(3,))
     assert_refused(ValueError, "no states", state_errors, torch.zeros(0, 3), torch.zeros(0, 3))

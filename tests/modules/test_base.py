@@ -10,7 +10,8 @@ from tensordict import TensorDict, unravel_key
 from torch import nn
 
 from tests.functional.checks import assert_refused
-from torch_denkf.applications.car import PairObservation, UnicycleMotion, UnicycleTransition
+from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import PairObservation
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,

@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from tests.filters.factories import has_compiler
-from torch_denkf.applications.car import PairObservation, UnicycleTransition
-from torch_denkf.applications.car.modules.pairs import ClonedTransition
+from torch_denkf.applications.car import UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import ClonedTransition, PairObservation
 from torch_denkf.fusion.parts import JoinedObservation, StateObservation
 from torch_denkf.inductor import options_for_processors
 from torch_denkf.modules import (

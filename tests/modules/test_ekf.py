@@ -8,8 +8,8 @@ from torch import nn
 
 from tests.filters.factories import NoisyLinear
 from tests.filters.gaussian_for_tests import directional_check
-from torch_denkf.applications.car import PairObservation, UnicycleTransition
-from torch_denkf.applications.car.modules.pairs import ClonedTransition
+from torch_denkf.applications.car import UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import ClonedTransition, PairObservation
 from torch_denkf.functional import kalman_update
 from torch_denkf.modules import (
     ConstantNoise,

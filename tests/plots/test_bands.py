@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import DT, ensemble_run, kalman_runs
-from torch_denkf.functional import wrap_angle
+from torch_denkf.functional import wrap_angles
 from torch_denkf.plots import plot_bands
 
 NORMAL_90 = 1.6448536
@@ -118,7 +118,7 @@ def test_each_component_is_shaded_by_its_own_sensors_mask():
 def test_angles_stay_beside_the_mean():
     rng = torch.Generator().manual_seed(0)
     theta = torch.linspace(0, 9, 30)
-    wrap = wrap_angle
+    wrap = wrap_angles
     ensemble = theta[:, None, None] + 0.1 * torch.randn(30, 19, 1, generator=rng)
     belief = {"mean": wrap(ensemble.mean(1)), "ensemble": wrap(ensemble)}
     run = TensorDict({"belief": belief, "state": wrap(theta).unsqueeze(-1)}, [30])

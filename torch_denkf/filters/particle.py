@@ -45,8 +45,7 @@ class ParticleFilter(Filter):
         epsilon: regularisation of transport.
         ess_threshold: share of E; only where fewer particles are effective it is resampled. ``None`` always does.
         jitter: regularised particle filter: the copies that resampling makes are moved apart by a Gaussian kernel of
-            this many times the usual width, see :func:`~torch_denkf.functional.jitter_copies`. For motions with little
-            noise of their own, or none.
+            this many times the usual width. For motions with little noise of their own, or none.
         initial: the initial belief, which also fixes the number of particles; weights are added where it has none.
         process_noise: Q of the motion, beside the transition's own noise: standard deviations ``[S]`` (a number for
             all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.

@@ -20,43 +20,34 @@ def check_angles(angles: Sequence[int], size: int) -> None:
         raise ValueError(f"angles are components of {size}, 0 to {size - 1}; got {strange} in {list(angles)}")
 
 
-def wrap_angle(angle: Tensor) -> Tensor:
-    """Bring angles to [-π, π).
+def wrap_angles(values: Tensor, angles: Sequence[int] | None = None) -> Tensor:
+    """Brings angles to [-pi, pi).
 
     Args:
-        angle: in rad, any shape.
+        values: ``[*, N]``, or of any shape if all are angles.
+        angles: the components that are angles in radians; ``None`` for all, none if empty.
 
     Returns:
-        The same directions in [-π, π), in rad.
+        The same directions, of the same shape.
+
+    Raises:
+        ValueError: if one of ``angles`` is no component.
 
     Examples:
-        >>> wrap_angle(torch.tensor([0.5, 4.0, -4.0]))
+        >>> wrap_angles(torch.tensor([0.5, 4.0, -4.0]))
         tensor([ 0.5000, -2.2832,  2.2832])
-    """
-    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
-
-
-def wrap_angles(difference: Tensor, angles: Sequence[int]) -> Tensor:
-    """Wraps some components of differences to [-pi, pi).
-
-    Args:
-        difference: ``[*, N]``.
-        angles: the components that are angles in radians.
-
-    Returns:
-        ``[*, N]``.
-
-    Examples:
         >>> wrap_angles(torch.tensor([6.0, 6.0]), [1])
         tensor([ 6.0000, -0.2832])
     """
-    if not angles:
-        return difference
-    check_angles(angles, difference.shape[-1])
-    wrapped = wrap_angle(difference)
-    is_angle = torch.zeros(difference.shape[-1], dtype=torch.bool, device=difference.device)
+    if angles is not None and not len(angles):
+        return values
+    wrapped = torch.remainder(values + math.pi, 2 * math.pi) - math.pi
+    if angles is None:
+        return wrapped
+    check_angles(angles, values.shape[-1])
+    is_angle = torch.zeros(values.shape[-1], dtype=torch.bool, device=values.device)
     is_angle[list(angles)] = True
-    return torch.where(is_angle, wrapped, difference)
+    return torch.where(is_angle, wrapped, values)
 
 
 def align_angles(

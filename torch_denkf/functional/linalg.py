@@ -95,7 +95,7 @@ def _correlation(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     std = variance.clamp(min=0).sqrt()
     inverse = torch.where(std > 0, 1 / torch.where(std > 0, std, 1), 0)
     ridge = 10 * dim * torch.finfo(cov.dtype).eps
-    diagonal = torch.where(std > 0, ridge, 1 + ridge).diag_embed()
+    diagonal = ((std <= 0).to(std) + ridge).diag_embed()
     # A variance of less than zero is not taken for one of zero, unless it is round-off beside the largest.
     negative = (variance < -ridge * variance.abs().amax(-1, keepdim=True)).any(-1, keepdim=True)
     std, inverse = torch.where(negative, torch.nan, std), torch.where(negative, torch.nan, inverse)

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_count
-from torch_denkf.functional.angles import wrap_angle
+from torch_denkf.functional.angles import wrap_angles
 
 __all__ = [
     "SE2",
@@ -229,7 +229,7 @@ class Circle(Space):
 
     def compose(self, first, second):
         """The sum, wrapped."""
-        return wrap_angle(first + second)
+        return wrap_angles(first + second)
 
     def inverse(self, point):
         """The negative."""
@@ -237,11 +237,11 @@ class Circle(Space):
 
     def exp(self, tangent):
         """The angle, wrapped."""
-        return wrap_angle(tangent)
+        return wrap_angles(tangent)
 
     def log(self, point):
         """The angle, wrapped."""
-        return wrap_angle(point)
+        return wrap_angles(point)
 
     def right_jacobian(self, tangent):
         """One."""
@@ -257,11 +257,11 @@ class Circle(Space):
 
     def normalise(self, point):
         """The angle, wrapped."""
-        return wrap_angle(point)
+        return wrap_angles(point)
 
     def _between(self, points, weights):
         first = points[..., :1, :]
-        return super()._between(first + wrap_angle(points - first), weights)
+        return super()._between(first + wrap_angles(points - first), weights)
 
 
 @dataclass(frozen=True)
@@ -279,7 +279,7 @@ class SE2(Space):
     def compose(self, first, second):
         """The second pose, seen from the first one's axes."""
         return torch.cat(
-            [wrap_angle(first[..., :1] + second[..., :1]), _turn(first, second[..., 1:]) + first[..., 1:]], -1
+            [wrap_angles(first[..., :1] + second[..., :1]), _turn(first, second[..., 1:]) + first[..., 1:]], -1
         )
 
     def inverse(self, point):
@@ -291,11 +291,11 @@ class SE2(Space):
         """Where a constant twist leads: an arc."""
         along, across = self._arc(tangent[..., :1])
         x, y = tangent[..., 1:2], tangent[..., 2:]
-        return torch.cat([wrap_angle(tangent[..., :1]), along * x - across * y, across * x + along * y], -1)
+        return torch.cat([wrap_angles(tangent[..., :1]), along * x - across * y, across * x + along * y], -1)
 
     def log(self, point):
         """The twist that leads there."""
-        angle = wrap_angle(point[..., :1])
+        angle = wrap_angles(point[..., :1])
         along, across = self._arc(angle)
         size = along.square() + across.square()
         x, y = point[..., 1:2], point[..., 2:]
@@ -329,11 +329,11 @@ class SE2(Space):
 
     def normalise(self, point):
         """The angle, wrapped."""
-        return torch.cat([wrap_angle(point[..., :1]), point[..., 1:]], -1)
+        return torch.cat([wrap_angles(point[..., :1]), point[..., 1:]], -1)
 
     def _between(self, points, weights):
         angles, first = points[..., :1], points[..., :1, :1]
-        return super()._between(torch.cat([first + wrap_angle(angles - first), points[..., 1:]], -1), weights)
+        return super()._between(torch.cat([first + wrap_angles(angles - first), points[..., 1:]], -1), weights)
 
     @staticmethod
     def _arc(angle: Tensor) -> tuple[Tensor, Tensor]:

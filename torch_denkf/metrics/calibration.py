@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_denkf.functional import wrap_angle
+from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.metrics.state import known_tangents, mean_of_known, state_difference
 
@@ -153,8 +153,8 @@ def ensemble_interval_coverage(
         One share a state dimension, ``[S]``.
 
     Raises:
-        ValueError: if the shapes do not fit, or if ``level`` is not in (0, 1) or more than the members can tell.
-        IndexError: if ``angles`` names no dimension.
+        ValueError: if the shapes do not fit, or if ``level`` is not in (0, 1) or more than the members can tell,
+            or if ``angles`` names no dimension.
 
     Reference:
         Hyndman & Fan 1996, "Sample quantiles in statistical packages", Am. Stat. 50, definition 6.
@@ -266,8 +266,7 @@ def rank_histogram(
         Counts, ``[S, E+1]`` float64; each row sums to the number of states in ``*B``.
 
     Raises:
-        ValueError: if the shapes do not fit, or if a value is not finite.
-        IndexError: if ``angles`` names no dimension.
+        ValueError: if the shapes do not fit, if a value is not finite, or if ``angles`` names no dimension.
 
     Reference:
         Hamill 2001, "Interpretation of rank histograms for verifying ensemble forecasts", Mon. Weather Rev. 129.
@@ -406,10 +405,7 @@ def _around_mean(
         sine, cosine = ((count * part).mean(-2) for part in (ensemble.sin(), ensemble.cos()))
         centre[..., dim] = torch.atan2(sine[..., dim], cosine[..., dim])
     offset = state_difference(truth, centre, angles=angles)
-    members = ensemble - centre.unsqueeze(-2)
-    for dim in angles:
-        members[..., dim] = wrap_angle(members[..., dim].clone())
-    return members, offset
+    return wrap_angles(ensemble - centre.unsqueeze(-2), angles), offset
 
 
 def _check_variance(variance: Tensor, error: Tensor) -> None:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_denkf.functional import wrap_angle
+from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.manifolds import Space, check_space, places_of, whole_parts
 
 __all__ = ["StateErrors", "known_tangents", "mean_of_known", "rotation_error", "state_difference", "state_errors"]
@@ -51,8 +51,7 @@ def state_difference(
         The differences, ``[*B, S]``; angles in [-π, π). Of points of a space the tangents, ``[*B, D]``.
 
     Raises:
-        ValueError: if the shapes differ, or for angles beside a space.
-        IndexError: if there is no such dimension.
+        ValueError: if the shapes differ, for angles beside a space, or if there is no such dimension.
 
     Examples:
         >>> import torch
@@ -67,12 +66,7 @@ def state_difference(
     check_space(space, angles)
     if space is not None:
         return space.minus(estimated, truth)
-    difference = estimated - truth
-    for dim in angles:
-        if not -truth.shape[-1] <= dim < truth.shape[-1]:
-            raise IndexError(f"angles names dimension {dim} of a state of {truth.shape[-1]} dimensions")
-        difference[..., dim] = wrap_angle(difference[..., dim].clone())
-    return difference
+    return wrap_angles(estimated - truth, angles)
 
 
 def state_errors(
@@ -94,8 +88,7 @@ def state_errors(
         A :class:`StateErrors`; NaN in a dimension whose truth is nowhere known.
 
     Raises:
-        ValueError: if the shapes differ or there are no states.
-        IndexError: if ``angles`` names no dimension.
+        ValueError: if the shapes differ, there are no states, or ``angles`` names no dimension.
 
     Examples:
         >>> import torch

@@ -21,10 +21,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.functional import jitter_copies, soft_resample, systematic_resample, transport_resample
+from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
 from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.functional.resampling import effective_sample_size
+from torch_denkf.functional.resampling import effective_sample_size, jitter_copies
 from torch_denkf.functional.weighted import weighted_innovation, weighted_mean, weighted_var
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
@@ -85,7 +85,7 @@ class ResampledTransition(SubModel):
         iterations: of Sinkhorn in transport.
         ess_threshold: share of E; only where fewer particles are effective it is resampled. ``None`` always does.
         jitter: moves copies apart by a Gaussian kernel of this many times the usual width; 0 for none. For
-            ``"systematic"`` and ``"soft"``; see :func:`~torch_denkf.functional.jitter_copies`.
+            ``"systematic"`` and ``"soft"``; see ``jitter_copies`` in ``functional/resampling.py``.
         log_weight_key: log-weights of the belief ``[*B, E]``.
         out_log_weight_key: log-weights of the forecast ``[*B, E]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` of the frame that is moved to.

@@ -239,9 +239,8 @@ class FilterLoss(Checked, LossModule):
             check_dims("dims", dims, once=True)
             if not len(dims):
                 raise ValueError("dims names the dimensions of the state that count; got none. Pass None for all.")
+        space = filter.structure.space if space is None else space
         check_space(space, angles)
-        if space is None and not len(angles):
-            space = filter.structure.space
         if space is not None and dims is not None and max(dims) >= space.tangent_dim:
             raise ValueError(
                 f"dims={list(dims)} names component {max(dims)} of tangents of {space.tangent_dim}, from 0."

@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torch_denkf.functional import wrap_angle
+from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.metrics.calibration import ensemble_interval
 from torch_denkf.plots._axes import (
@@ -203,7 +203,7 @@ def _edges(
 
 def _unwrap(angle: Tensor) -> Tensor:
     out, known = angle.clone(), angle[angle.isfinite()]
-    out[angle.isfinite()] = torch.cat([known[:1], known[:1] + wrap_angle(known.diff()).cumsum(0)])
+    out[angle.isfinite()] = torch.cat([known[:1], known[:1] + wrap_angles(known.diff()).cumsum(0)])
     return out
 
 
@@ -220,7 +220,7 @@ def _turns(drawn: Sequence[Tensor | None], column: int) -> list[int]:
 def _beside(values: Tensor, mean: Tensor, angular: list[bool]) -> Tensor:
     """The values; angles brought within π of the mean."""
     turned = torch.tensor(angular)
-    return torch.where(turned, mean + wrap_angle(values - mean), values)
+    return torch.where(turned, mean + wrap_angles(values - mean), values)
 
 
 def _outages(seen: Tensor, seconds: np.ndarray, gap: float | None) -> np.ndarray:

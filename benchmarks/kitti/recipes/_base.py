@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from benchmarks.common.recipes import Recipe, Registry
 from benchmarks.kitti.folds import VELOCITIES, Statistics
-from torch_denkf.applications.car import FlowSensor, PairObservation, UnicycleTransition
+from torch_denkf.applications.car import FlowSensor, UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import PairObservation
 from torch_denkf.filters import Filter
 from torch_denkf.modules import DiagonalNoise, StochasticMLP, SubModel
 

@@ -16,8 +16,10 @@ from benchmarks.reliability.target import Subject, Target, targets_of
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.particle_for_tests import bootstrap
 from torch_denkf import envs, objectives
-from torch_denkf.applications.car import KITTIReplayEnv, OpticalFlow, Updates, bridge_gaps, track
+from torch_denkf.applications.car import KITTIReplayEnv, OpticalFlow, track
+from torch_denkf.applications.car.kitti.gaps import bridge_gaps
 from torch_denkf.applications.car.odometry.filter import car_filter
+from torch_denkf.applications.car.odometry.training import Updates
 from torch_denkf.applications.car.vision.camera import CanonicalCamera
 from torch_denkf.data import Episode, EpisodeReplay
 from torch_denkf.functional import sigma_points

@@ -19,7 +19,7 @@ from benchmarks.reliability.case import apart, workshop
 from benchmarks.reliability.damage import finite, gone, in_lines, leaves, on_row, same, same_but
 from benchmarks.reliability.target import Folder, Subject, Target, targets_of
 from tests.data.recordings.own_files import SIZE, write_csv, write_images, write_video
-from torch_denkf.applications.car import write_trajectory
+from torch_denkf.applications.car.kitti.trajectories import write_trajectory
 from torch_denkf.data import Images, LeRobotReplay, Recording, RecordingReplay, Table, Video
 from torch_denkf.data.lerobot.rows import recording_from_rows
 

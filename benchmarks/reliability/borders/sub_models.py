@@ -13,8 +13,8 @@ from benchmarks.reliability import damage as d
 from benchmarks.reliability.borders.filters_made import IMAGE_SHAPE, SIGMA
 from benchmarks.reliability.target import Subject, Target, targets_of
 from torch_denkf import modules as m
-from torch_denkf.applications.car import FlowSensor, PairObservation, UnicycleMotion, UnicycleNoise, UnicycleTransition
-from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, with_history
+from torch_denkf.applications.car import FlowSensor, UnicycleMotion, UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, with_history
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.modules.keypoints import SpatialSoftArgmax
 from torch_denkf.modules.noise import MemberGain

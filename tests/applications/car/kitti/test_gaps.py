@@ -4,16 +4,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.applications.car import (
-    KITTIReplayEnv,
-    OpticalFlow,
-    bridge_gaps,
-    read_kitti_drive,
-    with_motion,
-    write_drives,
-)
+from torch_denkf.applications.car import KITTIReplayEnv, OpticalFlow, read_kitti_drive, with_motion, write_drives
 from torch_denkf.applications.car.kitti.frames import frames_at
-from torch_denkf.applications.car.kitti.gaps import steps_between
+from torch_denkf.applications.car.kitti.gaps import bridge_gaps, steps_between
 
 
 def searched(valid, longest):

@@ -7,7 +7,7 @@ from evo.core import metrics, sync
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 
-from torch_denkf.applications.car import write_trajectory
+from torch_denkf.applications.car.kitti.trajectories import write_trajectory
 
 READERS = {"kitti": file_interface.read_kitti_poses_file, "tum": file_interface.read_tum_trajectory_file}
 TIMES = 0.103 * torch.arange(60, dtype=torch.float64)

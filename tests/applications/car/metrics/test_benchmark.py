@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from tests.applications.car.metrics.paths_for_tests import evo_errors, straight, winding
-from torch_denkf.applications.car import kitti_endpoint_error, kitti_pathlength_error
-from torch_denkf.functional import wrap_angle
+from torch_denkf.applications.car import kitti_endpoint_error
+from torch_denkf.applications.car.metrics.benchmark import kitti_pathlength_error
+from torch_denkf.functional import wrap_angles
 
 
 @pytest.mark.parametrize("window", [1, 37, 100])
@@ -83,5 +84,5 @@ def test_pathlength_error_sums_the_steps_of_each_path():
 def test_wrapped_headings_are_the_callers_matter():
     truth = straight(101)
     truth[:, 2] = torch.linspace(3.0, 3.3, 101)
-    estimated = torch.cat([truth[:, :2], wrap_angle(truth[:, 2:])], -1)
+    estimated = torch.cat([truth[:, :2], wrap_angles(truth[:, 2:])], -1)
     torch.testing.assert_close(kitti_pathlength_error(estimated, truth).rotation.item(), 3.6)

@@ -8,7 +8,7 @@ import torch
 
 from tests.real_data import KITTI
 from torch_denkf.applications.car import dead_reckoning, kitti_endpoint_error
-from torch_denkf.functional import wrap_angle
+from torch_denkf.functional import wrap_angles
 
 POSES = KITTI / "poses"
 
@@ -164,7 +164,7 @@ def test_dead_reckoning_takes_batches_and_gradients():
 
 def test_wrapped_angles_keep_their_direction():
     angle = torch.linspace(-20, 20, 1001, dtype=torch.float64)
-    wrapped = wrap_angle(angle)
+    wrapped = wrap_angles(angle)
     assert wrapped.min() >= -math.pi
     assert wrapped.max() < math.pi
     torch.testing.assert_close(torch.polar(torch.ones(()).double(), wrapped).imag, angle.sin())
@@ -204,7 +204,7 @@ def test_true_velocities_leave_only_the_sideways_motion_of_the_camera(sequence, 
     # at most their sum: each window's error is below its mean |slip|, weighted with length.
     moved = truth[1:, :2] - truth[:-1, :2]
     heading = truth[:-1, 2] + velocities[1:, 1] * dt / 2
-    slip = wrap_angle(torch.atan2(moved[:, 1], moved[:, 0]) - heading).abs()
+    slip = wrap_angles(torch.atan2(moved[:, 1], moved[:, 0]) - heading).abs()
     length = moved.norm(dim=-1)
     limit = (slip * length).unfold(0, 100, 1).sum(-1) / length.unfold(0, 100, 1).sum(-1)
     counts = ~error.window_translation.isnan()

@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 
-from torch_denkf.applications.car import PairObservation, UnicycleMotion, UnicycleNoise, UnicycleTransition
-from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, with_history
+from torch_denkf.applications.car import UnicycleMotion, UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, with_history
 from torch_denkf.filters import EKF, DEnKF
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select, SubModel
 
@@ -150,11 +150,12 @@ def test_the_way_over_a_gap_is_that_of_the_corrected_steps(float64):
 
 def test_what_is_out_of_reach_is_not_read(float64):
     frames = frames_of(torch.full((4, 2), 9.0), [0, 0, 0, 3])
+    frames["state"] = torch.tensor([0.0, 0.0, 0.0, 9.0, 0.1]).expand(4, 5)
     torch.manual_seed(0)
     far = pair_filter(16, reach=[10.0, torch.inf]).sequence(frames.copy())
     torch.manual_seed(0)
     blind = pair_filter(16).sequence(frames.copy().set("observed", torch.zeros(4, 1, dtype=torch.bool)))
-    assert not far["forecast", "observed"][-1].any()  # 3 x 4 m/s
+    assert not far["forecast", "observed"][-1].any()  # 3 x 9 m/s, known to about 1 m/s each
     assert far["belief", "ensemble"].equal(blind["belief", "ensemble"])
 
 
@@ -166,6 +167,18 @@ def test_neighbours_are_read_however_fast_the_filter_believes_itself(float64):
     out = pair_filter(32, reach=[10.0, torch.inf]).sequence(frames)
     assert out["forecast", "observed"][1:].all()
     assert abs(float(out["belief", "mean"][-1, 3]) - 4.0) < 2.0  # far within the 10 m/s of the reach
+
+
+def test_a_slow_camera_is_read_again_when_the_car_slows_down(float64):
+    """What the filter hardly knows may be within reach: else a speed that is believed too large stays for ever."""
+    frames = frames_of(torch.full((91, 2), 6.0) * torch.tensor([1.0, 0.0]), [0] + [0, 0, 3] * 30)
+    frames["state"] = torch.tensor([0.0, 0.0, 0.0, 9.0, 0.0]).expand(91, 5)  # believed; in truth 3 x 2 m/s
+    torch.manual_seed(0)
+    out = pair_filter(64, reach=[10.0, torch.inf]).sequence(frames)
+    read = out["forecast", "observed"].squeeze(-1)
+    assert not read[3]
+    assert read[60::3].all()
+    assert abs(float(out["belief", "mean"][-1, 3]) - 2.0) < 1.0
 
 
 def test_steps_equal_the_sequence(float64):

@@ -6,8 +6,8 @@ import cv2
 import pytest
 import torch
 
-from torch_denkf.applications.car import Updates, read_kitti_drive, write_drives
-from torch_denkf.applications.car.odometry.training import train_car_filter
+from torch_denkf.applications.car import read_kitti_drive, write_drives
+from torch_denkf.applications.car.odometry.training import Updates, train_car_filter
 
 cv2.setNumThreads(1)
 SIZE = (25, 75)

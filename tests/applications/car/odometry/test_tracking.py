@@ -10,7 +10,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.applications.car import bridge_gaps, read_frames, read_kitti_drive, track, with_motion
+from torch_denkf.applications.car import read_frames, read_kitti_drive, track, with_motion
+from torch_denkf.applications.car.kitti.gaps import bridge_gaps
 from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.applications.car.odometry.tracking import _Clock

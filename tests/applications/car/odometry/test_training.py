@@ -8,7 +8,6 @@ import torch
 from tensordict import TensorDict
 
 from tests.applications.car.odometry.conftest import OPTIONS
-from torch_denkf.applications.car import Updates
 from torch_denkf.applications.car.odometry.batches import ReadingSampler
 from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
 from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter, markdown_table, write_rows
@@ -16,7 +15,7 @@ from torch_denkf.applications.car.odometry.filter import CarSettings, car_filter
 from torch_denkf.applications.car.odometry.roles import assign_roles
 from torch_denkf.applications.car.odometry.scores import calibrate
 from torch_denkf.applications.car.odometry.streams import Drive, all_frames, lose_frames, read_spans, take_spans
-from torch_denkf.applications.car.odometry.training import train_car_filter
+from torch_denkf.applications.car.odometry.training import Updates, train_car_filter
 from torch_denkf.pretrained import from_pretrained
 from torch_denkf.training import FilterTrainer
 

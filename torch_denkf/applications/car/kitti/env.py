@@ -32,7 +32,7 @@ class KITTIReplayEnv(RowsEnv):
     ``flow``     ``[*B,3,h,w]``   float32, where the drive has it: see :func:`torch_denkf.applications.car.with_motion`
     ``road``     ``[*B,p,s]``     float32, where the drive has it
     ``observed`` ``[*B,1]``       bool: frames t and t-1 are both there; what is missing is zero in the pixels
-    ``steps``    ``[*B,1]``       int64, where the drive has it: see :func:`torch_denkf.applications.car.bridge_gaps`
+    ``steps``    ``[*B,1]``       int64, where the drive has it: see ``kitti.gaps.bridge_gaps``
     ``state``    ``[*B,5]``       float32, the truth: x m, y m, θ rad, v m/s, θ_dot rad/s (backward differences)
     ``is_init``  ``[*B,1]``       bool: an episode starts here
     ``time``     ``[*B,1]``       float64, s, as the drive counts it

@@ -30,7 +30,7 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
     ``state``    ``[*B,5]``       float32, see :func:`torch_denkf.applications.car.read_kitti_drive`
     ``observed`` ``[*B,1]``       bool: both frames are there, so that the difference means something
     ``steps``    ``[*B,1]``       int64, where the drive has it: steps between the two frames, which then need not be
-                                  neighbours, see :func:`torch_denkf.applications.car.bridge_gaps`
+                                  neighbours, see ``kitti.gaps.bridge_gaps``
     ``time``     ``[*B,1]``       float64, s
     ============ ================ ====================================================================================
 

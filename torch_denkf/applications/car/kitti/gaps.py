@@ -18,7 +18,7 @@ def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
     Without it a missing frame blinds two pairs of neighbours. What comes after,
     :func:`torch_denkf.applications.car.kitti.frames.frames_at`, :func:`torch_denkf.applications.car.with_motion` and
     :class:`torch_denkf.applications.car.KITTIReplayEnv`, then takes differences and optical flow over those pairs; a
-    filter that knows what they mean has a :class:`torch_denkf.applications.car.PairObservation`.
+    filter that knows what they mean has a :class:`torch_denkf.applications.car.modules.pairs.PairObservation`.
 
     Args:
         drive: as :func:`torch_denkf.applications.car.read_kitti_drive` gives it, batch size ``[N]``.

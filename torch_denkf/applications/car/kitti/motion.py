@@ -46,7 +46,7 @@ def with_motion(
     :func:`torch_denkf.applications.car.vision.epipolar.two_view_motion`.
 
     All are zero in rows whose image, or the one before, is missing; after
-    :func:`torch_denkf.applications.car.bridge_gaps` the one before is the last that is there. They cost 9 ms a frame at
+    ``kitti.gaps.bridge_gaps`` the one before is the last that is there. They cost 9 ms a frame at
     50 x 150 pixels and 25 ms at 125 x 414 and are kept in the cache, under a key made of the images themselves.
 
     Args:
@@ -58,7 +58,7 @@ def with_motion(
         two_view: also track corners, for a sensor that reads them; 12 ms a frame at 125 x 414 pixels.
         signs: whether the images' signs of a failing camera are added.
         repair: whether the flow is continued over what stands still before the moving camera, see
-            :func:`torch_denkf.applications.car.vision.static_region`: dirt, or a box.
+            ``vision.signs.static_region``: dirt, or a box.
 
     Returns:
         A shallow copy of the drive, with these entries.

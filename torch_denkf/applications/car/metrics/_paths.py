@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_denkf.functional.angles import wrap_angle
+from torch_denkf.functional.angles import wrap_angles
 
 
 def check_paths(estimated: Tensor, truth: Tensor) -> None:
@@ -38,7 +38,7 @@ def relative_pose_error(start: Tensor, end: Tensor, true_start: Tensor, true_end
     motion, true_motion = end - start, true_end - true_start
     moved = _rotate(motion[..., :2], true_start[..., 2] - start[..., 2])
     distance = torch.linalg.vector_norm(moved - true_motion[..., :2], dim=-1)
-    return distance, wrap_angle(motion[..., 2] - true_motion[..., 2]).abs()
+    return distance, wrap_angles(motion[..., 2] - true_motion[..., 2]).abs()
 
 
 def _rotate(vectors: Tensor, angle: Tensor) -> Tensor:

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from torch_denkf.applications.car.metrics._paths import check_paths, relative_pose_error, step_lengths
-from torch_denkf.functional import wrap_angle
+from torch_denkf.functional import wrap_angles
 
-__all__ = ["EndpointError", "dead_reckoning", "kitti_endpoint_error", "wrap_angle"]
+__all__ = ["EndpointError", "dead_reckoning", "kitti_endpoint_error"]
 
 
 class EndpointError(NamedTuple):
@@ -101,7 +101,7 @@ def kitti_endpoint_error(
         )
     else:
         difference = estimated[..., last, :] - truth[..., last, :]
-        distance, angle = torch.linalg.vector_norm(difference[..., :2], dim=-1), wrap_angle(difference[..., 2]).abs()
+        distance, angle = torch.linalg.vector_norm(difference[..., :2], dim=-1), wrap_angles(difference[..., 2]).abs()
     length = step_lengths(truth).unfold(-1, window, stride).sum(-1)
     counts = length >= min_length
     windows = counts.sum(-1)

@@ -17,6 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_values
+from torch_denkf.functional import ensemble_var
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
 from torch_denkf.modules._running import check_module, reads, run_module
@@ -72,13 +73,14 @@ class PairObservation(SubModel):
 
     Args:
         reach: largest speed and turn rate of a whole pair ``[2]`` (m/s, rad/s) that the sensor can read, on both sides
-            of zero: where the forecast's mean says more over a gap, the frame counts as not observed.
+            of zero: where the forecast says more over a gap, by two standard deviations, the frame counts as not
+            observed.
         curve: h, what the sensor reads at a true sum ``[*, 2]``, for one that hedges; by default the sum itself.
         in_key: forecast ensemble ``[*B, E, 5]``, or with the past ``[*B, E, 5 + 2L]``.
         history_key: see :func:`with_history`; ``None`` where the past is part of the state, see
             :class:`ClonedTransition`.
         steps_key: optional number of steps n between the frames ``[*B, 1]``, int; 0 where there is no pair, 1 where
-            the key is not there. :func:`torch_denkf.applications.car.bridge_gaps` counts them.
+            the key is not there. ``kitti.gaps.bridge_gaps`` counts them.
         observed_key: optional mask ``[*B, 1]``.
         out_key: predicted observations ``[*B, E, 2]``.
         clone_key: forecast and history side by side, ``[*B, E, 5 + 2L]``.
@@ -125,8 +127,12 @@ class PairObservation(SubModel):
         history = history[0] if history else forecast[..., 5:].unflatten(-1, (-1, 2))
         past = within_pair(steps, history)
         way = forecast[..., 3:5] + torch.where(past, history, 0.0).sum(-2)
-        # Neighbours are always read: a filter that believes itself too fast would otherwise stay blind.
-        within_reach = (way.mean(-2).abs() <= self.reach).all(-1, keepdim=True)
+        # Neighbours are always read, and so is what the forecast knows little of: a filter that believes itself too
+        # fast would otherwise stay blind.
+        least = way.mean(-2).abs()
+        if way.shape[-2] > 1:  # an extended Kalman filter asks at one point
+            least = least - 2 * ensemble_var(way).sqrt()
+        within_reach = (least <= self.reach).all(-1, keepdim=True)
         readable = within_reach | ~past.flatten(-2).any(-1)
         for value in (steps, observed):
             if value is not None:

@@ -86,7 +86,7 @@ def track(
         black_level: a frame counts as missing if it is black all over: at most a thousandth of its pixels is brighter
             than this grey value, of 255. No street looks like that, not even at night. ``None`` checks nothing.
         repair: whether the flow is continued over what stands still before the moving camera, see
-            :func:`torch_denkf.applications.car.vision.static_region`.
+            ``vision.signs.static_region``.
         seed: of the filter's noise.
 
     Returns:

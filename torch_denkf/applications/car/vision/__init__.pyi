@@ -1,9 +1,6 @@
-from .signs import PICTURE_SIGNS, flow_signs, picture_signs, plane_distance, static_region
+from .signs import PICTURE_SIGNS, picture_signs
 
 __all__ = [
     "PICTURE_SIGNS",
-    "flow_signs",
     "picture_signs",
-    "plane_distance",
-    "static_region",
 ]

@@ -34,7 +34,7 @@ def image_motion(
         calibration: (fx, fy, cx, cy) in pixels of the images.
         height: of the camera over the road, in m.
         hidden: where something hides the street in both images, ``[H, W]``, bool, see
-            :func:`torch_denkf.applications.car.vision.static_region`: pictures and flow are continued over it from
+            ``vision.signs.static_region``: pictures and flow are continued over it from
             around it. ``None`` for nowhere.
 
     Returns:
