@@ -110,5 +110,7 @@ def _cell(rows: Sequence[dict]) -> str:
     if not rows:
         return ""
     (row,) = rows
+    if row["joint_mae_deg"] > 180:
+        return "diverges"
     threshold = f" ({row['threshold']:g})" if row.get("threshold") else ""
     return f"{row['joint_mae_deg']:.2f} / {row['ee_mae_cm']:.2f} / {row['coverage90']:.0%}{threshold}"
