@@ -11,12 +11,14 @@ from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import report
 from benchmarks.ur5.frontier import draw
 from benchmarks.ur5.limits import run
+from benchmarks.ur5.members import run as members
 from benchmarks.ur5.pictures import draw_all
 from benchmarks.ur5.study import Study, rows_of, run_all
 from benchmarks.ur5.tables import COLUMNS, markdown
 from benchmarks.ur5.training import Budget
 
-AFTERWARDS = {"pictures": lambda study: draw_all(study.out), "frontier": draw, "limits": run}  # of a table's folder
+# What reads a table's folder.
+AFTERWARDS = {"pictures": lambda study: draw_all(study.out), "frontier": draw, "limits": run, "members": members}
 
 
 def smoke(study: Study) -> Study:
@@ -26,7 +28,9 @@ def smoke(study: Study) -> Study:
     demos = {"size": 32, "demos": 12, "frames": 2, "sequences": 10, "real": 10, "real_train": 9, "steps": 30}
     budget = Budget(sensor=3, fine_tuning=2, motion=5, filter=2, end_to_end=1, length=6, batch=4)
     folders = {"root": folder / "demos", "out": folder / "out"}
-    return replace(study, sensors=("glimpse", "paper"), sizes=(4, 8), budget=budget, pasted=6, **demos, **folders)
+    return replace(
+        study, sensors=("glimpse", "paper"), sizes=(4, 8), members=4, budget=budget, pasted=6, **demos, **folders
+    )
 
 
 def main() -> None:

@@ -41,15 +41,19 @@ class Study(Collections):
 
     collect: demos into --root. table: collect what is missing, train, test. pictures: videos and plots of what a table
     left in --out. frontier: error against milliseconds a step of the filters that a table left there. limits: how far
-    simple filters get on its sensors' readings. What was broken off goes on where it stopped. See the README beside.
+    simple filters get on its sensors' readings. members: DEnKFs that are trained with few members, by localisation.
+    What was broken off goes on where it stopped. See the README beside.
     """
 
-    command: Positional[Literal["collect", "table", "pictures", "frontier", "limits"]] = "table"
+    command: Positional[Literal["collect", "table", "pictures", "frontier", "limits", "members"]] = "table"
     filters: some_of(sorted(FILTERS)) = tuple(sorted(FILTERS))
     sensors: some_of(sorted(SENSORS)) = ("glimpse", "paper")
     trainings: some_of(TRAININGS) = TRAININGS
     seeds: tuple[int, ...] = (0,)
     sizes: tuple[int, ...] = (4, 8, 16, 32, 64, 128, 256, 512, 1024)  # of the ensemble, for one row each
+    localisations: tuple[str, ...] = ("factors", "significance")  # that members trains with
+    members: int = 64  # that members trains with
+    threshold: float = 1.5  # of significance in these trainings
     processes: int = 1  # that collect
     budget: OmitArgPrefixes[Budget] = field(default_factory=Budget)
     smoke: bool = False  # a tiny run of everything
@@ -164,9 +168,9 @@ class Base:
         read = self.preset.state_of(reading["sensor", "ensemble"].mean(-2), truth[..., WRIST])
         return (read - truth).square().mean((0, 1)).sqrt()
 
-    def train(self, name: str) -> tuple[UR5Recipe, Filter, Path]:
-        """Trains a filter, or reads it."""
-        recipe, out = self.recipe(name), self.study.out / "filters" / f"{name}-{self.name}"
+    def train(self, name: str, recipe: UR5Recipe | None = None) -> tuple[UR5Recipe, Filter, Path]:
+        """Trains a filter, or reads it; by default that of the name's recipe."""
+        recipe, out = recipe or self.recipe(name), self.study.out / "filters" / f"{name}-{self.name}"
         begin = None if self.parent is None else self.parent.train(name)[1]
         tune = [self.codes("tune"), self.codes("tune", "salt_and_pepper")]
         validation = self.codes("validation")

@@ -16,10 +16,9 @@ from benchmarks.common.training import fit_filter
 from benchmarks.ur5.demos import JOINTS
 from benchmarks.ur5.readings import Windows, read_all, read_head, with_missing
 from benchmarks.ur5.recipes import UR5Recipe
-from benchmarks.ur5.sensors import MEMBERS, Preset, unit_of
+from benchmarks.ur5.sensors import unit_of
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble
-from torch_denkf.modules import ImageSensor
 from torch_denkf.training import Stage
 from torch_denkf.training.parts import parameters_without
 
@@ -72,14 +71,15 @@ def joint_coverage(out: TensorDict) -> Tensor:
 class WithHead(nn.Module):
     """The filter's objective with the sensor's head in front, and the head's own beside it."""
 
-    def __init__(self, objective: nn.Module, sensor: ImageSensor, preset: Preset):
+    def __init__(self, objective: nn.Module, recipe: UR5Recipe):
         super().__init__()
-        self.objective, self.sensor, self.preset = objective, sensor, preset
-        self.register_buffer("unit", unit_of(preset.dim))
+        self.objective, self.sensor, self.preset = objective, recipe.sensor, recipe.preset
+        self.size = recipe.ensemble_size
+        self.register_buffer("unit", unit_of(self.preset.dim))
 
     def forward(self, codes: TensorDict) -> dict[str, Tensor]:
         """All terms, of windows ``[B, T]`` of features."""
-        windows = read_head(self.sensor, codes, MEMBERS)
+        windows = read_head(self.sensor, codes, self.size)
         own = crps_ensemble(windows["sensor", "ensemble"], self.preset.observe(codes["state"])) / self.unit
         return {**self.objective(windows), "loss_sensor": 0.5 * own[codes["observed"].squeeze(-1)].mean()}
 
@@ -122,11 +122,12 @@ def train_filter(
     share, rate = (1, 1.0) if begin is None else (3, 0.2)
 
     def read() -> TensorDict:
-        return with_missing(read_all(sensor, validation, MEMBERS))
+        return with_missing(read_all(sensor, validation, recipe.ensemble_size))
 
     def stages() -> list[Stage]:
         windows = Windows(tune, budget.length, recipe.start_std)
-        frozen = Windows([read_all(sensor, part, MEMBERS, seed + 1) for part in tune], budget.length, recipe.start_std)
+        read_once = [read_all(sensor, part, recipe.ensemble_size, seed + 1) for part in tune]
+        frozen = Windows(read_once, budget.length, recipe.start_std)
         objective, clean = recipe.loss(recipe.behind(model, training=True)), read()
         head = list(sensor.module["head"].parameters())
         # R knows how wrong the sensor is on new demos; on those that it is now trained on it would forget.
@@ -142,7 +143,7 @@ def train_filter(
             ),
             Stage(
                 "end_to_end",
-                WithHead(objective, sensor, recipe.preset),
+                WithHead(objective, recipe),
                 lambda generator, _: windows.sample(generator, budget.batch, max(budget.length // 2, 2)),
                 max(budget.end_to_end // share, 1),
                 parameters=[*head, *rest],

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from tensordict import TensorDict
 from benchmarks.common.arms import AtRest, WithBias
 from benchmarks.ur5.evaluation import errors
 from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
+from benchmarks.ur5.members import KINDS, recipe_of, thresholds_of
 from benchmarks.ur5.motion import ERRORS, FADING, SIZE, ArmMotion, BiasedReading, open_loop, with_rates
 from benchmarks.ur5.readings import read_head
 from benchmarks.ur5.recipes import FILTERS
@@ -222,6 +224,25 @@ def test_localisation_keeps_covariances_and_the_gripper_apart():
     assert (state[gripper][:, [0, 1, 2, 3, 4, 5, 7, 8, 9]] == 0).all()
     assert (state[gripper, 6] == 1).all()
     assert torch.equal(localisation(24)[0], state[:24])
+
+
+def test_each_localisation_is_what_the_page_calls_it():
+    def made(name, size):
+        preset = SENSORS["keypoints"]
+        return FILTERS[name](preset.build(FACTS, 4), preset, FACTS, ArmMotion(FACTS), ERRORS, size)
+
+    found = {}
+    for kind in KINDS:
+        thresholds = thresholds_of(kind, 8)
+        analysis = recipe_of(SimpleNamespace(recipe=made), kind, thresholds[-1], 8).modules()["analysis"]
+        found[kind] = (thresholds, analysis.state_taper is not None, analysis.significance)
+    able = [1.0, 1.5, 2.0]  # 3 standard deviations are more than 8 members can show
+    assert found == {
+        "none": ([None], False, None),
+        "factors": ([None], True, None),
+        "significance": (able, False, 2.0),
+        "both": (able, True, 2.0),
+    }
 
 
 def test_a_head_on_features_is_the_sensor_on_pictures():

@@ -37,9 +37,12 @@ class DEnKF(UR5Recipe):
 
     Attributes:
         scheme: of the update: trained with ``"sensor"``, it may be run with another one on the samples' mean.
+        factors: whether covariances are weakened as :func:`localisation` has it.
+        threshold: of the localisation by significance; ``None`` for none.
     """
 
-    scheme = "sensor"
+    scheme, factors = "sensor", True
+    threshold: float | None = None
 
     def modules(self):
         return OrderedDict(
@@ -47,7 +50,13 @@ class DEnKF(UR5Recipe):
             transition=NoisyTransition(self.transition(), self.process_noise(), self.noisy, before=True),
             near=NearForecast(self.preset),
             observation=self.observation(),
-            analysis=EnsembleAnalysis(self.scheme, taper=localisation(self.size), observation_key=NEAR),
+            analysis=EnsembleAnalysis(
+                self.scheme,
+                taper=localisation(self.size) if self.factors else None,
+                localisation=None if self.threshold is None else "significance",
+                threshold=self.threshold or 3.0,
+                observation_key=NEAR,
+            ),
         )
 
     def belief(self, std, state_key):
