@@ -43,6 +43,7 @@ class Study:
     data: Path = Path("../shared/data")  # with kitti_inertial/0027.npz and kitti/poses/07.txt
     out: Path | None = None  # folder for sequence07.csv, sequence07.md and sequence07.png
     seed: int = 0
+    ukf: bool = False  # also the unscented filter, whose figures are the extended one's
     smoke: bool = False  # a few rows and filters: does it run?
 
 
@@ -200,7 +201,9 @@ def main() -> None:
     poses = truth(study.data, count)
     data = readings(study.data, "0027", CONDITIONS, count, study.seed)
     rows, paths, claims = [], {}, {}
-    models = [("EKF", "EKF", "RTS smoother", {}), ("UKF", "UKF", "", {})]
+    models = [("EKF", "EKF", "RTS smoother", {})]
+    if study.ukf:
+        models.append(("UKF", "UKF", "", {}))
     for members, smoother in ((32, ""), (64, "EnRTS, 64 members")):
         options = {"members": members, "localisation": "significance"}
         models.append((f"DEnKF, {members} members", "DEnKF", smoother, options))
