@@ -648,6 +648,10 @@ def test_what_is_refused():
     lasting = {"a": FusedSensor(LinearObservation(H), R, sensor_error=FadingBias([1.0] * 2, 5.0))}
     with pytest.raises(ValueError, match="needs a transition of ensembles"):
         FusedFilter(LinearTransition(F, Q), lasting, initial=moments)
+    with pytest.raises(ValueError, match="need process_noise"):
+        FusedFilter(NoisyLinear(F), lasting, initial=moments)
+    with pytest.raises(TypeError, match="is a FadingBias, or None; got float"):
+        FusedFilter(NoisyLinear(F), {"a": replace(lasting["a"], sensor_error=1.0)}, initial=members)
     own = {"a": FusedSensor(LinearObservation(H), R, analysis=EKF)}
     with pytest.raises(ValueError, match="analysis of their own"):
         FusedFilter(NoisyLinear(F), own, initial=members, joint=True)

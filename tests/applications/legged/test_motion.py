@@ -10,7 +10,8 @@ from torch_denkf.applications.legged import QUADRUPED, LeggedNoises, legged_filt
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.applications.legged.motion import LeggedMotion, LeggedSpace
 from torch_denkf.applications.legged.readings import FeetInBody, FeetRates
-from torch_denkf.functional.manifolds import SO3, rotation_matrix, skew
+from torch_denkf.functional.manifolds import SO3, rotation_matrix, skew, whole_parts
+from torch_denkf.metrics.state import rotation_error
 
 DT, GRAVITY = 0.01, torch.tensor([0.0, 0.0, -9.81])
 
@@ -44,6 +45,23 @@ def test_a_step_turns_the_world():
     moved = space.plus(point, torch.cat([turn, torch.zeros(15)]))
     expected = [-2.0, 1, 3, -5, 4, 6, 7, 8, 9, 10, 11, 12, -14, 13, 15]
     torch.testing.assert_close(moved[4:], torch.tensor(expected))
+
+
+def test_labels_may_be_of_some_vectors_alone():
+    """Their errors are those of the whole state; of a foot without an orientation there is none."""
+    space, (base, truth) = LeggedSpace(2), LeggedSpace(2).exp(torch.randn(2, 21))
+    whole = space.minus(base, truth)
+    for lost, told in ((16, range(15)), (5, [0, 1, 2, *range(6, 21)]), (11, [*range(10), *range(11, 21)])):
+        part = truth.clone()
+        part[lost : 22 if lost == 16 else lost + 1] = torch.nan
+        points, tangents = whole_parts(space, ~part.isnan())
+        assert tangents.nonzero().flatten().tolist() == list(told)
+        found = space.minus(base, torch.where(points, truth, space.neutral(truth)))
+        torch.testing.assert_close(found[tangents], whole[tangents])
+    no_turn = torch.arange(22) > 0
+    assert whole_parts(space, no_turn)[1].nonzero().flatten().tolist() == list(range(9, 15))
+    angle = rotation_error(space.plus(truth, 0.5 * torch.eye(21)[1]), truth, space=space)
+    torch.testing.assert_close(angle.deg2rad(), torch.tensor([0.5]))
 
 
 @pytest.mark.parametrize("seed", [0, 1])
