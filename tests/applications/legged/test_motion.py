@@ -8,7 +8,7 @@ import torch
 
 from torch_denkf.applications.legged import QUADRUPED, LeggedNoises, legged_filter, quadruped_env
 from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.applications.legged.motion import LeggedMotion, LeggedSpace
+from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, LeggedSpace
 from torch_denkf.applications.legged.readings import FeetInBody, FeetRates
 from torch_denkf.functional.manifolds import SO3, rotation_matrix, skew, whole_parts
 from torch_denkf.metrics.state import rotation_error
@@ -82,6 +82,18 @@ def test_errors_move_alike_wherever_the_mean_is(seed):
     expected[3:6, :3], expected[6:9, :3] = DT * skew(GRAVITY), DT**2 / 2 * skew(GRAVITY)
     expected[6:9, 3:6] = DT * torch.eye(3)
     torch.testing.assert_close(found[rows][:, rows], expected, rtol=0, atol=1e-9)
+
+
+def test_noise_is_that_of_steps_in_the_sensors_axes():
+    """For a mean and a covariance what an ensemble draws, to first order, wherever the mean is."""
+    torch.manual_seed(0)
+    space, stands = LeggedSpace(2), torch.tensor([True, False])
+    state = space.exp(torch.randn(space.tangent_dim))
+    drawn, cov = (LeggedMotionNoise(2, DT, LeggedNoises(), ensemble=both).double() for both in (True, False))
+    step = lambda tangent: space.minus(drawn.space.plus(state, tangent), state)  # noqa: E731
+    jacobian = torch.func.jacrev(step)(torch.zeros(space.tangent_dim))
+    expected = jacobian @ drawn.compute(stands).diag() @ jacobian.mT
+    torch.testing.assert_close(cov.compute(state, stands), expected, rtol=0, atol=1e-12)
 
 
 def test_a_turn_of_the_world_is_not_seen_in_what_feet_say():
