@@ -14,7 +14,7 @@ from torch.testing import assert_close
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check
-from torch_denkf.filters import EKF, DEnKF, Filter
+from torch_denkf.filters import EKF, DEnKF, Filter, KalmanFilter
 from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.functional import wrap_angles
 from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
@@ -620,6 +620,25 @@ def test_errors_that_last_in_an_ensemble(float64):
     assert_close(out["var"], cov.diagonal(dim1=-2, dim2=-1), rtol=0.05, atol=0)
 
 
+def test_each_component_of_a_reading_has_its_own_error(float64):
+    """Of the second sensor, behind the error of the first: one Kalman filter of all three readings is the oracle."""
+    F, Q, H, _ = linear_system()
+    h, r, start = torch.cat([H[:1], H]), torch.tensor([0.5, 0.7, 0.9]), (torch.ones(2), torch.eye(2))
+    errors = [FadingBias(*given, trainable=False) for given in (([0.8], 6.0), ([1.5, 0.4], [20.0, 2.0]))]
+    sensors = {
+        "one": FusedSensor(LinearObservation(h[:1]), r[:1], sensor_error=errors[0]),
+        "pair": FusedSensor(LinearObservation(h[1:]), r[1:], sensor_error=errors[1]),
+    }
+    fused = FusedFilter(NoisyLinear(F), sensors, initial=MomentPrior(*start), process_noise=known_noise())
+    both = FadingBias([0.8, 1.5, 0.4], [6.0, 20.0, 2.0], trainable=False)
+    whole = KalmanFilter(F, h, process_noise_cov=Q, noise=r, mean=start[0], cov=start[1], sensor_error=both)
+    y = torch.randn(B, T, 3)
+    out = fused.sequence(TensorDict({"one": y[..., :1], "pair": y[..., 1:]}, [B, T]))
+    expected = whole.sequence(TensorDict({"observation": y}, [B, T]))
+    for key in BELIEF:
+        assert_close(out[key], expected[key], rtol=0, atol=1e-10)
+
+
 def test_what_is_refused():
     F, Q, H, R = linear_system(torch.float32)
     moments, members = MomentPrior(torch.zeros(2), torch.eye(2)), GaussianPrior([0.0] * 2, [1.0] * 2, ensemble_size=4)
@@ -648,6 +667,10 @@ def test_what_is_refused():
     lasting = {"a": FusedSensor(LinearObservation(H), R, sensor_error=FadingBias([1.0] * 2, 5.0))}
     with pytest.raises(ValueError, match="needs a transition of ensembles"):
         FusedFilter(LinearTransition(F, Q), lasting, initial=moments)
+    with pytest.raises(ValueError, match="need process_noise"):
+        FusedFilter(NoisyLinear(F), lasting, initial=moments)
+    with pytest.raises(TypeError, match="is a FadingBias, or None; got float"):
+        FusedFilter(NoisyLinear(F), {"a": replace(lasting["a"], sensor_error=1.0)}, initial=members)
     own = {"a": FusedSensor(LinearObservation(H), R, analysis=EKF)}
     with pytest.raises(ValueError, match="analysis of their own"):
         FusedFilter(NoisyLinear(F), own, initial=members, joint=True)

@@ -60,6 +60,7 @@ class Space:
 
     point_dim: int
     tangent_dim: int
+    _angles = 0  # leading numbers of a tangent that are a rotation
 
     def compose(self, first: Tensor, second: Tensor) -> Tensor:
         """The product of two points ``[*, P]``."""
@@ -134,6 +135,11 @@ class Space:
         away = points - points[..., :1, :]
         away = away.mean(-2, keepdim=True) if weights is None else (weights.unsqueeze(-1) * away).sum(-2, keepdim=True)
         return points[..., :1, :] + away
+
+    def _whole(self, known: Tensor) -> tuple[Tensor, Tensor]:
+        """What :func:`whole_parts` says of a space that is no product."""
+        known = known.all(-1, keepdim=True)
+        return known.expand(*known.shape[:-1], self.point_dim), known.expand(*known.shape[:-1], self.tangent_dim)
 
     def perturb(self, point: Tensor, std: Tensor, noise: Tensor) -> Tensor:
         """A random point ``[*, P]``: standard normal ``noise`` ``[*, D]`` times standard deviations ``[*, D]`` away."""
@@ -215,6 +221,9 @@ class Euclidean(Space):
         """The mean."""
         return self.mean(points, weights)
 
+    def _whole(self, known):
+        return known, known
+
 
 @dataclass(frozen=True)
 class Circle(Space):
@@ -225,7 +234,7 @@ class Circle(Space):
         tensor([-0.2832])
     """
 
-    point_dim = tangent_dim = 1
+    point_dim = tangent_dim = _angles = 1
 
     def compose(self, first, second):
         """The sum, wrapped."""
@@ -275,6 +284,7 @@ class SE2(Space):
     """
 
     point_dim = tangent_dim = 3
+    _angles = 1
 
     def compose(self, first, second):
         """The second pose, seen from the first one's axes."""
@@ -346,6 +356,7 @@ class _RotationAndVectors(Space):
     """A rotation and K vectors that it turns; the point is (quaternion, vectors), the tangent (rotation, vectors)."""
 
     vectors: int
+    _angles = 3
 
     @property
     def point_dim(self) -> int:  # type: ignore[override]
@@ -532,6 +543,10 @@ class Opposite(Space):
     def tangent_dim(self) -> int:  # type: ignore[override]
         """D."""
         return self.part.tangent_dim
+
+    @property
+    def _angles(self) -> int:  # type: ignore[override]
+        return self.part._angles
 
     def compose(self, first, second):
         """The second, then the first."""
@@ -747,10 +762,9 @@ def places_of(space: Space) -> list[Place]:
         if isinstance(part, Product):
             todo = [*part.parts, *todo]
             continue
-        group = part.part if isinstance(part, Opposite) else part
-        angles = 3 if isinstance(group, _RotationAndVectors) else int(isinstance(group, (Circle, SE2)))
         ends = point + part.point_dim, tangent + part.tangent_dim
-        places.append(Place(part, slice(point, ends[0]), slice(tangent, ends[1]), slice(tangent, tangent + angles)))
+        turn = slice(tangent, tangent + part._angles)
+        places.append(Place(part, slice(point, ends[0]), slice(tangent, ends[1]), turn))
         point, tangent = ends
     return places
 
@@ -772,14 +786,9 @@ def whole_parts(space: Space, known: Tensor) -> tuple[Tensor, Tensor]:
     """
     points, tangents = [], []
     for place in places_of(space):
-        own = known[..., place.point]
-        if isinstance(place.space, Euclidean):
-            points.append(own)
-            tangents.append(own)
-        else:
-            own = own.all(-1, keepdim=True)
-            points.append(own.expand(*own.shape[:-1], place.space.point_dim))
-            tangents.append(own.expand(*own.shape[:-1], place.space.tangent_dim))
+        whole, told = place.space._whole(known[..., place.point])
+        points.append(whole)
+        tangents.append(told)
     return torch.cat(points, -1), torch.cat(tangents, -1)
 
 

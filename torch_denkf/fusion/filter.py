@@ -31,11 +31,13 @@ from torch_denkf.modules import (
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition
 from torch_denkf.modules._running import check_module, declared, writes
-from torch_denkf.modules.bias import biased_parts
+from torch_denkf.modules.bias import FadingBias, biased_parts
 from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, with_past
 from torch_denkf.smoothers.past_moments import CrossTransition
 
 __all__ = ["FusedFilter"]
+
+_NO_NOISE = "A mean and a covariance need process_noise=..., standard deviations [S] or a module."
 
 
 class FusedFilter(Filter):
@@ -198,7 +200,11 @@ def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:
 
 def _with_errors(transition, process_noise, initial, sensors):
     """Transition, process noise, initial belief and sensors of the state with the sensors' lasting errors behind it."""
-    total = sum(len(sensor.sensor_error) for sensor in sensors.values() if sensor.sensor_error is not None)
+    given = [sensor.sensor_error for sensor in sensors.values() if sensor.sensor_error is not None]
+    for error in given:
+        if not isinstance(error, FadingBias):
+            raise TypeError(f"sensor_error is a FadingBias, or None; got {type(error).__name__}")
+    total = sum(map(len, given))
     if not total:
         return transition, process_noise, initial, sensors
     if isinstance(transition, LinearTransition | GaussianTransition):
@@ -206,6 +212,8 @@ def _with_errors(transition, process_noise, initial, sensors):
             f"sensor_error needs a transition of ensembles and process_noise=...; {type(transition).__name__} moves a "
             "mean and a covariance. LearnedTransition(torch.nn.Linear(...), residual=False) is a linear one."
         )
+    if process_noise is None and _is_gaussian(initial):
+        raise ValueError(_NO_NOISE)
     made, begin = {}, 0
     for name, sensor in sensors.items():
         observation, end = sensor.observation, begin
@@ -232,7 +240,7 @@ def _moving(transition, process_noise, initial, gaussian):
         return transition
     if process_noise is None:
         if gaussian:
-            raise ValueError("A mean and a covariance need process_noise=..., standard deviations [S] or a module.")
+            raise ValueError(_NO_NOISE)
         return transition
     noise, space = as_process_noise(process_noise, initial), declared(initial).space
     made = EKFTransition if gaussian else NoisyTransition

@@ -66,3 +66,19 @@ def test_a_real_humanoid_walks():
 def test_an_unknown_kind_is_refused():
     with pytest.raises(ValueError, match="kind is"):
         legged_filter(quadruped_env().model, **QUADRUPED, dt=0.01, kind="Kalman")
+
+
+@pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
+def test_a_start_without_acceleration_is_level(kind):
+    """A first row that is rejected does not spoil the run; without reject it is an error."""
+    env = quadruped_env(seed=0)
+    log = trotting(env, 3).select("imu", "joints", "joint_rates", "contact").unsqueeze(0)
+    log["imu"][:, 0] = torch.nan
+    options = {**QUADRUPED, "dt": env.dt, "kind": kind, "ensemble_size": 8}
+    out = filtered(legged_filter(env.model, **options, reject=True), log)
+    assert out[VELOCITY].isfinite().all()
+    start = legged_filter(env.model, **options, reject=True).initialise(log[:, 0].clone())["legs", "start"]
+    sensor = LegKinematics(env.model, **QUADRUPED).base
+    torch.testing.assert_close(start[0, :4], sensor[:4])
+    with pytest.raises(ValueError, match="imu"):
+        filtered(legged_filter(env.model, **options), log)

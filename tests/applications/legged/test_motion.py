@@ -8,9 +8,10 @@ import torch
 
 from torch_denkf.applications.legged import QUADRUPED, LeggedNoises, legged_filter, quadruped_env
 from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.applications.legged.motion import LeggedMotion, LeggedSpace
+from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, LeggedSpace
 from torch_denkf.applications.legged.readings import FeetInBody, FeetRates
-from torch_denkf.functional.manifolds import SO3, rotation_matrix, skew
+from torch_denkf.functional.manifolds import SO3, rotation_matrix, skew, whole_parts
+from torch_denkf.metrics.state import rotation_error
 
 DT, GRAVITY = 0.01, torch.tensor([0.0, 0.0, -9.81])
 
@@ -46,6 +47,23 @@ def test_a_step_turns_the_world():
     torch.testing.assert_close(moved[4:], torch.tensor(expected))
 
 
+def test_labels_may_be_of_some_vectors_alone():
+    """Their errors are those of the whole state; of a foot without an orientation there is none."""
+    space, (base, truth) = LeggedSpace(2), LeggedSpace(2).exp(torch.randn(2, 21))
+    whole = space.minus(base, truth)
+    for lost, told in ((16, range(15)), (5, [0, 1, 2, *range(6, 21)]), (11, [*range(10), *range(11, 21)])):
+        part = truth.clone()
+        part[lost : 22 if lost == 16 else lost + 1] = torch.nan
+        points, tangents = whole_parts(space, ~part.isnan())
+        assert tangents.nonzero().flatten().tolist() == list(told)
+        found = space.minus(base, torch.where(points, truth, space.neutral(truth)))
+        torch.testing.assert_close(found[tangents], whole[tangents])
+    no_turn = torch.arange(22) > 0
+    assert whole_parts(space, no_turn)[1].nonzero().flatten().tolist() == list(range(9, 15))
+    angle = rotation_error(space.plus(truth, 0.5 * torch.eye(21)[1]), truth, space=space)
+    torch.testing.assert_close(angle.deg2rad(), torch.tensor([0.5]))
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_errors_move_alike_wherever_the_mean_is(seed):
     """Without biases the Jacobian is Hartley's, eq. 21: of gravity and the time step alone."""
@@ -64,6 +82,18 @@ def test_errors_move_alike_wherever_the_mean_is(seed):
     expected[3:6, :3], expected[6:9, :3] = DT * skew(GRAVITY), DT**2 / 2 * skew(GRAVITY)
     expected[6:9, 3:6] = DT * torch.eye(3)
     torch.testing.assert_close(found[rows][:, rows], expected, rtol=0, atol=1e-9)
+
+
+def test_noise_is_that_of_steps_in_the_sensors_axes():
+    """For a mean and a covariance what an ensemble draws, to first order, wherever the mean is."""
+    torch.manual_seed(0)
+    space, stands = LeggedSpace(2), torch.tensor([True, False])
+    state = space.exp(torch.randn(space.tangent_dim))
+    drawn, cov = (LeggedMotionNoise(2, DT, LeggedNoises(), ensemble=both).double() for both in (True, False))
+    step = lambda tangent: space.minus(drawn.space.plus(state, tangent), state)  # noqa: E731
+    jacobian = torch.func.jacrev(step)(torch.zeros(space.tangent_dim))
+    expected = jacobian @ drawn.compute(stands).diag() @ jacobian.mT
+    torch.testing.assert_close(cov.compute(state, stands), expected, rtol=0, atol=1e-12)
 
 
 def test_a_turn_of_the_world_is_not_seen_in_what_feet_say():

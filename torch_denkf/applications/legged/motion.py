@@ -38,6 +38,7 @@ class LeggedSpace(Space):
     """
 
     feet: int
+    _angles = 3
 
     @property
     def point_dim(self) -> int:  # type: ignore[override]
@@ -89,6 +90,16 @@ class LeggedSpace(Space):
     def near(self, points, weights=None):
         """Part by part."""
         return _in_order(self.in_groups.near(_in_groups(points, 10), weights), 10)
+
+    def _whole(self, known):
+        # A vector's step needs the orientation and that vector alone: labels may be of the base, without feet.
+        turn, biases = known[..., :4].all(-1, keepdim=True), known[..., 10:16]
+        vectors = torch.cat([known[..., 4:10], known[..., 16:]], -1).unflatten(-1, (-1, 3)).all(-1)
+        vectors = (turn & vectors).repeat_interleave(3, -1)
+        return tuple(
+            torch.cat([turn.expand(*turn.shape[:-1], size), vectors[..., :6], biases, vectors[..., 6:]], -1)
+            for size in (4, 3)
+        )
 
 
 def _in_groups(value: Tensor, begin: int) -> Tensor:

@@ -16,7 +16,8 @@ __all__ = ["FeetInBody", "FeetRates", "LegReadings"]
 class LegReadings(SubModel):
     """Writes what the filter reads of the joints, and the state in which a robot starts that stands still.
 
-    That state is upright as the accelerometer says, at the origin, with heading zero.
+    That state is upright as the accelerometer says, at the origin, with heading zero; where the accelerometer says
+    nothing, as in a row that is rejected, the base's own z points up.
 
     Args:
         kinematics: of the robot's legs.
@@ -51,7 +52,8 @@ class LegReadings(SubModel):
     def _start(self, force: Tensor, feet: Tensor) -> Tensor:
         sensor = self.module.base
         up = rotate(sensor[:4], force)
-        up = up / torch.linalg.vector_norm(up, dim=-1, keepdim=True)
+        length = torch.linalg.vector_norm(up, dim=-1, keepdim=True)
+        up = torch.where(length == 0, torch.eye(3, dtype=up.dtype, device=up.device)[2], up / length)
         x, y, z = up.split(1, -1)
         turn = torch.cat([1 + z, y, -x, torch.zeros_like(z)], -1)  # the shortest from there to the world's z
         turn = SO3().compose(turn / torch.linalg.vector_norm(turn, dim=-1, keepdim=True), sensor[:4].expand_as(turn))
