@@ -175,7 +175,7 @@ class Laboratory:
         agent, file, first = self.agent(arm, batches), self.study.out / f"{arm}.pt", 0
         parts = {"loss": agent.loss, "optimiser": agent.optimiser, "schedule": agent.schedule}
         if file.exists():
-            kept = torch.load(file)
+            kept = torch.load(file, weights_only=True)
             first = kept.pop("batches")
             for name, state in kept.items():
                 parts[name].load_state_dict(state)
@@ -201,7 +201,7 @@ class Laboratory:
         contacts = LearnedContacts(self.model, **QUADRUPED, rows=ROWS)
         network, file = LSTM(contacts), self.study.out / "lstm.pt"
         if file.exists():
-            network.load_state_dict(torch.load(file))
+            network.load_state_dict(torch.load(file, weights_only=True))
             return network
         logs = []
         for number in range(2):

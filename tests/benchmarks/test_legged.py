@@ -118,6 +118,7 @@ def test_the_page_has_every_row():
     assert "| iCub | 0.7 | 1 |" in text
 
 
+@pytest.mark.slow
 def test_the_likeliest_noises_are_chosen_once(robot, tmp_path):
     grid = [{"kinematics": k, "rate": r, "gyro": 1e-3, "accelerometer": 5e-3} for k, r in ((0.01, 0.3), (1e-4, 1e-3))]
     assert chosen(lambda: robot, "some", grid, tmp_path).kinematics == 0.01

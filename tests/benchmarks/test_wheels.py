@@ -17,6 +17,7 @@ def test_sensors_read_at_their_rates(data):
     torch.testing.assert_close(bias, data["state"][..., 5:6].mean(1), rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_few_members_are_as_honest_as_the_kalman_filter_where_chance_is_not_believed(data):
     """20 s are 2,400 updates. The table of the study says the same of 60 s."""
     kalman, plain = row(gaussian_filter(), data), row(ensemble_filter(64), data)
