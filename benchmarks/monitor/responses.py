@@ -14,6 +14,7 @@ from benchmarks.common.tables import head, line
 from benchmarks.monitor.drives import believed_spans, car_filter, failing, filtered, from_truth
 from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 from torch_denkf.filters import Filter
+from torch_denkf.functional import wrap_angles
 from torch_denkf.monitoring import Gated
 
 DRAWS = 8
@@ -34,7 +35,7 @@ def degrees(filter: Filter, drives: list[TensorDict]) -> Tensor:
         one["belief", "mean"][..., 2] - drive["state"][:, 2]
         for one, drive in zip(filtered(filter, drives, DRAWS), drives, strict=True)
     ]
-    return torch.stack([torch.atan2(angle.sin(), angle.cos()).abs().mean().rad2deg() for angle in off])
+    return torch.stack([wrap_angles(angle).abs().mean().rad2deg() for angle in off])
 
 
 def main() -> None:

@@ -153,8 +153,8 @@ def ensemble_interval_coverage(
         One share a state dimension, ``[S]``.
 
     Raises:
-        ValueError: if the shapes do not fit, or if ``level`` is not in (0, 1) or more than the members can tell,
-            or if ``angles`` names no dimension.
+        ValueError: if the shapes do not fit, ``level`` is not in (0, 1) or more than the members can tell, or
+            ``angles`` names no dimension.
 
     Reference:
         Hyndman & Fan 1996, "Sample quantiles in statistical packages", Am. Stat. 50, definition 6.

@@ -117,7 +117,7 @@ class Visible(AnalysisAround):
     mixture, and ``(info_prefix, "visible")`` ``[*B, 1]`` is q, 0 where nothing is observed. Innovation and ``nis`` are
     those of the reading as it came. b is the Gaussian that the reading is expected from, ``broad`` times as wide: it is
     in the reading's own unit, and grows while nothing is seen. A reading of O components that fits the forecast speaks
-    for itself with up to ``broad`` to the power O: with many components, mask instead what p says is hidden.
+    for itself with up to ``broad`` to the power O: with many components, leave out the readings that p says are hidden.
 
     Args:
         analysis: of an ensemble, of a mean and a covariance, or of particles with a Gaussian likelihood. Its keys and

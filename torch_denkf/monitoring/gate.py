@@ -33,8 +33,7 @@ class GateOptions(TypedDict, total=False):
     Attributes:
         response: what happens to a reading that is not believed: ``"reject"`` takes it out, ``"student"`` and
             ``"huber"`` enlarge its variances, see :func:`~torch_denkf.monitoring.gating.disbelief`; ``"student"`` by
-            default. ``"reject"`` may take surprising motions for faults: it made the shipped car filter's heading 20
-            times as wrong on drives without a fault, the other two did not.
+            default. ``"reject"`` may take surprising motions for faults, and the belief then runs away.
         window: observed steps whose normalised innovations squared are summed up; 3 by default.
         rate: probability that the sum of a sound sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
             acts.

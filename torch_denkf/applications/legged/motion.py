@@ -147,7 +147,7 @@ class LeggedMotion(Motion):
         actions = {imu_key: 6, feet_key: 3 * feet, contact_key: feet}
         if moves_key is not None:
             actions[moves_key] = 3 * feet
-        space: Any = LeggedSpace(feet)  # no product, and none of its parts is asked for
+        space: Any = LeggedSpace(feet)  # no Product: the motion uses the space as a whole
         super().__init__(space, dt, actions, ("belief", "ensemble"), ("forecast", "ensemble"))
         self.inertial = InertialMotion(dt, gravity=gravity)
 

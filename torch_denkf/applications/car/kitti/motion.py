@@ -46,8 +46,8 @@ def with_motion(
     :func:`torch_denkf.applications.car.vision.epipolar.two_view_motion`.
 
     All are zero in rows whose image, or the one before, is missing; after
-    ``kitti.gaps.bridge_gaps`` the one before is the last that is there. They cost 9 ms a frame at
-    50 x 150 pixels and 25 ms at 125 x 414 and are kept in the cache, under a key made of the images themselves.
+    ``kitti.gaps.bridge_gaps`` the one before is the last that is there. They cost 9 ms a frame at 50 x 150 pixels and
+    25 ms at 125 x 414 and are kept in the cache, under a key made of the images themselves.
 
     Args:
         drive: as :func:`torch_denkf.applications.car.read_kitti_drive` gives it, batch size ``[N]``; colour images are
