@@ -17,7 +17,7 @@ import torch
 from benchmarks.common.arguments import command, parse, processor
 from benchmarks.common.tables import head, line, write_page
 from benchmarks.legged.study import KINDS
-from benchmarks.legged.task import FIRM, quadruped
+from benchmarks.legged.task import FIRM, simulated
 from torch_denkf.applications.legged import legged_filter
 from torch_denkf.deployment import export_step, load_step
 
@@ -48,7 +48,7 @@ def timed(call: Callable[[], object], rounds: int, calls: int = 1) -> float:
 @torch.no_grad()
 def rows(study: Speed) -> list[tuple[str, float, float, float | None]]:
     """Of each filter its name, microseconds a robot and step in a batch and alone, and milliseconds packaged."""
-    robot, found = quadruped(1, 0.1, 0, FIRM), []
+    robot, found = simulated("quadruped", 1, 0.1, 0, FIRM), []
     readings = robot.log[0, 5:7].select("imu", "joints", "joint_rates", "contact")
     for name, options in KINDS.items():
         filter = legged_filter(robot.model, **robot.names, dt=robot.dt, check_finite=False, **options)

@@ -17,7 +17,7 @@ from torch import Tensor
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import head, line, write_page
 from benchmarks.legged.study import KINDS
-from benchmarks.legged.task import FIRM, Robot, base_pose, quadruped
+from benchmarks.legged.task import FIRM, Robot, base_pose, simulated
 from torch_denkf.applications.legged import LeggedNoises, legged_filter
 from torch_denkf.functional.manifolds import SO3, rotate
 
@@ -73,7 +73,7 @@ def main() -> None:
     study = parse(Start)
     if study.smoke:
         study = Start(runs=1, seconds=0.2, degrees=(20.0,), smoke=True)
-    robot = quadruped(study.runs, study.seconds, study.seed, FIRM)
+    robot = simulated("quadruped", study.runs, study.seconds, study.seed, FIRM)
     moments, last = (10, 50, 100, 200), slice(-100, None)
     text = [
         "# A start that is tilted",

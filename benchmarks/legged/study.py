@@ -11,29 +11,32 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+from safetensors.torch import save_file
 from tensordict import TensorDict
 
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import Columns, head, line, write_page
 from benchmarks.legged.pictures import draw
-from benchmarks.legged.task import FIRM, GROUNDS, LEVEL, Robot, humanoid, jittered, quadruped, scores
+from benchmarks.legged.task import FIRM, GROUNDS, LEVEL, SIMULATED, Robot, icub, jittered, scores, simulated
 from benchmarks.legged.training import VELOCITY, learned_contacts, trained_lstm
 from torch_denkf.applications.legged import LeggedNoises, legged_filter
 
 #: Of the feet, by the joints' angles in m and by their rates in m/s: one pair is chosen in validation.
 KINEMATICS, RATES = (0.01, 0.03, 0.1), (0.3, 1.0)
 #: Gyro in rad/s/sqrt(Hz), accelerometer in m/s^2/sqrt(Hz). The simulated ones are a little above their data sheets.
-SIMULATED = (1e-3, 5e-3)
+SENSOR = (1e-3, 5e-3)
 #: Of a log with uneven stamps: a turn or a force counts for a wrong time. One pair is chosen in validation.
 STAMPED = ((1e-3, 5e-3), (5e-3, 2e-2), (1e-2, 5e-2), (2e-2, 0.1), (4e-2, 0.2))
 NOISES = ("kinematics", "rate", "gyro", "accelerometer")
 ICUB = "iCub, real"
+#: Names of the data of each simulated robot, with their grounds.
+DATA = {kind: {f"{kind}, {name}": ground for name, ground in GROUNDS.items()} for kind in SIMULATED}
 SCORES = ("velocity", "certain", "tilt", "drift", "nees", "held", "ms")
 COLUMNS = Columns(
     names=("data", "filter", *SCORES, "nll", *NOISES),
     text=("data", "filter"),
     whole=(),
-    order=lambda row: ([*GROUNDS, ICUB].index(row["data"]), row["filter"]),
+    order=lambda row: ([*DATA["quadruped"], *DATA["humanoid"], ICUB].index(row["data"]), row["filter"]),
 )
 VALIDATED = Columns(
     names=("data", *NOISES, "velocity", "nees", "held", "nll"),
@@ -41,11 +44,12 @@ VALIDATED = Columns(
     whole=(),
     order=lambda row: (row["data"], *(row[key] for key in NOISES)),
 )
-SHOWN = list(GROUNDS)[1]  # in the picture
+SHOWN = list(DATA["quadruped"])[1]  # in the picture
 VALIDATION_RUNS = 8
 KINDS = {
     "EKF": {"kind": "EKF"},
     "UKF": {"kind": "UKF"},
+    "DEnKF, 32 members": {"kind": "DEnKF", "ensemble_size": 32},
     "DEnKF, 64 members": {"kind": "DEnKF", "ensemble_size": 64},
 }
 
@@ -56,12 +60,13 @@ class Study:
 
     out: Path | None = None  # folder for legged.csv, legged.md and legged.png
     icub: Path = Path("../shared/data/icub")  # with walking.npz and model.urdf; left out where they are missing
-    parts: tuple[Literal["simulated", "icub"], ...] = (
-        "simulated",
+    parts: tuple[Literal["quadruped", "humanoid", "icub"], ...] = (
+        "quadruped",
+        "humanoid",
         "icub",
-    )  # rows of the other are read from legged.csv
-    runs: int = 8  # of the test, on each ground
-    seconds: float = 8.0  # of such a run
+    )  # rows of the others are read from legged.csv
+    runs: int = 20  # of the test, on each ground
+    seconds: float = 20.0  # of such a run
     training_runs: int = 120  # of 6 s each
     updates: int = 3000  # of the learned contacts
     lstm_updates: int = 500
@@ -122,7 +127,7 @@ def chosen(make: Callable[[], Robot], name: str, grid: Iterable[dict[str, float]
 def feet_grid(smoke: bool) -> list[dict[str, float]]:
     """Noises of the feet, with those of the simulated sensor."""
     pairs = list(product(KINEMATICS, RATES))[: 1 if smoke else None]
-    gyro, accelerometer = SIMULATED
+    gyro, accelerometer = SENSOR
     return [{"kinematics": k, "rate": r, "gyro": gyro, "accelerometer": accelerometer} for k, r in pairs]
 
 
@@ -184,14 +189,12 @@ def page(rows: list[dict], study: Study) -> str:
     lines += [
         "",
         f"Simulated: {study.runs} runs of {study.seconds:g} s on each ground, scored from 1 s on; every run has biases "
-        f"of its own. Contacts and LSTM are trained on {study.training_runs} other runs of 6 s, whose friction is 0.15 "
-        "to 1.5, whose floor gives way in 0.01 to 0.06 s, and whose pushes are up to 250 N. Noises are chosen on "
-        "further runs, by the likelihood of the true velocity: on the training's grounds for all simulated rows. iCub "
-        "has those of the simulated quadruped on firm ground, whose rows were stamped as unevenly "
-        "as iCub's. "
-        "Milliseconds are those of the "
-        f"processor for a step of all {study.runs * len(GROUNDS)} simulated runs, or of iCub's, without compilation, "
-        "one thread.",
+        f"of its own. Contacts and LSTM are trained on {study.training_runs} other runs of 6 s of that robot, whose "
+        "friction is 0.15 to 1.5, whose floor gives way in 0.01 to 0.06 s, and whose pushes are up to 250 N, on the "
+        "humanoid 100 N. Noises are chosen on further runs, by the likelihood of the true velocity: on the training's "
+        "grounds for all simulated rows. iCub has those of the simulated humanoid on firm ground, whose rows were "
+        "stamped as unevenly as iCub's. Milliseconds are those of the processor for a step of all "
+        f"{study.runs * len(GROUNDS)} runs of a simulated robot, or of iCub's, without compilation, one thread.",
         "",
         *head(
             "noises", "joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)"
@@ -205,22 +208,24 @@ def page(rows: list[dict], study: Study) -> str:
 
 
 def _with_noises(rows: list[dict]) -> dict[str, dict]:
-    """A row with noises, of the simulated ones and of iCub's."""
-    return {"iCub" if row["data"] == ICUB else "quadruped": row for row in rows if row["filter"].startswith("EKF")}
+    """A row with noises of each robot."""
+    return {row["data"].split(",")[0]: row for row in rows if row["filter"].startswith("EKF")}
 
 
-def simulated(study: Study) -> list[dict]:
-    """The rows of the quadruped; leaves the picture in the folder."""
+def walked(study: Study, kind: str) -> list[dict]:
+    """The rows of a simulated robot; the quadruped leaves the picture in the folder, each its learned contacts."""
     length = 0.3 if study.smoke else 6.0
-    make = partial(quadruped, VALIDATION_RUNS, length, study.seed + 2)
-    noises = chosen(make, "all grounds", feet_grid(study.smoke), study.out)
-    training = quadruped(study.training_runs, length, study.seed + 1)
+    make = partial(simulated, kind, VALIDATION_RUNS, length, study.seed + 2)
+    noises = chosen(make, f"{kind}, all grounds", feet_grid(study.smoke), study.out)
+    training = simulated(kind, study.training_runs, length, study.seed + 1)
     validation = make()
     contacts = learned_contacts(training, validation, noises, study.updates)
     lstm = trained_lstm(training, validation, contacts, study.lstm_updates)
+    if study.out is not None:
+        save_file(contacts.state_dict(), study.out / f"{kind}.safetensors")
     robots = {
-        name: quadruped(study.runs, study.seconds, study.seed + 3 + number, ground)
-        for number, (name, ground) in enumerate(GROUNDS.items())
+        name: simulated(kind, study.runs, study.seconds, study.seed + 3 + number, ground)
+        for number, (name, ground) in enumerate(DATA[kind].items())
     }
     kinds = {"EKF": KINDS["EKF"]} if study.smoke else KINDS
     variants = {", threshold": {"noises": noises}, ", learned": {"noises": noises, "contacts": contacts}}
@@ -229,21 +234,21 @@ def simulated(study: Study) -> list[dict]:
         with torch.no_grad():
             found = scores(robot, *lstm(lstm.read(robot.log)))
         rows += [{"data": name, "filter": "LSTM", **found}, {"data": name, "filter": "standing still", **still(robot)}]
-    if study.out is not None:
-        number = list(GROUNDS).index(SHOWN)
-        shown = {label: beliefs[f"EKF, {label}"].chunk(len(GROUNDS))[number] for label in ("threshold", "learned")}
+    if study.out is not None and SHOWN in robots:
+        number = list(robots).index(SHOWN)
+        shown = {label: beliefs[f"EKF, {label}"].chunk(len(robots))[number] for label in ("threshold", "learned")}
         draw(robots[SHOWN], shown, study.out / "legged.png")
     return rows
 
 
 def real(study: Study) -> list[dict]:
     """The rows of iCub."""
-    robot = humanoid(study.icub)
-    make = partial(quadruped, VALIDATION_RUNS, 6.0, study.seed + 2, FIRM)
-    firm = chosen(make, "firm ground", feet_grid(study.smoke), study.out)
+    robot = icub(study.icub)
+    make = partial(simulated, "humanoid", VALIDATION_RUNS, 6.0, study.seed + 2, FIRM)
+    firm = chosen(make, "humanoid, firm ground", feet_grid(study.smoke), study.out)
     feet = {"kinematics": firm.kinematics, "rate": firm.rate}
     grid = [{**feet, "gyro": gyro, "accelerometer": accelerometer} for gyro, accelerometer in STAMPED]
-    noises = chosen(lambda: jittered(make(), robot), "firm ground, uneven stamps", grid, study.out)
+    noises = chosen(lambda: jittered(make(), robot), "humanoid, firm ground, uneven stamps", grid, study.out)
     rows = filter_rows({ICUB: robot}, {"": {"noises": noises}}, KINDS)[0]
     return [*rows, {"data": ICUB, "filter": "standing still", **still(robot)}]
 
@@ -252,9 +257,11 @@ def main() -> None:
     """Runs the study."""
     study = parse(Study)
     if study.smoke:
-        study = replace(study, parts=("simulated",), runs=1, seconds=0.3, training_runs=4, updates=1, lstm_updates=1)
+        study = replace(
+            study, parts=("quadruped", "humanoid"), runs=1, seconds=0.3, training_runs=4, updates=1, lstm_updates=1
+        )
     torch.manual_seed(study.seed)
-    parts: dict[str, Callable[[Study], list[dict]]] = {"simulated": simulated}
+    parts: dict[str, Callable[[Study], list[dict]]] = {kind: partial(walked, kind=kind) for kind in SIMULATED}
     if (study.icub / "walking.npz").exists():
         parts["icub"] = real
     if study.out is not None:
@@ -265,7 +272,8 @@ def main() -> None:
         if part not in parts:
             continue
         began = time.monotonic()
-        rows = [row for row in rows if (row["data"] == ICUB) != (part == "icub")] + parts[part](study)
+        data = DATA.get(part, [ICUB])
+        rows = [row for row in rows if row["data"] not in data] + parts[part](study)
         print(f"{part}: {(time.monotonic() - began) / 60:.0f} min", flush=True)
         if file is not None:
             COLUMNS.write(rows, file)

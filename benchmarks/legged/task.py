@@ -1,8 +1,9 @@
-"""Logs of a simulated quadruped and of a real humanoid, and how well a filter knows the base's motion."""
+"""Logs of a simulated quadruped, a simulated humanoid and a real one, and how well a filter knows the base's motion."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import NormalDist
@@ -15,11 +16,25 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf.applications.legged import QUADRUPED, quadruped_env, trot, with_last_rows
+from torch_denkf.applications.legged.environment import LeggedEnv
+from torch_denkf.applications.legged.humanoid import HUMANOID, humanoid_env, stroll
 from torch_denkf.applications.legged.icub import ICUB, icub_log, icub_model
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.functional.manifolds import SO3, rotate
 
-__all__ = ["FIRM", "GROUNDS", "LEVEL", "ROWS", "Ground", "Robot", "humanoid", "jittered", "quadruped", "scores"]
+__all__ = [
+    "FIRM",
+    "GROUNDS",
+    "LEVEL",
+    "ROWS",
+    "SIMULATED",
+    "Ground",
+    "Robot",
+    "icub",
+    "jittered",
+    "simulated",
+    "scores",
+]
 
 LEVEL = 0.9  # of the intervals
 ROWS, EVERY = 10, 5  # the learned contacts read ten rows, each five rows after the one before it
@@ -73,34 +88,56 @@ class Robot:
     doubtful: Tensor
 
 
-def quadruped(runs: int, seconds: float, seed: int, ground: Ground | None = None) -> Robot:
-    """dm_control's quadruped, which trots at paces, strides and turns of its own in each run; all sensors err.
+def _trots(random: np.random.Generator, options: dict[str, float]) -> tuple[LeggedEnv, Callable[[float], Tensor]]:
+    """A quadruped, and its controls at a time."""
+    low, high = [0.8, 0.2, 0.2, -0.3], [1.2, 0.4, 0.4, 0.3]
+    gait = dict(zip(("pace", "stride", "height", "turn"), random.uniform(low, high).tolist(), strict=True))
+    return quadruped_env(**options), lambda time: min(1.0, time) * trot(time, **gait)
+
+
+def _strolls(random: np.random.Generator, options: dict[str, float]) -> tuple[LeggedEnv, Callable[[float], Tensor]]:
+    """A humanoid in its harness, and its controls."""
+    pace, stride, lift, turn, fits = random.uniform([0.8, 0.12, 0.3, -0.2, 0.9], [1.1, 0.22, 0.5, 0.2, 1.1]).tolist()
+    options["pushes"] *= 0.4  # as it weighs
+    env = humanoid_env(**options, speed=2.5 * fits * stride * pace, turn=turn)
+    return env, lambda time: stroll(time, pace=pace, stride=min(1.0, time) * stride, lift=min(1.0, time) * lift)
+
+
+#: Simulated robots: names of their parts, and how one begins to walk.
+SIMULATED: dict[str, tuple[dict[str, Any], Callable]] = {
+    "quadruped": (QUADRUPED, _trots),
+    "humanoid": (HUMANOID, _strolls),
+}
+
+
+def simulated(kind: str, runs: int, seconds: float, seed: int, ground: Ground | None = None) -> Robot:
+    """A robot of dm_control that walks at a pace, with strides and turns of its own in each run; all sensors err.
 
     Args:
+        kind: one of ``SIMULATED``.
         runs: R.
         seconds: of a run, 100 rows each.
         seed: of grounds, gaits and errors.
-        ground: that it trots on; ``None`` for that of training.
+        ground: that it walks on; ``None`` for that of training.
     """
     random, logs, ground = np.random.default_rng(seed), [], Ground() if ground is None else ground
+    names, walks = SIMULATED[kind]
     for run in range(runs):
         options = {name: random.uniform(*getattr(ground, name)) for name in ("softness", "pushes")}
-        friction = math.exp(random.uniform(*(math.log(each) for each in ground.friction)))
-        env = quadruped_env(friction=friction, seed=1000 * seed + run, **options)
-        low, high = [0.8, 0.2, 0.2, -0.3], [1.2, 0.4, 0.4, 0.3]
-        gait = dict(zip(("pace", "stride", "height", "turn"), random.uniform(low, high).tolist(), strict=True))
+        options["friction"] = math.exp(random.uniform(*(math.log(each) for each in ground.friction)))
+        env, controls = walks(random, options | {"seed": 1000 * seed + run})
         row, rows = env.reset(), []
         for step in range(round(seconds / env.dt)):
             rows.append(row.select("imu", "joints", "joint_rates", "contact", "true"))
-            row["action"] = min(1.0, step * env.dt) * trot(step * env.dt, **gait)
+            row["action"] = controls(step * env.dt)
             row = env.step(row)["next"]
         logs.append(torch.stack(rows))
     log = with_last_rows(torch.stack(logs), ROWS, EVERY)
     doubtful = torch.zeros(log.shape, dtype=torch.bool)
-    return Robot("quadruped", env.model, QUADRUPED, env.dt, log, slice(min(100, log.shape[1] // 2), None), doubtful)
+    return Robot(kind, env.model, names, env.dt, log, slice(min(100, log.shape[1] // 2), None), doubtful)
 
 
-def humanoid(folder: Path) -> Robot:
+def icub(folder: Path) -> Robot:
     """The walk of iCub. Its truth is in doubt where motion capture moves a foot that carries the whole robot.
 
     Args:

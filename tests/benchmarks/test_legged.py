@@ -1,6 +1,7 @@
 """The study of a legged robot's base: its scores against made-up beliefs, its data, its page."""
 
 import dataclasses
+from itertools import product
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ import torch
 from benchmarks.common.arguments import ROOT
 from benchmarks.legged.start import turned
 from benchmarks.legged.study import ICUB, Study, chosen, in_the_air, page, run, scored, still
-from benchmarks.legged.task import FIRM, GROUNDS, ROWS, base_pose, humanoid, quadruped, scores
+from benchmarks.legged.task import FIRM, GROUNDS, ROWS, SIMULATED, base_pose, icub, scores, simulated
 from benchmarks.legged.training import LASTS, LSTM, learned_contacts
 from tests.real_data import SHARED
 from torch_denkf.applications.legged import LearnedContacts, LeggedNoises
@@ -20,7 +21,7 @@ from torch_denkf.functional.manifolds import SO3, rotate
 
 @pytest.fixture(scope="module")
 def robot():
-    return quadruped(2, 1.5, 0, FIRM)
+    return simulated("quadruped", 2, 1.5, 0, FIRM)
 
 
 def true_mean(robot):
@@ -73,10 +74,10 @@ def test_a_turned_belief_tilts_and_drifts(robot):
 
 
 def test_runs_differ_and_repeat(robot):
-    again = quadruped(2, 1.5, 0, FIRM)
+    again = simulated("quadruped", 2, 1.5, 0, FIRM)
     assert torch.equal(robot.log["imu"], again.log["imu"])
     assert (robot.log["imu"][0] - robot.log["imu"][1]).abs().max() > 0.1
-    slippery = quadruped(1, 1.0, 0, list(GROUNDS.values())[1])
+    slippery = simulated("quadruped", 1, 1.0, 0, list(GROUNDS.values())[1])
     assert slippery.log["last", "imu"].shape == (1, 100, 60)
 
 
@@ -111,11 +112,14 @@ def test_how_long_errors_of_contacts_last_is_chosen_in_validation(robot):
 
 def test_the_page_has_every_row():
     noises = {"kinematics": 0.7, "rate": 1.0, "gyro": 1.0, "accelerometer": 1.0}
-    rows = [{"data": d, "filter": "EKF", "velocity": 0.1, "certain": 0.2, **noises} for d in ("firm ground", ICUB)]
+    rows = [
+        {"data": d, "filter": "EKF", "velocity": 0.1, "certain": 0.2, **noises} for d in ("humanoid, firm ground", ICUB)
+    ]
     text = page(rows, Study())
     assert "| EKF | 0.100 |  |" in text
     assert "| EKF | 0.100 | 0.200 |" in text
     assert "| iCub | 0.7 | 1 |" in text
+    assert "| humanoid | 0.7 | 1 |" in text
 
 
 @pytest.mark.slow
@@ -128,14 +132,14 @@ def test_the_likeliest_noises_are_chosen_once(robot, tmp_path):
 def test_the_results_are_those_of_the_study():
     table = (ROOT / "benchmarks/legged/results/legged.md").read_text()
     assert "python -m benchmarks.legged --out benchmarks/legged/results`" in table
-    for name in GROUNDS:
-        assert f"## {name}" in table
+    for kind, name in product(SIMULATED, GROUNDS):
+        assert f"## {kind}, {name}" in table
     assert [field.name for field in dataclasses.fields(Study)][-1] == "smoke"
 
 
 @pytest.mark.skipif(not (SHARED / "icub").exists(), reason="the log is not here")
 def test_of_the_walk_the_truth_is_in_doubt_where_a_loaded_foot_moves():
-    robot = humanoid(SHARED / "icub")
+    robot = icub(SHARED / "icub")
     assert 0 < robot.doubtful.double().mean() < 0.5
     assert robot.log.shape == robot.doubtful.shape
 

@@ -7,7 +7,7 @@ import torch
 from dm_control.suite import common, quadruped
 
 from tests.real_data import SHARED
-from torch_denkf.applications.legged.environment import QUADRUPED
+from torch_denkf.applications.legged import QUADRUPED
 from torch_denkf.applications.legged.icub import ICUB as NAMES
 from torch_denkf.applications.legged.icub import icub_model
 from torch_denkf.applications.legged.kinematics import LegKinematics

@@ -1,8 +1,9 @@
 from .contacts import contacts
-from .environment import QUADRUPED, LeggedErrors, quadruped_env, trot
+from .environment import LeggedErrors
 from .filter import legged_filter
 from .learned import LearnedContacts, last_rows, with_last_rows
 from .noises import LeggedNoises
+from .quadruped import QUADRUPED, quadruped_env, trot
 
 __all__ = [
     "QUADRUPED",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -18,7 +17,7 @@ from torchrl.envs import EnvBase
 from torch_denkf._checks import check_number
 from torch_denkf.applications.legged.kinematics import LegKinematics
 
-__all__ = ["QUADRUPED", "LeggedEnv", "LeggedErrors", "quadruped_env", "trot"]
+__all__ = ["LeggedEnv", "LeggedErrors", "on_floor"]
 
 
 @dataclass(frozen=True)
@@ -99,6 +98,7 @@ class LeggedEnv(EnvBase):
             raise ValueError(f"dt={dt} is no multiple of the model's time step, {model.opt.timestep} s.")
         if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
             raise ValueError("The base needs a free joint, the first joint of the model.")
+        self.base = int(model.jnt_bodyid[0])
         kinematics = LegKinematics(model, feet, imu)
         self.columns = [int(model.joint(name).qposadr[0]) for name in kinematics.joints]
         self.rows = [int(model.joint(name).dofadr[0]) for name in kinematics.joints]
@@ -134,7 +134,7 @@ class LeggedEnv(EnvBase):
         six = [self.errors.gyro_bias] * 3 + [self.errors.accelerometer_bias] * 3
         self.bias = np.array(six) * self.random.standard_normal(6)
         self.offset = self.errors.joint_offset * self.random.standard_normal(len(self.columns))
-        self.stands, self.pushed = np.zeros(len(self.feet), dtype=bool), 0
+        self.stands, self.pushed, self.push = np.zeros(len(self.feet), dtype=bool), 0, np.zeros(6)
         for _ in range(round(0.5 / self.dt)):
             readings = self._move()
         return readings
@@ -151,6 +151,7 @@ class LeggedEnv(EnvBase):
         """Simulates a step, and reads the sensors."""
         data, total = self.data, np.zeros(6)
         for _ in range(self.substeps):
+            data.xfrc_applied[self.base] = self._force_on_base()
             mujoco.mj_step(self.model, data)
             # The simulator goes on with the turn at the end of its step, and with the force at its beginning.
             total[:3] += self.to_sensor @ data.qvel[3:6]
@@ -168,12 +169,15 @@ class LeggedEnv(EnvBase):
 
     def _push(self) -> None:
         """Begins or ends a force on the base."""
-        force = self.data.xfrc_applied[int(self.model.jnt_bodyid[0])]
         self.pushed -= 1
         if self.pushed <= 0:
-            force[:] = 0.0
+            self.push[:] = 0.0
             if self.random.random() < self.dt:
-                force[:2], self.pushed = self.pushes * self.random.standard_normal(2), round(0.1 / self.dt)
+                self.push[:2], self.pushed = self.pushes * self.random.standard_normal(2), round(0.1 / self.dt)
+
+    def _force_on_base(self) -> np.ndarray:
+        """From outside in the world's axes, in N, and the torque in Nm."""
+        return self.push
 
     def _with_errors(self, imu: np.ndarray) -> dict:
         e, draw, root = self.errors, self.random.standard_normal, math.sqrt(self.dt)
@@ -194,64 +198,27 @@ class LeggedEnv(EnvBase):
         return found
 
 
-#: Names of dm_control's quadruped, as :class:`LeggedEnv` and :func:`legged_filter` take them.
-QUADRUPED: dict[str, Any] = {
-    "feet": [f"toe_{side}" for side in ("front_left", "front_right", "back_right", "back_left")],
-    "imu": "torso",
-}
-
-
-def quadruped_env(
-    errors: LeggedErrors | None = None,
-    *,
-    friction: float = 1.5,
-    softness: float = 0.01,
-    pushes: float = 0.0,
-    seed: int = 0,
-) -> LeggedEnv:
-    """dm_control's quadruped on a floor, with an inertial sensor beside its middle, 100 steps a second.
+def on_floor(robot: ElementTree.Element, assets: dict, friction: float, softness: float) -> mujoco.MjModel:
+    """A robot of dm_control on a floor, as its sensors need it.
 
     Args:
-        errors: of the sensors.
-        friction: of feet and floor: the force along the floor by the force upon it. On 0.3 feet slide.
+        robot: its MJCF.
+        assets: files that it includes.
+        friction: of feet and floor: the force along the floor by the force upon it.
         softness: seconds in which the floor gives way and comes back.
-        pushes: standard deviation in N, see :class:`LeggedEnv`. The robot has 107 kg.
-        seed: of errors and pushes.
-    """
-    from dm_control.suite import common, quadruped  # type: ignore[import-untyped]  # which takes seconds
 
-    robot = ElementTree.fromstring(quadruped.make_model(floor_size=200))
-    site = next(site for site in robot.iter("site") if site.get("name") == QUADRUPED["imu"])
-    site.attrib.update(pos="0.12 0.05 0.08", euler="30 -20 60")
-    model = mujoco.MjModel.from_xml_string(ElementTree.tostring(robot, encoding="unicode"), common.ASSETS)
+    Raises:
+        ValueError: if a number is not above zero.
+    """
+    check_number("friction", friction, above=0)
+    check_number("softness", softness, above=0)
+    model = mujoco.MjModel.from_xml_string(ElementTree.tostring(robot, encoding="unicode"), assets)
     model.opt.timestep = 0.0025
     model.opt.cone, model.opt.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 30.0  # feet that stand do not creep
     # With implicit damping the simulator moves otherwise than its accelerometer reads, by a third.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    check_number("friction", friction, above=0)
-    check_number("softness", softness, above=0)
     model.geom_friction[:, 0], model.geom_solref[:, 0] = friction, softness
-    return LeggedEnv(model, **QUADRUPED, errors=errors, on=150.0, off=100.0, pushes=pushes, seed=seed)
-
-
-def trot(
-    time: float, *, pace: float = 1.0, stride: float = 0.3, height: float = 0.3, turn: float = 0.0
-) -> torch.Tensor:
-    """Controls ``[12]`` of dm_control's quadruped that let it trot: two legs swing while the other two stand.
-
-    Args:
-        time: in s.
-        pace: strides a second.
-        stride: amplitude of the hips.
-        height: by how much legs are lifted.
-        turn: by how much the strides of right and left legs differ, -1 to 1.
-    """
-    found = []
-    for number, side in enumerate((-1.0, 1.0, 1.0, -1.0)):  # front left, front right, back right, back left
-        phase = 2 * math.pi * pace * time + math.pi * (number % 2)
-        ahead = stride * (1 + side * turn) * math.cos(phase)
-        found += [side * ahead, -height * max(0.0, -math.sin(phase)), 0.0]
-    return torch.tensor(found)
+    return model
 
 
 def _is_site(model: mujoco.MjModel, name: str) -> bool:

@@ -1,0 +1,121 @@
+"""dm_control's humanoid, which a harness leads, and how it walks."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import torch
+
+from torch_denkf.applications.legged.environment import LeggedEnv, LeggedErrors, on_floor
+
+__all__ = ["HUMANOID", "HarnessedEnv", "humanoid_env", "stroll"]
+
+#: Names of dm_control's humanoid, as :class:`LeggedEnv` and :func:`legged_filter` take them.
+HUMANOID: dict[str, Any] = {"feet": ["left_foot", "right_foot"], "imu": "root"}
+_HEIGHT = 1.24  # m: below it the harness carries
+
+
+class HarnessedEnv(LeggedEnv):
+    """A robot whose base hangs in a harness that goes along: it keeps the robot from falling, as in a laboratory.
+
+    The harness is made of springs and dampers: it turns the base upright and to where it goes, pulls it after itself,
+    and carries it where it sinks. The legs carry the robot while it walks.
+
+    Args:
+        speed: of the harness, in m/s; it sets off within a second.
+        turn: how fast it turns, in rad/s.
+        *args: of :class:`LeggedEnv`.
+        **options: of :class:`LeggedEnv`.
+    """
+
+    def __init__(self, *args, speed: float = 0.5, turn: float = 0.0, **options):
+        self.speed, self.turn = speed, turn
+        super().__init__(*args, **options)
+
+    def _reset(self, *args, **kwargs):
+        self.place, self.heading, self.begins = np.zeros(2), 0.0, True
+        readings = super()._reset(*args, **kwargs)
+        self.begins, self.begun = False, self.data.time
+        return readings
+
+    def _force_on_base(self) -> np.ndarray:
+        data, step = self.data, self.model.opt.timestep
+        share = 0.0 if self.begins else min(1.0, data.time - self.begun)
+        self.heading += share * self.turn * step
+        ahead = np.array([math.cos(self.heading), math.sin(self.heading)])
+        self.place = self.place + share * self.speed * step * ahead
+        axes = data.xmat[self.base].reshape(3, 3)
+        wanted = np.array([[ahead[0], -ahead[1], 0.0], [ahead[1], ahead[0], 0.0], [0.0, 0.0, 1.0]])
+        off = 0.5 * np.cross(axes.T, wanted.T).sum(0)
+        force = self.push.copy()
+        force[:2] += 400 * (self.place - data.qpos[:2]) - 80 * (data.qvel[:2] - share * self.speed * ahead)
+        force[2] += max(0.0, 1500 * (_HEIGHT - data.qpos[2])) - 100 * data.qvel[2]
+        force[3:] += 600 * off - 40 * axes @ data.qvel[3:6]
+        return force
+
+
+def humanoid_env(
+    errors: LeggedErrors | None = None,
+    *,
+    friction: float = 1.5,
+    softness: float = 0.01,
+    pushes: float = 0.0,
+    speed: float = 0.5,
+    turn: float = 0.0,
+    seed: int = 0,
+) -> HarnessedEnv:
+    """dm_control's humanoid in a harness, with an inertial sensor beside the middle of its chest, 100 steps a second.
+
+    Its motors turn joints to the angles of the action, in rad.
+
+    Args:
+        errors: of the sensors.
+        friction: of feet and floor: the force along the floor by the force upon it. On 0.3 feet slide.
+        softness: seconds in which the floor gives way and comes back.
+        pushes: standard deviation in N, see :class:`LeggedEnv`. The robot has 41 kg.
+        speed: of the harness, in m/s.
+        turn: how fast it turns, in rad/s.
+        seed: of errors and pushes.
+
+    Raises:
+        ValueError: if ``friction`` or ``softness`` is not above zero.
+    """
+    from dm_control.suite import humanoid  # type: ignore[import-untyped]  # which takes seconds
+
+    xml, assets = humanoid.get_model_and_assets()
+    robot = ElementTree.fromstring(xml)
+    site = next(site for site in robot.iter("site") if site.get("name") == HUMANOID["imu"])
+    site.attrib.update(pos="0.06 0.03 -0.05", euler="20 -30 40")
+    motors = next(robot.iter("actuator"))
+    for motor in list(motors):
+        strength = float(motor.attrib.pop("gear")) * (3 if "ankle" in motor.attrib["name"] else 1)  # feet stay flat
+        motor.tag = "position"
+        motor.attrib.update(kp=f"{8 * strength}", kv=f"{0.15 * strength}", ctrlrange="-2 2")
+        motor.attrib.update(forcerange=f"{-4 * strength} {4 * strength}")
+    model = on_floor(robot, assets, friction, softness)
+    model.body("torso").pos[2] = model.qpos0[2] = 1.285  # its feet touch the floor
+    model.dof_armature[6:] = 0.08  # of its motors, in kg m^2: lighter ones shake
+    return HarnessedEnv(
+        model, **HUMANOID, errors=errors, on=60.0, off=40.0, pushes=pushes, speed=speed, turn=turn, seed=seed
+    )
+
+
+def stroll(time: float, *, pace: float = 1.0, stride: float = 0.2, lift: float = 0.4) -> torch.Tensor:
+    """Controls ``[21]`` of dm_control's humanoid that let it walk on bent legs, while the harness leads.
+
+    Args:
+        time: in s.
+        pace: strides a second.
+        stride: amplitude of the hips, in rad. A speed of about ``2.5 * stride * pace`` fits it, in m/s.
+        lift: by how much a knee bends that swings, in rad.
+    """
+    legs, bent = [], 0.25
+    for begin in (math.pi, 0.0):  # right, left
+        phase = 2 * math.pi * pace * time + begin
+        swing = lift * max(0.0, -math.sin(phase))
+        hip, knee = -stride * math.cos(phase) - bent - 0.5 * swing, -2 * bent - swing
+        legs += [0.0, 0.0, hip, knee, 0.0, knee - hip]  # the foot stays level
+    return torch.tensor([0.0, 0.0, 0.0, *legs, *[0.0] * 6])
