@@ -82,3 +82,28 @@ def test_a_start_without_acceleration_is_level(kind):
     torch.testing.assert_close(start[0, :4], sensor[:4])
     with pytest.raises(ValueError, match="imu"):
         filtered(legged_filter(env.model, **options), log)
+
+
+def test_a_robot_may_start_upside_down():
+    """Of all turns by half a circle one is chosen, and up is up."""
+    env = quadruped_env(seed=0)
+    row = env.reset().select("imu", "joints", "joint_rates", "contact")
+    sensor = LegKinematics(env.model, **QUADRUPED).base
+    row["imu"][3:] = rotate(SO3().inverse(sensor[:4]), torch.tensor([0.0, 0.0, -9.81]))
+    start = legged_filter(env.model, **QUADRUPED, dt=env.dt, kind="EKF").initialise(row)["legs", "start"]
+    up = rotate(SO3().inverse(start[:4]), torch.tensor([0.0, 0.0, 1.0]))
+    torch.testing.assert_close(up, row["imu"][3:] / 9.81, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("key", ["imu", "joints", "joint_rates", "contact"])
+def test_readings_of_another_robot_are_named(key):
+    env = quadruped_env(seed=0)
+    row = env.reset().select("imu", "joints", "joint_rates", "contact")
+    row[key] = row[key][:-1]
+    with pytest.raises(ValueError, match=key):
+        legged_filter(env.model, **QUADRUPED, dt=env.dt, kind="EKF").initialise(row)
+
+
+def test_no_time_between_rows_is_refused():
+    with pytest.raises(ValueError, match="dt"):
+        legged_filter(quadruped_env().model, **QUADRUPED, dt=0.0)

@@ -247,3 +247,15 @@ def test_without_rates_they_are_refused(model):
 def test_errors_last_for_a_row_at_least(model):
     with pytest.raises(ValueError, match="lasts"):
         LearnedContacts(model, **QUADRUPED, lasts=0.5)
+
+
+def test_rows_without_a_standing_foot_teach_nothing(model, log):
+    rows = with_last_rows(log, 10)
+    rows["last", "contact"] = torch.zeros_like(rows["last", "contact"])
+    with pytest.raises(ValueError, match="No foot stands"):
+        contacts_of(model).loss(rows)
+
+
+def test_other_numbers_of_rows_are_named(model, log):
+    with pytest.raises(ValueError, match=r"rows of 'imu' .* last_rows"):
+        contacts_of(model).loss(with_last_rows(log, 11))

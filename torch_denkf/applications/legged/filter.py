@@ -11,6 +11,7 @@ import mujoco
 import torch
 from tensordict import NestedKey
 
+from torch_denkf._checks import check_number
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.applications.legged.learned import MOVES, SLIP, LearnedContacts, Variances
 from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, LeggedSpace
@@ -90,6 +91,8 @@ def legged_filter(
         raise ValueError(f'kind is "DEnKF", "EKF" or "UKF"; got {kind!r}.')
     if contacts is not None and rates_key is None:
         raise ValueError("LearnedContacts is about the rates of the joints: give rates_key.")
+    if isinstance(dt, (int, float)):
+        check_number("dt", dt, above=0, cure="It is the time step in seconds, or the key of one")
     n, kinematics = LeggedNoises() if noises is None else noises, LegKinematics(model, feet, imu, joints=joints)
     count, space = len(kinematics.feet), LeggedSpace(len(kinematics.feet))
     readings = LegReadings(

@@ -101,6 +101,9 @@ class LearnedContacts(SubModel):
         Args:
             log: ``[*B]``, rows in any order, with the last rows and ``("true", "velocity")`` of the base ``[*B, 3]`` in
                 its own axes, in m/s.
+
+        Raises:
+            ValueError: if no foot stands in any row.
         """
         features, sensor = self.features(*(log["last", key] for key in _KEYS)), self.kinematics.base
         own = features[..., -16:]  # of the newest row
@@ -109,6 +112,8 @@ class LearnedContacts(SubModel):
         lever = rotate(to_sensor, sensor[4:]).expand_as(own[..., 10:13])
         moves = velocity + torch.linalg.cross(own[..., 10:13], lever) - own[..., 4:7]
         stands = own[..., 0] > 0
+        if not stands.any():
+            raise ValueError('No foot stands in these rows, by ("last", "contact"): nothing is to be learned of them.')
         mean, cov = self._moments(features[stands])
         return -MultivariateNormal(mean, cov, validate_args=False).log_prob(moves[stands]).mean()
 
@@ -118,6 +123,13 @@ class LearnedContacts(SubModel):
         """What the network reads of each foot, ``[*B, F, 16 K]``; ``rows`` in the place of K."""
         rows, kinematics = self.rows if rows is None else rows, self.kinematics
         like = kinematics.base
+        sizes = 6, len(kinematics.joints), len(kinematics.joints), len(kinematics.feet)
+        for key, size, value in zip(_KEYS, sizes, (imu, joints, rates, contact), strict=True):
+            if value.shape[-1:] != (size * rows,):
+                raise ValueError(
+                    f"{rows} rows of {key!r} of this robot are [*B, {size * rows}]; got {list(value.shape)}. "
+                    "last_rows and with_last_rows make them, with as many rows as LearnedContacts reads."
+                )
         imu, joints, rates = (part.to(like.dtype).unflatten(-1, (rows, -1)) for part in (imu, joints, rates))
         stands = contact.to(like.dtype).unflatten(-1, (rows, -1)).unsqueeze(-1)  # [*B, K, F, 1]
         feet = kinematics(joints)

@@ -45,6 +45,11 @@ class LegReadings(SubModel):
 
     def compute(self, imu, joints, contact, rates=None):
         """The feet, which of them stand, the start, and the feet's rates."""
+        kinematics = self.module
+        sizes = [6, len(kinematics.joints), len(kinematics.feet), len(kinematics.joints)]
+        for key, size, value in zip(self.in_keys, sizes, (imu, joints, contact, rates), strict=False):
+            if value.shape[-1:] != (size,):
+                raise ValueError(f"{key!r} of this robot is [*B, {size}]; got {list(value.shape)}.")
         feet = self.module(joints.to(self.module.base.dtype))
         out = feet.flatten(-2), contact.repeat_interleave(3, -1), self._start(imu[..., 3:].to(feet.dtype), feet)
         return out if rates is None else (*out, self.module.velocities(joints, rates).flatten(-2))
@@ -56,6 +61,8 @@ class LegReadings(SubModel):
         up = torch.where(length == 0, torch.eye(3, dtype=up.dtype, device=up.device)[2], up / length)
         x, y, z = up.split(1, -1)
         turn = torch.cat([1 + z, y, -x, torch.zeros_like(z)], -1)  # the shortest from there to the world's z
+        about_x = torch.eye(4, dtype=up.dtype, device=up.device)[1]
+        turn = torch.where(z < -1 + 1e-6, about_x, turn)  # upside down, all are as short
         turn = SO3().compose(turn / torch.linalg.vector_norm(turn, dim=-1, keepdim=True), sensor[:4].expand_as(turn))
         place = rotate(quaternion_product(turn, SO3().inverse(sensor[:4]).expand_as(turn)), sensor[4:])
         standing = place.unsqueeze(-2) + rotate(turn.unsqueeze(-2), feet)
