@@ -33,6 +33,7 @@ setup(
         "torch_denkf": ["py.typed", "**/*.pyi"],
         "torch_denkf.applications.ur5": ["simulation/assets/*.xml", "weights/*/*"],
         "torch_denkf.applications.car": ["weights/*/*"],
+        "torch_denkf.applications.legged": ["weights/*/*"],
         "torch_denkf.applications.reacher": ["weights/*/*"],
     },
     entry_points={"console_scripts": ["denkf = torch_denkf.cli.main:main"]},

@@ -62,7 +62,7 @@ def check_trained_filters(wheel, folder):
     weights = [each for each in wheel.infolist() if "/weights/" in each.filename]
     assert sum(each.file_size for each in weights) <= 1.5e6
     names = torch_denkf.available()
-    assert names == ["car-odometry", "reacher", "ur5-table"]
+    assert names == ["car-odometry", "quadruped", "reacher", "ur5-table"]
     files = {f"{name}/{file}" for name in names for file in ("card.md", "config.json", "weights.safetensors")}
     assert {each.filename.split("/weights/")[1] for each in weights} == files
     wheel.extractall(folder)

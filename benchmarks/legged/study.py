@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from safetensors.torch import save_file
 from tensordict import TensorDict
 
-from benchmarks.common.arguments import made_by, parse
+from benchmarks.common.arguments import command, made_by, parse
 from benchmarks.common.tables import Columns, head, line, write_page
 from benchmarks.legged.pictures import draw
 from benchmarks.legged.task import FIRM, GROUNDS, LEVEL, SIMULATED, Robot, icub, jittered, scores, simulated
-from benchmarks.legged.training import VELOCITY, learned_contacts, trained_lstm
-from torch_denkf.applications.legged import LeggedNoises, legged_filter
+from benchmarks.legged.training import CELLS, VELOCITY, learned_contacts, trained_lstm
+from torch_denkf.applications.legged import LearnedContacts, LeggedNoises, legged_filter
+from torch_denkf.applications.legged.quadruped import quadruped
+from torch_denkf.pretrained import save_pretrained
 
 #: Of the feet, by the joints' angles in m and by their rates in m/s: one pair is chosen in validation.
 KINEMATICS, RATES = (0.01, 0.03, 0.1), (0.3, 1.0)
@@ -213,7 +214,7 @@ def _with_noises(rows: list[dict]) -> dict[str, dict]:
 
 
 def walked(study: Study, kind: str) -> list[dict]:
-    """The rows of a simulated robot; the quadruped leaves the picture in the folder, each its learned contacts."""
+    """The rows of a simulated robot; of the quadruped the picture and the trained filter are left in the folder."""
     length = 0.3 if study.smoke else 6.0
     make = partial(simulated, kind, VALIDATION_RUNS, length, study.seed + 2)
     noises = chosen(make, f"{kind}, all grounds", feet_grid(study.smoke), study.out)
@@ -221,8 +222,8 @@ def walked(study: Study, kind: str) -> list[dict]:
     validation = make()
     contacts = learned_contacts(training, validation, noises, study.updates)
     lstm = trained_lstm(training, validation, contacts, study.lstm_updates)
-    if study.out is not None:
-        save_file(contacts.state_dict(), study.out / f"{kind}.safetensors")
+    if study.out is not None and kind == "quadruped":
+        _save(contacts, noises, study)
     robots = {
         name: simulated(kind, study.runs, study.seconds, study.seed + 3 + number, ground)
         for number, (name, ground) in enumerate(DATA[kind].items())
@@ -239,6 +240,16 @@ def walked(study: Study, kind: str) -> list[dict]:
         shown = {label: beliefs[f"EKF, {label}"].chunk(len(robots))[number] for label in ("threshold", "learned")}
         draw(robots[SHOWN], shown, study.out / "legged.png")
     return rows
+
+
+def _save(contacts: LearnedContacts, noises: LeggedNoises, study: Study) -> None:
+    """Leaves the quadruped's filter with its trained contacts in the folder, for ``from_pretrained``."""
+    settings: dict = {"num_cells": list(CELLS), **{key: getattr(noises, key) for key in NOISES}}
+    filter = quadruped(**settings)
+    trained = next(module for module in filter.modules() if isinstance(module, LearnedContacts))
+    trained.load_state_dict(contacts.state_dict())
+    training = {"command": command("legged"), "seed": study.seed, "runs": study.training_runs, "updates": study.updates}
+    save_pretrained(filter, study.out / "quadruped", builder=quadruped, settings=settings, training=training)
 
 
 def real(study: Study) -> list[dict]:

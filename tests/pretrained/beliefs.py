@@ -9,8 +9,11 @@ from tensordict import TensorDict
 import torch_denkf
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
 
+_LEGS = {"imu": 6, "joints": 16, "joint_rates": 16, "contact": 4}
 _READINGS = {
     "car-odometry": {"flow": FLOW_SHAPE, "road": ROAD_SHAPE, "start": (5,)},
+    "quadruped": {key: (size,) for key, size in _LEGS.items()}
+    | {("last", key): (10 * size,) for key, size in _LEGS.items()},
     "reacher": {"encoder": (2,), "action": (2,)},
     "ur5-table": {"pixels": (3, 64, 64), "action": (7,)},
 }
@@ -22,6 +25,7 @@ def all_beliefs():
     for name in torch_denkf.available():
         generator = torch.Generator().manual_seed(0)
         data = {key: torch.rand(6, *shape, generator=generator) for key, shape in _READINGS[name].items()}
+        data.update({key: each > 0.5 for key, each in data.items() if "contact" in key})
         torch.manual_seed(0)
         with torch.no_grad():
             belief = torch_denkf.from_pretrained(name).sequence(TensorDict(data, [6]))["belief"][-1]

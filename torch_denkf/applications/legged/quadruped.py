@@ -1,16 +1,21 @@
-"""dm_control's quadruped, and how it trots."""
+"""dm_control's quadruped, how it trots, and its filter with trained contacts."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal
 from xml.etree import ElementTree
 
 import torch
 
 from torch_denkf.applications.legged.environment import LeggedEnv, LeggedErrors, on_floor
+from torch_denkf.applications.legged.filter import legged_filter
+from torch_denkf.applications.legged.learned import LearnedContacts
+from torch_denkf.applications.legged.noises import LeggedNoises
+from torch_denkf.filters import Filter
 
-__all__ = ["QUADRUPED", "quadruped_env", "trot"]
+__all__ = ["QUADRUPED", "quadruped", "quadruped_env", "trot"]
 
 #: Names of dm_control's quadruped, as :class:`LeggedEnv` and :func:`legged_filter` take them.
 QUADRUPED: dict[str, Any] = {
@@ -63,3 +68,27 @@ def trot(
         ahead = stride * (1 + side * turn) * math.cos(phase)
         found += [side * ahead, -height * max(0.0, -math.sin(phase)), 0.0]
     return torch.tensor(found)
+
+
+def quadruped(
+    *,
+    rows: int = 10,
+    num_cells: Sequence[int] = (48, 48),
+    dt: float = 0.01,
+    kind: Literal["DEnKF", "EKF", "UKF"] = "EKF",
+    **noises: float,
+) -> Filter:
+    """The filter of dm_control's quadruped with :class:`~torch_denkf.applications.legged.LearnedContacts`, untrained.
+
+    ``from_pretrained("quadruped")`` is this filter, trained. It reads what ``last_rows(10, every=5)`` keeps.
+
+    Args:
+        rows: K, that the contacts read.
+        num_cells: hidden layers of their networks.
+        dt: time step in seconds.
+        kind: the belief.
+        **noises: of :class:`~torch_denkf.applications.legged.LeggedNoises`.
+    """
+    model, known = quadruped_env().model, LeggedNoises(**noises)
+    contacts = LearnedContacts(model, **QUADRUPED, rows=rows, rate=known.rate, num_cells=num_cells)
+    return legged_filter(model, **QUADRUPED, dt=dt, kind=kind, noises=known, contacts=contacts)

@@ -1,6 +1,6 @@
-"""What legged robots register with the library: nothing yet that is stored or run by a command."""
+"""What legged robots add to the library's registers."""
 
 from __future__ import annotations
 
-BUILDERS: dict[str, str] = {}
+BUILDERS = {"quadruped": "torch_denkf.applications.legged.quadruped:quadruped"}
 COMMANDS: dict[str, tuple[str, str]] = {}
