@@ -23,10 +23,10 @@ from torch_denkf.applications.car import (
     FlowSensor,
     KITTIOdometryExperienceReplay,
     dead_reckoning,
-    kitti_endpoint_error,
     with_motion,
     write_drives,
 )
+from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
 from torch_denkf.applications.car.modules.unicycle import UnicycleMotion, UnicycleTransition
 from torch_denkf.envs import ReplayEnv
 from torch_denkf.metrics import interval_coverage

@@ -31,11 +31,11 @@ from torch_denkf.applications.car import (
     UnicycleMotion,
     UnicycleTransition,
     dead_reckoning,
-    drive_frames,
-    kitti_endpoint_error,
     read_kitti_drive,
     write_drives,
 )
+from torch_denkf.applications.car.kitti.frames import drive_frames
+from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import (

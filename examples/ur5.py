@@ -36,7 +36,7 @@ from torch_denkf import (
     Stage,
     UR5ExperienceReplay,
 )
-from torch_denkf.applications.ur5 import collect_ur5_demos
+from torch_denkf.applications.ur5.envs.collect import collect_ur5_demos
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import (
     DiagonalNoise,

@@ -17,8 +17,10 @@ from benchmarks.kitti.readings import read_spans
 from benchmarks.kitti.recipes import REACH, KITTIRecipe
 from benchmarks.kitti.streams import CONDITIONS, DISTURBANCES, Stream
 from benchmarks.kitti.training import FLOOR, run_filter
-from torch_denkf.applications.car import dead_reckoning, kitti_devkit_error, kitti_endpoint_error
+from torch_denkf.applications.car import dead_reckoning
 from torch_denkf.applications.car.metrics.benchmark import kitti_pathlength_error
+from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
+from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
 from torch_denkf.applications.car.odometry.streams import all_frames, lose_frames, shortest_spans
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_gaussian

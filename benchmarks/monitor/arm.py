@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
 from benchmarks.monitor.scores import Run, afterwards, detection, false_alarms
-from torch_denkf.applications.ur5 import UR5ExperienceReplay, collect_ur5_demos
+from torch_denkf.applications.ur5 import UR5ExperienceReplay
+from torch_denkf.applications.ur5.envs.collect import collect_ur5_demos
 from torch_denkf.applications.ur5.train import UNIT
 from torch_denkf.filters import Filter
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, Select

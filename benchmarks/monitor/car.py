@@ -14,11 +14,10 @@ from torch import Tensor
 
 from benchmarks.monitor.drives import ALWAYS, FAULTS, SIGNS, believed_spans, car_filter, failing, filtered, side_by_side
 from benchmarks.monitor.scores import Run, afterwards, detection, false_alarms
-from torch_denkf.applications.car import kitti_endpoint_error
+from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
 from torch_denkf.applications.car.odometry.filter import VELOCITIES
-from torch_denkf.applications.car.vision import PICTURE_SIGNS
 from torch_denkf.applications.car.vision.poses import KITTI_DT
-from torch_denkf.applications.car.vision.signs import FLOW_SIGNS
+from torch_denkf.applications.car.vision.signs import FLOW_SIGNS, PICTURE_SIGNS
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.monitoring import InnovationMonitor, MonitoredSensor, SignGate
 

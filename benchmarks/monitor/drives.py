@@ -17,9 +17,14 @@ from torch_denkf.applications.car.odometry.batches import mark_start
 from torch_denkf.applications.car.odometry.filter import CarFilter
 from torch_denkf.applications.car.odometry.scores import first_state
 from torch_denkf.applications.car.odometry.streams import read_sensor, shortest_spans
-from torch_denkf.applications.car.vision import PICTURE_SIGNS, picture_signs
 from torch_denkf.applications.car.vision.poses import KITTI_DT
-from torch_denkf.applications.car.vision.signs import FLOW_SIGNS, flow_signs, plane_distance
+from torch_denkf.applications.car.vision.signs import (
+    FLOW_SIGNS,
+    PICTURE_SIGNS,
+    flow_signs,
+    picture_signs,
+    plane_distance,
+)
 from torch_denkf.data.cache import cached
 from torch_denkf.envs import BlackFrames, Brightness, OccludingBox
 from torch_denkf.filters import Filter

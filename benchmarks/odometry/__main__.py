@@ -13,10 +13,12 @@ import torch
 
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import Columns, head, line, report
-from torch_denkf.applications.car import kitti_devkit_error, kitti_endpoint_error, write_drives
+from torch_denkf.applications.car import write_drives
 from torch_denkf.applications.car.kitti.clock import read_times
 from torch_denkf.applications.car.kitti.drive import choose_camera, list_kitti_drives
 from torch_denkf.applications.car.kitti.files import read_poses
+from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
+from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
 from torch_denkf.applications.car.odometry.paths import read_path
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
 from torch_denkf.applications.car.vision.poses import poses_to_state

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.common.plots import plt, save
-from torch_denkf.applications.car import kitti_devkit_error
+from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
 
 __all__ = ["draw"]
 

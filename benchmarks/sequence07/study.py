@@ -19,7 +19,7 @@ from benchmarks.sequence07.filters import POSE, SPACE, car_filter, pose_of, prep
 from benchmarks.sequence07.pictures import draw
 from benchmarks.sequence07.task import CONDITIONS, ROWS, chained, naive, readings, truth
 from torch_denkf import Filter
-from torch_denkf.applications.car import kitti_devkit_error
+from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
 from torch_denkf.functional.manifolds import SE3
 from torch_denkf.smoothers import EnRTS, RTSSmoother
 

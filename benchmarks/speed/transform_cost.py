@@ -32,7 +32,7 @@ from benchmarks.speed.workload import car_filter
 from examples.append_to_env import NOISE, make_filter
 from torch_denkf.applications.car import KITTIReplayEnv
 from torch_denkf.applications.car.kitti.render import render_drives
-from torch_denkf.applications.reacher import NoisyEncoders
+from torch_denkf.applications.reacher.encoders import NoisyEncoders
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import VectorSensor

@@ -10,7 +10,8 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from torch_denkf.applications.ur5 import UR5ExperienceReplay, collect_ur5_demos
+from torch_denkf.applications.ur5 import UR5ExperienceReplay
+from torch_denkf.applications.ur5.envs.collect import collect_ur5_demos
 
 STATE = 10  # J1..J6 rad, J7 the gripper's opening rad, x, y, z m
 JOINTS = 7

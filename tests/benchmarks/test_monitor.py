@@ -12,9 +12,8 @@ from benchmarks.monitor.car import CarGuard, gates_of
 from benchmarks.monitor.drives import believed_spans, stretches
 from benchmarks.monitor.scores import Run, afterwards, auroc, detection, false_alarms, spans_of
 from benchmarks.monitor.study import COLUMNS, Study, page
-from torch_denkf.applications.car.vision import PICTURE_SIGNS
 from torch_denkf.applications.car.vision.poses import KITTI_DT
-from torch_denkf.applications.car.vision.signs import flow_signs
+from torch_denkf.applications.car.vision.signs import PICTURE_SIGNS, flow_signs
 
 
 def test_spans_are_first_and_behind_the_last():

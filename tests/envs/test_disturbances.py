@@ -12,7 +12,8 @@ from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
 
 from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import Changed, base_env
-from torch_denkf.applications.car import KITTIReplayEnv, drive_frames, read_kitti_drive, write_drives
+from torch_denkf.applications.car import KITTIReplayEnv, read_kitti_drive, write_drives
+from torch_denkf.applications.car.kitti.frames import drive_frames
 from torch_denkf.data.cache_entry import CachedTensor
 from torch_denkf.envs import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper, _frames
 

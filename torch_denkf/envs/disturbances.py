@@ -4,7 +4,7 @@ The first two and the box are the robustness tests of the DEnKF paper's KITTI co
 pixels of 1242 x 375, so that they fit any size. Pictures are ``[*B, C, H, W]``, uint8 in [0, 255] or floating in
 [0, 1], and keep their dtype; every frame has its own draws. Append a disturbance to an environment that emits frames
 (after ``ToTensorImage``), or call it on data. What follows from frames must be made of the disturbed ones: of a drive
-disturb the ``image``, whose difference images :func:`torch_denkf.applications.car.drive_frames` and
+disturb the ``image``, whose difference images :func:`torch_denkf.applications.car.kitti.frames.drive_frames` and
 :class:`torch_denkf.applications.car.KITTIReplayEnv` make afterwards.
 """
 

@@ -20,7 +20,7 @@ class SignGate(SubModel):
     """Marks readings as not observed whose signs are larger than they are on clean data.
 
     A *sign* is a number that is small while a sensor is sound and large when it fails, whatever it reads: the share of
-    a picture that is black (:func:`torch_denkf.applications.car.vision.picture_signs`), the residual of a fit, a
+    a picture that is black (:func:`torch_denkf.applications.car.vision.signs.picture_signs`), the residual of a fit, a
     motor's temperature. It tells at once what innovations tell after some steps, or never. Put this module in front of
     the filter, or of its sensor; an :class:`InnovationMonitor` raises its alarm by the same signs.
 

@@ -27,7 +27,8 @@ from tests.filters.factories import linear_kalman
 from tests.training.problem import make_trainer
 from torch_denkf.applications.car import read_kitti_drive, with_motion
 from torch_denkf.applications.car.kitti.render import render_drives
-from torch_denkf.applications.ur5 import UR5ExperienceReplay, collect_ur5_demos
+from torch_denkf.applications.ur5 import UR5ExperienceReplay
+from torch_denkf.applications.ur5.envs.collect import collect_ur5_demos
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.pretrained import from_pretrained, save_pretrained
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint

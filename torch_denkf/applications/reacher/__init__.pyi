@@ -1,8 +1,7 @@
-from .encoders import NoisyEncoders, reacher_env
+from .encoders import reacher_env
 from .filter import reacher
 
 __all__ = [
-    "NoisyEncoders",
     "reacher",
     "reacher_env",
 ]

@@ -14,9 +14,9 @@ import torch
 from evo.core import sync
 from evo.tools import file_interface
 
-from torch_denkf.applications.car import read_camera, read_frames, read_kitti_drive, track
+from torch_denkf.applications.car import read_kitti_drive, track
 from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
-from torch_denkf.applications.car.odometry.images import read_times
+from torch_denkf.applications.car.odometry.images import read_camera, read_frames, read_times
 from torch_denkf.applications.car.odometry.paths import read_path
 from torch_denkf.cli.main import main
 from torch_denkf.pretrained import from_pretrained

@@ -10,7 +10,8 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayB
 from torchrl.envs import Compose, InitTracker, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torch_denkf.applications.car import KITTIReplayEnv, dead_reckoning, drive_frames, read_kitti_drive, write_drives
+from torch_denkf.applications.car import KITTIReplayEnv, dead_reckoning, read_kitti_drive, write_drives
+from torch_denkf.applications.car.kitti.frames import drive_frames
 from torch_denkf.applications.car.vision.poses import poses_to_state, state_to_poses
 
 ROWS = 24

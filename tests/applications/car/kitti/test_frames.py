@@ -4,8 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.applications.car import drive_frames
-from torch_denkf.applications.car.kitti.frames import frames_at
+from torch_denkf.applications.car.kitti.frames import drive_frames, frames_at
 
 
 def make_drive(rows=8, missing=(), channels=3, size=(4, 6), seed=0):

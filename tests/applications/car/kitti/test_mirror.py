@@ -5,8 +5,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.applications.car import dead_reckoning, drive_frames, read_kitti_drive, with_motion, write_drives
+from torch_denkf.applications.car import dead_reckoning, read_kitti_drive, with_motion, write_drives
 from torch_denkf.applications.car.kitti.files import read_poses
+from torch_denkf.applications.car.kitti.frames import drive_frames
 from torch_denkf.applications.car.kitti.mirror import mirror_drive
 from torch_denkf.applications.car.kitti.render import random_drive, render_drives
 from torch_denkf.applications.car.vision.poses import poses_to_state

@@ -9,11 +9,10 @@ import torch_denkf.applications.car.kitti.motion as motion_module
 from tests.applications.car.vision.drives_for_tests import rendered
 from tests.applications.car.vision.plane_for_tests import as_image, random_texture
 from torch_denkf.applications.car import read_kitti_drive, with_motion, write_drives
-from torch_denkf.applications.car.vision import picture_signs
 from torch_denkf.applications.car.vision.epipolar import two_view_motion
 from torch_denkf.applications.car.vision.motion import image_motion
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
-from torch_denkf.applications.car.vision.signs import static_region
+from torch_denkf.applications.car.vision.signs import picture_signs, static_region
 
 cv2.setNumThreads(1)
 ROWS = 8

@@ -12,13 +12,8 @@ from torchrl.envs.transforms import ObservationNorm
 
 import torch_denkf.applications.car.kitti.drive as kitti_module
 from tests.data import replay_for_tests as shared
-from torch_denkf.applications.car import (
-    KITTIOdometryExperienceReplay,
-    drive_frames,
-    read_kitti_drive,
-    with_motion,
-    write_drives,
-)
+from torch_denkf.applications.car import KITTIOdometryExperienceReplay, read_kitti_drive, with_motion, write_drives
+from torch_denkf.applications.car.kitti.frames import drive_frames
 from torch_denkf.applications.car.kitti.mirror import mirror_drive
 from torch_denkf.data.cache_entry import CachedTensor
 

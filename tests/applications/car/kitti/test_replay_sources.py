@@ -9,7 +9,8 @@ import torch
 
 from tests.applications.car.kitti.test_drive import make
 from tests.real_data import KITTI
-from torch_denkf.applications.car import KITTIOdometryExperienceReplay, drive_frames, read_kitti_drive
+from torch_denkf.applications.car import KITTIOdometryExperienceReplay, read_kitti_drive
+from torch_denkf.applications.car.kitti.frames import drive_frames
 from torch_denkf.applications.car.kitti.mirror import mirror_drive
 
 SIZE = (12, 36)

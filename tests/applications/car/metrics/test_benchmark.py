@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from tests.applications.car.metrics.paths_for_tests import evo_errors, straight, winding
-from torch_denkf.applications.car import kitti_endpoint_error
 from torch_denkf.applications.car.metrics.benchmark import kitti_pathlength_error
+from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
 from torch_denkf.functional import wrap_angles
 
 

@@ -10,7 +10,7 @@ from evo.core.metrics import RPE
 from evo.core.units import Unit
 
 from tests.applications.car.metrics.paths_for_tests import evo_errors, matrices, straight, winding
-from torch_denkf.applications.car import kitti_devkit_error
+from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
 
 LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)
 

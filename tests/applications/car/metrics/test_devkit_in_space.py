@@ -2,7 +2,7 @@
 
 import torch
 
-from torch_denkf.applications.car import kitti_devkit_error
+from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
 from torch_denkf.functional.manifolds import SE3, SO3
 
 

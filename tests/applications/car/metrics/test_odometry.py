@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from tests.real_data import KITTI
-from torch_denkf.applications.car import dead_reckoning, kitti_endpoint_error
+from torch_denkf.applications.car import dead_reckoning
+from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
 from torch_denkf.functional import wrap_angles
 
 POSES = KITTI / "poses"

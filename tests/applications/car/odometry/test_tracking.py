@@ -10,10 +10,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.applications.car import read_frames, read_kitti_drive, track, with_motion
+from torch_denkf.applications.car import read_kitti_drive, track, with_motion
 from torch_denkf.applications.car.kitti.gaps import bridge_gaps
 from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.applications.car.odometry.filter import car_filter
+from torch_denkf.applications.car.odometry.images import read_frames
 from torch_denkf.applications.car.odometry.tracking import _Clock
 from torch_denkf.applications.car.vision.motion import image_motion
 from torch_denkf.applications.car.vision.shapes import ROAD_SHIFTS

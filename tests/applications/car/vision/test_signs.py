@@ -8,13 +8,19 @@ import pytest
 import torch
 
 from tests.applications.car.vision.drives_for_tests import rendered
-from torch_denkf.applications.car.vision import PICTURE_SIGNS, picture_signs
 from torch_denkf.applications.car.vision.camera import CanonicalCamera
 from torch_denkf.applications.car.vision.expansion import coarse_cells
 from torch_denkf.applications.car.vision.flow import coarse_flow
 from torch_denkf.applications.car.vision.hidden import continue_flow
 from torch_denkf.applications.car.vision.motion import image_motion
-from torch_denkf.applications.car.vision.signs import FLOW_SIGNS, flow_signs, plane_distance, static_region
+from torch_denkf.applications.car.vision.signs import (
+    FLOW_SIGNS,
+    PICTURE_SIGNS,
+    flow_signs,
+    picture_signs,
+    plane_distance,
+    static_region,
+)
 
 cv2.setNumThreads(1)
 HEIGHT = 1.65

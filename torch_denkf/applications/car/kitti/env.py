@@ -22,7 +22,7 @@ class KITTIReplayEnv(RowsEnv):
     """Replays sub-sequences of one KITTI drive, one for each element of the batch, in lockstep.
 
     Emits, at reset and at each step, the row t of the drive exactly as
-    :func:`torch_denkf.applications.car.drive_frames` has it:
+    :func:`torch_denkf.applications.car.kitti.frames.drive_frames` has it:
 
     ============ ================ ====================================================================================
     key          shape            content

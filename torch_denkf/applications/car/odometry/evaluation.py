@@ -68,9 +68,9 @@ def evaluate_car_filter(
     ``drive``, ``method``        ``"filter"``, ``"dead reckoning"`` (the sensor's mean readings, integrated), or
                                  ``"floor"`` (the true velocities, integrated)
     ``frames``, ``window``       of the drive; steps of the end point errors
-    ``translation_m_per_m``      end point error, see :func:`torch_denkf.applications.car.kitti_endpoint_error`
+    ``translation_m_per_m``      end point error, as ``metrics.odometry.kitti_endpoint_error`` computes it
     ``rotation_deg_per_m``       its rotation
-    ``devkit_t_rel_percent``,    of the planar path, see :func:`torch_denkf.applications.car.kitti_devkit_error`; left
+    ``devkit_t_rel_percent``,    of the planar path, as ``metrics.devkit.kitti_devkit_error`` computes it; left
     ``devkit_r_rel_deg_per_m``   out below 100 m
     ``coverage90_v``,            share of the true speeds, and of the true turn rates, in the filter's 90 % intervals
     ``coverage90_theta_dot``

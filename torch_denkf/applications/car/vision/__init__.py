@@ -1,6 +1,1 @@
 """Image geometry of a camera over a road: arrays in, arrays out, by OpenCV."""
-
-import lazy_loader
-
-# __init__.pyi names what is here, and where; a module is imported when one of its names is first used.
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
