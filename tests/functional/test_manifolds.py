@@ -232,6 +232,17 @@ def test_a_step_on_the_left_is_the_adjoints_on_the_right(space):
     assert_same_points(space, space.compose(space.exp(ahead.squeeze(-1)), point), right)
 
 
+@pytest.mark.parametrize("space", SPACES, ids=repr)
+def test_bases_are_the_derivatives_of_steps(space):
+    point, zero = points(space), torch.zeros(space.tangent_dim)
+    plus = torch.func.jacrev(lambda step: space.plus(point, step))(zero)
+    minus = torch.func.jacrev(lambda other: space.minus(other, point))(point)
+    torch.testing.assert_close(space.basis(point), plus, **EXACT)
+    # A tangent says nothing of numbers off the space.
+    torch.testing.assert_close(space.dual_basis(point) @ plus, minus @ plus, **EXACT)
+    torch.testing.assert_close(space.dual_basis(point) @ plus, torch.eye(space.tangent_dim), **EXACT)
+
+
 def test_quaternions_that_other_libraries_store_with_w_last():
     from scipy.spatial.transform import Rotation  # (x, y, z, w)
 
@@ -310,6 +321,8 @@ def test_gradients(space):
     assert torch.autograd.gradcheck(space.exp, (tangent,))
     assert torch.autograd.gradcheck(space.right_jacobian, (tangent,))
     assert torch.autograd.gradcheck(space.adjoint, (point,))
+    assert torch.autograd.gradcheck(space.basis, (point,))
+    assert torch.autograd.gradcheck(space.dual_basis, (point,))
     assert torch.autograd.gradcheck(mean, (point.detach(), group))
     assert torch.autograd.gradgradcheck(space.exp, (tangent,))
 
@@ -437,6 +450,8 @@ def test_vmap_and_any_batch_dimensions(space):
         (space.mean, (point,)),
         (space.right_jacobian, (tangent,)),
         (space.adjoint, (point,)),
+        (space.basis, (point,)),
+        (space.dual_basis, (point,)),
     ):
         expected = function(*inputs)
         torch.testing.assert_close(torch.func.vmap(function)(*inputs), expected, **EXACT)
@@ -483,4 +498,5 @@ def test_precision_stays(space):
     point, tangent = points(space, 3).float(), near(space, 3).float()
     values = [space.plus(point, tangent), space.minus(point, point), space.mean(point), space.normalise(point)]
     values += [space.right_jacobian(tangent), space.adjoint(point), space.neutral(point)]
+    values += [space.basis(point), space.dual_basis(point)]
     assert {value.dtype for value in values} == {torch.float32}

@@ -51,7 +51,7 @@ class Space:
     """A space of points; the base of all.
 
     All spaces here are Lie groups. A subclass writes :meth:`compose`, :meth:`inverse`, :meth:`exp`, :meth:`log`,
-    :meth:`right_jacobian`, :meth:`adjoint` and :meth:`neutral`. Two spaces of one kind are equal.
+    :meth:`right_jacobian`, :meth:`adjoint`, :meth:`basis`, :meth:`dual_basis` and :meth:`neutral`. Two spaces of one kind are equal.
 
     Attributes:
         point_dim: numbers of a point, P.
@@ -84,6 +84,14 @@ class Space:
 
     def adjoint(self, point: Tensor) -> Tensor:
         r"""A with :math:`x \exp(d) x^{-1} = \exp(A d)`: ``[*, D, D]`` of ``[*, P]``."""
+        raise NotImplementedError
+
+    def basis(self, point: Tensor) -> Tensor:
+        r"""B with :math:`x \oplus d \approx x + B d` for a small d: ``[*, P, D]`` of ``[*, P]``."""
+        raise NotImplementedError
+
+    def dual_basis(self, point: Tensor) -> Tensor:
+        r"""B with :math:`(x + e) \ominus x \approx B e` for a small e: ``[*, D, P]`` of ``[*, P]``."""
         raise NotImplementedError
 
     def neutral(self, like: Tensor | None = None) -> Tensor:
@@ -209,6 +217,14 @@ class Euclidean(Space):
         """The identity."""
         return _eye(point, self.size)
 
+    def basis(self, point):
+        """The identity."""
+        return _eye(point, self.size)
+
+    def dual_basis(self, point):
+        """The identity."""
+        return _eye(point, self.size)
+
     def neutral(self, like=None):
         """Zeros."""
         return torch.zeros(self.size) if like is None else like.new_zeros(self.size)
@@ -257,6 +273,14 @@ class Circle(Space):
         return _eye(tangent, 1)
 
     def adjoint(self, point):
+        """One."""
+        return _eye(point, 1)
+
+    def basis(self, point):
+        """One."""
+        return _eye(point, 1)
+
+    def dual_basis(self, point):
         """One."""
         return _eye(point, 1)
 
@@ -332,6 +356,17 @@ class SE2(Space):
         cos, sin, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
         rows = [[one, zero, zero], [y, cos, -sin], [-x, sin, cos]]
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+    def basis(self, point):
+        """A rotation of what leads ahead and to the left."""
+        cos, sin = point[..., 0].cos(), point[..., 0].sin()
+        zero, one = torch.zeros_like(cos), torch.ones_like(cos)
+        rows = [[one, zero, zero], [zero, cos, -sin], [zero, sin, cos]]
+        return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+    def dual_basis(self, point):
+        """The rotation back."""
+        return self.basis(point).mT
 
     def neutral(self, like=None):
         """Zeros."""
@@ -442,6 +477,14 @@ class _RotationAndVectors(Space):
         others = _eye(block[..., 0], self.vectors)[..., None, :, None] * block[..., None, :, None, :]
         others = others.flatten(-2).flatten(-3, -2)
         return torch.cat([first, torch.cat([torch.zeros_like(others[..., :3, :]), others], -2)], -1)
+
+    def basis(self, point):
+        """Half the quaternion's products with i, j and k; the rotation, once for each vector."""
+        return _blocks([_products(point) / 2, *[rotation_matrix(point[..., :4])] * self.vectors])
+
+    def dual_basis(self, point):
+        """Its transpose, with twice the products."""
+        return _blocks([2 * _products(point), *[rotation_matrix(point[..., :4])] * self.vectors]).mT
 
     def neutral(self, like=None):
         """No rotation, zeros."""
@@ -572,6 +615,14 @@ class Opposite(Space):
         """The inverse of the space's: it takes errors in the world's axes to the body's."""
         return self.part.adjoint(self.part.inverse(point))
 
+    def basis(self, point):
+        """That of the space, of the step as the body sees it."""
+        return self.part.basis(point) @ self.adjoint(point)
+
+    def dual_basis(self, point):
+        """That of the space, as the world sees it."""
+        return self.part.adjoint(point) @ self.part.dual_basis(point)
+
     def neutral(self, like=None):
         """That of the space."""
         return self.part.neutral(like)
@@ -632,6 +683,14 @@ class Product(Space):
     def adjoint(self, point):
         """Blocks on the diagonal."""
         return _blocks([part.adjoint(own) for part, own in zip(self.parts, self.points(point), strict=True)])
+
+    def basis(self, point):
+        """Blocks on the diagonal."""
+        return _blocks([part.basis(own) for part, own in zip(self.parts, self.points(point), strict=True)])
+
+    def dual_basis(self, point):
+        """Blocks on the diagonal."""
+        return _blocks([part.dual_basis(own) for part, own in zip(self.parts, self.points(point), strict=True)])
 
     def neutral(self, like=None):
         """Part by part."""
@@ -710,6 +769,14 @@ class Repeated(Space):
     def adjoint(self, point):
         """Blocks on the diagonal."""
         return self._diagonal(self.part.adjoint, point)
+
+    def basis(self, point):
+        """Blocks on the diagonal."""
+        return self._diagonal(self.part.basis, point)
+
+    def dual_basis(self, point):
+        """Blocks on the diagonal."""
+        return self._diagonal(self.part.dual_basis, point)
 
     def neutral(self, like=None):
         """N times the same."""
@@ -854,6 +921,13 @@ def skew(vector: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
+def _products(point: Tensor) -> Tensor:
+    """The products of a point's quaternion with i, j and k, ``[*, 4, 3]``."""
+    w, x, y, z = point[..., :4].unbind(-1)
+    rows = [[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
 def _conjugate(quaternion: Tensor) -> Tensor:
     return torch.cat([quaternion[..., :1], -quaternion[..., 1:]], -1)
 
@@ -881,7 +955,7 @@ def _eye(like: Tensor, size: int) -> Tensor:
 
 
 def _blocks(parts: Sequence[Tensor]) -> Tensor:
-    """Square matrices ``[*, D_k, D_k]`` on the diagonal of one."""
+    """Matrices on the diagonal of one."""
     sizes = [part.shape[-1] for part in parts]
     rows = []
     for place, part in enumerate(parts):

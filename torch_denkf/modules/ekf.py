@@ -124,15 +124,9 @@ def _linearise_on(
     image_space: Space,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """The image of a point ``[*B, P]``, and the Jacobian ``[*B, N, D]`` between the tangents of both."""
-    image, mask = model(entries, mean.unsqueeze(-2), call)
-
-    def tangents(rows: Entries, states: Tensor, call: Call) -> tuple[Tensor, None]:
-        moved, _ = model(rows, space.plus(mean.unsqueeze(-2).expand(*states.shape[:-1], -1), states), call)
-        return image_space.minus(moved, image.expand(moved.shape)), None
-
-    zero = torch.zeros_like(mean[..., :1]).expand(*mean.shape[:-1], space.tangent_dim)
-    _, jacobian, _ = _linearise(tangents, entries, call, zero, image_space.tangent_dim)
-    return image.squeeze(-2), jacobian, mask
+    image, jacobian, mask = _linearise(model, entries, call, mean, image_space.point_dim)
+    space.check(point=mean)
+    return image, image_space.dual_basis(image) @ jacobian @ space.basis(mean), mask
 
 
 def _linearise(

@@ -36,6 +36,9 @@ def test_it_is_a_group_and_its_jacobian_that_of_autodiff():
     torch.testing.assert_close(space.right_jacobian(tangent), jacobian)
     moved = space.compose(space.compose(one, space.exp(step)), space.inverse(one))
     torch.testing.assert_close(space.exp(space.adjoint(one) @ step), moved)
+    basis = torch.func.jacrev(lambda more: space.plus(one, more))(torch.zeros_like(step))
+    torch.testing.assert_close(space.basis(one), basis)
+    torch.testing.assert_close(space.dual_basis(one) @ basis, torch.eye(space.tangent_dim))
 
 
 def test_a_step_turns_the_world():

@@ -79,6 +79,14 @@ class LeggedSpace(Space):
         """Takes errors in the world's axes to the sensor's."""
         return _matrix_in_order(self.in_groups.adjoint(_in_groups(point, 10)))
 
+    def basis(self, point):
+        """How points move by steps in the world's axes."""
+        return _matrix_in_order(self.in_groups.basis(_in_groups(point, 10)), rows=10)
+
+    def dual_basis(self, point):
+        """The step in the world's axes that leads to a point nearby."""
+        return _matrix_in_order(self.in_groups.dual_basis(_in_groups(point, 10)), columns=10)
+
     def neutral(self, like=None):
         """No rotation, zeros."""
         return _in_order(self.in_groups.neutral(like), 10)
@@ -112,8 +120,8 @@ def _in_order(value: Tensor, begin: int) -> Tensor:
     return torch.cat([value[..., :begin], value[..., -6:], value[..., begin:-6]], -1)
 
 
-def _matrix_in_order(value: Tensor) -> Tensor:
-    return _in_order(_in_order(value, 9).mT, 9).mT
+def _matrix_in_order(value: Tensor, rows: int = 9, columns: int = 9) -> Tensor:
+    return _in_order(_in_order(value, columns).mT, rows).mT
 
 
 class LeggedMotion(Motion):
