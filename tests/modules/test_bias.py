@@ -331,3 +331,8 @@ def test_white_residuals_and_few_are_refused():
         FadingBias.from_residuals(residuals(2, 20))
     with pytest.raises(ValueError, match=r"\[N, T, K\]"):
         FadingBias.from_residuals(torch.randn(50, 100))
+
+
+def test_of_one_run_nothing_is_the_runs_own():
+    with pytest.raises(ValueError, match="about ten; got one"):
+        FadingBias.from_residuals(residuals(1, 300), per_run=True)

@@ -101,8 +101,8 @@ class FadingBias(nn.Module):
             K biases, or 2 K; and the standard deviations of the white part ``[K]``, for the noise of the reading.
 
         Raises:
-            ValueError: if the shape is another, a component has fewer than 100 pairs of neighbours, or its errors do
-                not last at all.
+            ValueError: if the shape is another, a component has fewer than 100 pairs of neighbours, its errors do not
+                last at all, or ``per_run`` is given one run.
 
         Example:
             >>> torch.manual_seed(0)
@@ -117,6 +117,8 @@ class FadingBias(nn.Module):
         """
         if residuals.ndim != 3 or residuals.shape[1] < 3:
             raise ValueError(f"residuals must be [N, T, K], T at least 3; got {list(residuals.shape)}")
+        if per_run and len(residuals) < 2:
+            raise ValueError("per_run=True tells errors of a whole run by how runs differ: give about ten; got one")
         values = residuals.detach().double()
         known = ~values.isnan()
         found = [_fit(*_autocovariance(values[..., k], known[..., k]), k, per_run) for k in range(values.shape[-1])]

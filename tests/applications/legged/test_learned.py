@@ -9,6 +9,7 @@ from torch.testing import assert_close
 from torchrl.envs import TransformedEnv
 
 from tests.applications.legged.test_environment import trotting
+from torch_denkf import from_pretrained
 from torch_denkf.applications.legged import (
     QUADRUPED,
     LearnedContacts,
@@ -259,3 +260,19 @@ def test_rows_without_a_standing_foot_teach_nothing(model, log):
 def test_other_numbers_of_rows_are_named(model, log):
     with pytest.raises(ValueError, match=r"rows of 'imu' .* last_rows"):
         contacts_of(model).loss(with_last_rows(log, 11))
+
+
+def test_the_shipped_filter_knows_feet_that_slide():
+    """Against contacts that a threshold tells alone, with the noises of its validation, where friction is .2."""
+    base = quadruped_env(friction=0.2, seed=7)
+    rows = trotting(base, 200).select(*KEYS, "true").unsqueeze(0)
+    plain = legged_filter(
+        base.model, **QUADRUPED, dt=base.dt, kind="EKF", noises=LeggedNoises(kinematics=0.1, rate=1.0)
+    )
+    errors = []
+    for filter in (from_pretrained("quadruped"), plain):
+        with torch.no_grad():
+            out = filter.sequence(with_last_rows(rows, 10, every=5))
+        error = out["belief", "velocity"] - rows["true", "velocity"]
+        errors.append(error[:, 50:].square().sum(-1).mean().sqrt())
+    assert errors[0] < 0.7 * errors[1]
