@@ -185,6 +185,6 @@ plt.show()
 # %%
 # From here
 # ---------
-# * All that ``FusedFilter`` can do, and how to build the same of single modules: :doc:`/how_to/several_sensors`.
+# * All that ``FusedFilter`` can do: :doc:`/how_to/several_sensors`.
 # * To notice a wrong sensor, and say which one it is: :doc:`plot_monitor`.
 # * A simulated arm and real drives of KITTI, each sensor late, wrong or missing: :doc:`/results/fusion`.
