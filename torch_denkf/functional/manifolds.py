@@ -51,7 +51,8 @@ class Space:
     """A space of points; the base of all.
 
     All spaces here are Lie groups. A subclass writes :meth:`compose`, :meth:`inverse`, :meth:`exp`, :meth:`log`,
-    :meth:`right_jacobian`, :meth:`adjoint`, :meth:`basis`, :meth:`dual_basis` and :meth:`neutral`. Two spaces of one kind are equal.
+    :meth:`right_jacobian`, :meth:`adjoint`, :meth:`basis`, :meth:`dual_basis` and :meth:`neutral`. Two spaces of one
+    kind are equal.
 
     Attributes:
         point_dim: numbers of a point, P.
