@@ -6,6 +6,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torch_denkf.applications.legged import QUADRUPED, LeggedErrors, quadruped_env, trot
 from torch_denkf.applications.legged.environment import LeggedEnv
+from torch_denkf.applications.legged.humanoid import humanoid_env
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.applications.legged.motion import LeggedSpace
 from torch_denkf.functional.inertial import move_inertially
@@ -130,3 +131,18 @@ def test_pushes_are_level_and_come_once_a_second():
 def test_a_floor_without_friction_is_refused(name):
     with pytest.raises(ValueError, match=name):
         quadruped_env(**{name: 0.0})
+
+
+@pytest.mark.parametrize("make", [quadruped_env, humanoid_env])
+def test_a_force_from_outside_acts_until_it_is_taken_off(make):
+    """As ropes pull that an environment around this one sets: the robot gives way, and the force is not overwritten."""
+    places = []
+    for force in (0.0, 100.0):
+        env = make(PERFECT)
+        td = env.reset()
+        env.data.xfrc_applied[1, 1] = force
+        for _ in range(30):
+            td = env.step(td.set("action", torch.zeros(env.action_spec.shape)))["next"]
+        assert env.data.xfrc_applied[1].tolist() == [0.0, force, 0.0, 0.0, 0.0, 0.0]
+        places.append(td["true", "position"][1])
+    assert places[1] - places[0] > 2e-3

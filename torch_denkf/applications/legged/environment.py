@@ -134,7 +134,7 @@ class LeggedEnv(EnvBase):
         six = [self.errors.gyro_bias] * 3 + [self.errors.accelerometer_bias] * 3
         self.bias = np.array(six) * self.random.standard_normal(6)
         self.offset = self.errors.joint_offset * self.random.standard_normal(len(self.columns))
-        self.stands, self.pushed, self.push = np.zeros(len(self.feet), dtype=bool), 0, np.zeros(6)
+        self.stands, self.pushed = np.zeros(len(self.feet), dtype=bool), 0
         for _ in range(round(0.5 / self.dt)):
             readings = self._move()
         return readings
@@ -151,8 +151,7 @@ class LeggedEnv(EnvBase):
         """Simulates a step, and reads the sensors."""
         data, total = self.data, np.zeros(6)
         for _ in range(self.substeps):
-            data.xfrc_applied[self.base] = self._force_on_base()
-            mujoco.mj_step(self.model, data)
+            self._simulate()
             # The simulator goes on with the turn at the end of its step, and with the force at its beginning.
             total[:3] += self.to_sensor @ data.qvel[3:6]
             total[3:] += data.sensordata[self.force_at : self.force_at + 3]
@@ -169,15 +168,16 @@ class LeggedEnv(EnvBase):
 
     def _push(self) -> None:
         """Begins or ends a force on the base."""
+        force = self.data.xfrc_applied[self.base]
         self.pushed -= 1
         if self.pushed <= 0:
-            self.push[:] = 0.0
+            force[:] = 0.0
             if self.random.random() < self.dt:
-                self.push[:2], self.pushed = self.pushes * self.random.standard_normal(2), round(0.1 / self.dt)
+                force[:2], self.pushed = self.pushes * self.random.standard_normal(2), round(0.1 / self.dt)
 
-    def _force_on_base(self) -> np.ndarray:
-        """From outside in the world's axes, in N, and the torque in Nm."""
-        return self.push
+    def _simulate(self) -> None:
+        """One step of the simulator."""
+        mujoco.mj_step(self.model, self.data)
 
     def _with_errors(self, imu: np.ndarray) -> dict:
         e, draw, root = self.errors, self.random.standard_normal, math.sqrt(self.dt)

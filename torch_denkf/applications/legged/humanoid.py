@@ -36,25 +36,31 @@ class HarnessedEnv(LeggedEnv):
         super().__init__(*args, **options)
 
     def _reset(self, *args, **kwargs):
-        self.place, self.heading, self.begins = np.zeros(2), 0.0, True
+        self.place, self.heading, self.begun = np.zeros(2), 0.0, math.inf  # the harness rests until the episode begins
         readings = super()._reset(*args, **kwargs)
-        self.begins, self.begun = False, self.data.time
+        self.begun = self.data.time
         return readings
 
-    def _force_on_base(self) -> np.ndarray:
+    def _simulate(self) -> None:
+        force = self.data.xfrc_applied[self.base]
+        others = force.copy()
+        force += self._harness()
+        super()._simulate()
+        force[:] = others
+
+    def _harness(self) -> np.ndarray:
+        """Its force on the base in N, and its torque in Nm, in the world's axes."""
         data, step = self.data, self.model.opt.timestep
-        share = 0.0 if self.begins else min(1.0, data.time - self.begun)
+        share = min(1.0, max(0.0, data.time - self.begun))
         self.heading += share * self.turn * step
         ahead = np.array([math.cos(self.heading), math.sin(self.heading)])
         self.place = self.place + share * self.speed * step * ahead
         axes = data.xmat[self.base].reshape(3, 3)
         wanted = np.array([[ahead[0], -ahead[1], 0.0], [ahead[1], ahead[0], 0.0], [0.0, 0.0, 1.0]])
         off = 0.5 * np.cross(axes.T, wanted.T).sum(0)
-        force = self.push.copy()
-        force[:2] += 400 * (self.place - data.qpos[:2]) - 80 * (data.qvel[:2] - share * self.speed * ahead)
-        force[2] += max(0.0, 1500 * (_HEIGHT - data.qpos[2])) - 100 * data.qvel[2]
-        force[3:] += 600 * off - 40 * axes @ data.qvel[3:6]
-        return force
+        level = 400 * (self.place - data.qpos[:2]) - 80 * (data.qvel[:2] - share * self.speed * ahead)
+        upwards = max(0.0, 1500 * (_HEIGHT - data.qpos[2])) - 100 * data.qvel[2]
+        return np.array([*level, upwards, *(600 * off - 40 * axes @ data.qvel[3:6])])
 
 
 def humanoid_env(
