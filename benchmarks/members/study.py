@@ -22,7 +22,6 @@ COLUMNS = Columns(
     order=lambda row: (row["task"], row["filter"], row.get("members", 0)),
 )
 TITLES = {"walks": "ten walks", "lorenz96": "Lorenz-96", "ur5": "UR5 arm"}  # others are titled by their name
-DEFAULT = 3.0  # threshold where no validation data choose one
 
 
 @dataclass(frozen=True)
@@ -73,8 +72,6 @@ def rows_of(task: Task, study: Study, there: list[dict]) -> Iterator[dict]:
 def chosen(task: Task, study: Study, members: int) -> float | None:
     """The threshold with the least error on validation data; ``None`` where members are too few for any."""
     able = [threshold for threshold in study.thresholds if threshold**2 < members - 1]
-    if task.validate is None:
-        return DEFAULT if DEFAULT in able else None
     scores: dict[float, Score] = {threshold: task.validate(members, threshold) for threshold in able}
     return min(scores, key=lambda threshold: scores[threshold].error) if scores else None
 
@@ -85,8 +82,7 @@ def page(rows: list[dict], study: Study, errors: dict[str, str]) -> str:
         "# How many members?",
         "",
         'Error, and share of the truth within the 90 % intervals, without and with `localisation="significance"`.',
-        "Validation data of the same kind choose the threshold, and of Lorenz-96 the inflation. For `ur5`",
-        "it is the default.",
+        "Validation data of the same kind choose the threshold, and of Lorenz-96 the inflation.",
         "",
         *head("task", "error", "members", "without", "held", "with", "held", "threshold"),
     ]

@@ -18,7 +18,9 @@ from benchmarks.common.lorenz96 import lorenz96_step
 from benchmarks.wheels.task import ensemble_filter, gaussian_filter, recordings
 from torch_denkf import DEnKF, Filter, KalmanFilter, from_pretrained
 from torch_denkf.applications.reacher import reacher_env
-from torch_denkf.applications.ur5.train import evaluate_ur5_table, whole_demos
+from torch_denkf.applications.ur5.envs.collect import collect_ur5_demos
+from torch_denkf.applications.ur5.filter import UR5TableSettings
+from torch_denkf.applications.ur5.train import evaluate_ur5_table
 from torch_denkf.functional import analyse
 from torch_denkf.functional.inflation import inflate
 from torch_denkf.metrics import interval_coverage
@@ -46,14 +48,14 @@ class Task:
         name: of the task.
         error: what its error is of, with the unit.
         score: of a filter with so many members, and the threshold of the significance or ``None``.
-        validate: the same on other data, by which the threshold is chosen; ``None`` where it is the default.
+        validate: the same on other data, by which the threshold is chosen.
         reference: name and score of a filter without members; ``None`` for none.
     """
 
     name: str
     error: str
     score: Callable[[int, float | None], Score]
-    validate: Callable[[int, float | None], Score] | None = None
+    validate: Callable[[int, float | None], Score]
     reference: tuple[str, Score] | None = None
 
 
@@ -179,7 +181,7 @@ def lorenz96(seeds: int = 4, cycles: int = 600, inflations: tuple[float, ...] = 
 def manipulator(folder: Path, demos: int = 100, updates: int = 8000) -> Task:
     """Joint velocities of dm_control's manipulator by the filter of ``benchmarks.arms``, which learned its motion.
 
-    Cosine, sine and velocity of its joints are 24 numbers, of which noisy encoders read 16.
+    Cosine, sine and velocity of its joints are 12 numbers, of which noisy encoders read 8.
     """
     arm = ARMS["manipulator"]
     shipped = trained(arm, False, Study(demos=demos, motion_updates=updates), folder)
@@ -229,12 +231,15 @@ def reacher(episodes: int = 10, steps: int = 400) -> Task:
     return Task("reacher", "velocities, rad/s", partial(score, test), partial(score, other))
 
 
-def ur5(folder: Path, demos: int = 30) -> Task:
+def ur5(folder: Path, demos: int = 200, others: int = 100) -> Task:
     """Joints of the UR5 at its table by the filter that comes with the library, on demos that it has not seen."""
-    data, shipped = whole_demos(folder, demos, progress=False), from_pretrained("ur5-table")
+    shipped, side = from_pretrained("ur5-table"), UR5TableSettings.pixels
+    test, other = (folder / "demos/sequences", folder / "validation")
+    for seed, (root, count) in enumerate(((test, demos), (other, others))):
+        collect_ur5_demos(root, count, size=(side, side), seed=seed)
 
-    def score(members: int, threshold: float | None) -> Score:
+    def score(data: Path, members: int, threshold: float | None) -> Score:
         found = evaluate_ur5_table(resized(shipped, members, threshold), data, cache=folder / "cache", progress=False)
         return Score(found["filter"]["joints, deg"], found["held by 90 % intervals"])
 
-    return Task("ur5", "joints, degrees", score)
+    return Task("ur5", "joints, degrees", partial(score, test), partial(score, other))

@@ -22,6 +22,7 @@ __all__ = ["UR5TableFilter", "UR5TableSettings", "ur5_table"]
 
 STATE, JOINTS = 10, 7  # J1..J6 rad, the gripper's opening rad, x, y, z m; the action is the targets of the first seven
 _STEP = 0.05  # rad: a usual way of a joint in a step
+_THRESHOLD = 1.0  # of significance, in standard deviations: chosen on demos that are for neither training nor tests
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ class UR5TableFilter(DEnKF):
             pixel_scale=s.pixel_std,
             encoding_key=("sensor", "encoding"),
         )
-        analysis = EnsembleAnalysis("sensor")
+        analysis = EnsembleAnalysis("sensor", localisation="significance", threshold=_THRESHOLD)
         analysis.inflation = s.inflation
         super().__init__(
             transition=_ArmTransition(s),
