@@ -185,7 +185,7 @@ def manipulator(folder: Path, demos: int = 100, updates: int = 8000) -> Task:
     """
     arm = ARMS["manipulator"]
     shipped = trained(arm, False, Study(demos=demos, motion_updates=updates), folder)
-    test, other = (collect(arm, False, 20, 200, seed) for seed in (1000, 2000))
+    test, other = (collect(arm, False, 60, 200, seed) for seed in (1000, 2000))
 
     def score(data: TensorDict, members: int, threshold: float | None) -> Score:
         shipped.initial.ensemble_size = members

@@ -515,5 +515,16 @@ def test_what_does_not_fit_is_refused():
         BackpropKF(*matrices, process_noise_cov=torch.eye(7), initial=start, observation_key="pose")
     with pytest.raises(ValueError, match="put the biases into the state"):
         make("EKF", sensor_error=FadingBias([0.1], time=10.0))
+    parts = (Turning(), None, Orientation(), ConstantNoise(R, in_key="pose"))
+    plain = {"process_noise": [0.1] * 7, "sensor_error": FadingBias([0.1] * 4, time=10.0)}
+    error, around = "sensor_error is added to readings of plain numbers", AroundState([0.1] * 7, ensemble_size=E)
+    for filter in (EKF, UKF):
+        with pytest.raises(ValueError, match=error):
+            filter(*parts, initial=GaussianAround([0.1] * 7), reading_space=SO3(), observation_key="pose", **plain)
+    with pytest.raises(ValueError, match=error):
+        DEnKF(*parts, EnsembleAnalysis("etkf", reading_space=SO3()), initial=around, **plain)
+    sensor = FusedSensor(Orientation(), R, reading_space=SO3(), sensor_error=plain["sensor_error"])
+    with pytest.raises(ValueError, match=error):
+        FusedFilter(Turning(), {"pose": sensor}, initial=around, process_noise=[0.1] * 7)
     with pytest.raises(TypeError, match="EKFAnalysis is on a space"):
         make("EKF", visibility=Visibility(3, encoding_key="pose"))

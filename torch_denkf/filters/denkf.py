@@ -108,7 +108,8 @@ class DEnKF(Filter):
         check_module("noise", noise)
         check_module("initial", initial)
         if sensor_error is not None:
-            biased = biased_parts(sensor_error, transition, observation, process_noise, initial)
+            of_reading = reading_space if analysis is None else declared(analysis).reading_space
+            biased = biased_parts(sensor_error, transition, observation, process_noise, initial, of_reading)
             transition, observation, process_noise, initial = biased
         if process_noise is not None:
             q = as_process_noise(process_noise, initial)

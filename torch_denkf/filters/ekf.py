@@ -80,7 +80,8 @@ class EKF(GaussianFilter):
     ):
         q = as_process_noise(process_noise, initial)
         if sensor_error is not None:
-            transition, observation, q, initial = biased_parts(sensor_error, transition, observation, q, initial)
+            parts = biased_parts(sensor_error, transition, observation, q, initial, options.get("reading_space"))
+            transition, observation, q, initial = parts
         space = declared(initial).space
         forecast = EKFTransition(transition, q, stop_jacobian_gradient=stop_jacobian_gradient, space=space)
         super().__init__(sensor, noise, forecast, partial(EKFAnalysis, observation), initial=initial, **options)

@@ -79,7 +79,8 @@ class UKF(GaussianFilter):
     ):
         q = as_process_noise(process_noise, initial)
         if sensor_error is not None:
-            transition, observation, q, initial = biased_parts(sensor_error, transition, observation, q, initial)
+            parts = biased_parts(sensor_error, transition, observation, q, initial, options.get("reading_space"))
+            transition, observation, q, initial = parts
         space = declared(initial).space
         forecast = UKFTransition(transition, q, alpha=alpha, beta=beta, kappa=kappa, space=space)
         update = partial(UKFAnalysis, observation, alpha=alpha, beta=beta, kappa=kappa)

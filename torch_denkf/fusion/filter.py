@@ -218,7 +218,8 @@ def _with_errors(transition, process_noise, initial, sensors):
     for name, sensor in sensors.items():
         observation, end = sensor.observation, begin
         if sensor.sensor_error is not None:
-            parts = biased_parts(sensor.sensor_error, transition, observation, process_noise, initial)
+            of_reading = sensor.reading_space
+            parts = biased_parts(sensor.sensor_error, transition, observation, process_noise, initial, of_reading)
             transition, observation, process_noise, initial = parts
             end += len(sensor.sensor_error)
         made[name] = replace(sensor, observation=OfOwnErrors(observation, range(begin, end), total))

@@ -29,6 +29,7 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_values
 from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._running import check_module, declared, reads, run_module, writes
 from torch_denkf.modules._tensors import as_standard_deviations
@@ -354,6 +355,7 @@ def biased_parts(
     observation: TensorDictModuleBase,
     process_noise: TensorDictModuleBase | Sequence[float] | float | None,
     initial: TensorDictModuleBase,
+    reading_space: Space | None = None,
 ) -> BiasedParts:
     """Gives each part of a filter the same biases.
 
@@ -363,6 +365,7 @@ def biased_parts(
         observation: observes them.
         process_noise: of the state; ``None`` for none, where the transition has its own.
         initial: the belief of the state.
+        reading_space: in which the sensor's reading lives; ``None`` for plain numbers.
     """
     if not isinstance(bias, FadingBias):
         raise TypeError(f"sensor_error is a FadingBias, or None; got {type(bias).__name__}")
@@ -371,6 +374,8 @@ def biased_parts(
             f"sensor_error is for states of plain numbers, not for {declared(initial).space}: put the biases into the "
             "state, Product(..., Euclidean(K))."
         )
+    if reading_space is not None:
+        raise ValueError(f"sensor_error is added to readings of plain numbers, not to points of {reading_space}.")
     of_state = as_process_noise(
         torch.zeros_like(bias.std[0]).detach() if process_noise is None else process_noise, initial
     )
