@@ -32,7 +32,7 @@ class Study:
     runs: Path = Path("runs/members")  # demos of the UR5 and the trained motion of the manipulator, made where missing
     members: tuple[int, ...] = (8, 16, 32, 64, 128, 256, 512)
     thresholds: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0)  # of which validation data choose one
-    tasks: tuple[str, ...] = ("walks", "reacher", "manipulator", "lorenz96", "wheels", "ur5")
+    tasks: tuple[str, ...] = ("walks", "reacher", "cartpole", "manipulator", "lorenz96", "wheels", "ur5")
     smoke: bool = False  # two small tasks: do they run?
 
 
@@ -46,7 +46,7 @@ def made(study: Study, name: str) -> Task:
         return tasks.ur5(study.runs / "ur5")
     if name == "manipulator":
         return tasks.manipulator(study.runs / name)
-    return {"wheels": tasks.wheels, "reacher": tasks.reacher}[name]()
+    return {"wheels": tasks.wheels, "reacher": tasks.reacher, "cartpole": tasks.cartpole}[name]()
 
 
 def rows_of(task: Task, study: Study, there: list[dict]) -> Iterator[dict]:

@@ -15,6 +15,7 @@ from torch import Tensor
 from benchmarks.arms.arms import ARMS
 from benchmarks.arms.study import Study, collect, trained
 from benchmarks.common.lorenz96 import lorenz96_step
+from benchmarks.control.cartpole import STEPS, NoisyCartpole, exact_filter
 from benchmarks.wheels.task import ensemble_filter, gaussian_filter, recordings
 from torch_denkf import DEnKF, Filter, KalmanFilter, from_pretrained
 from torch_denkf.applications.reacher import reacher_env
@@ -26,7 +27,7 @@ from torch_denkf.functional.inflation import inflate
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
 
-__all__ = ["Score", "Task", "lorenz96", "manipulator", "reacher", "ur5", "walks", "wheels"]
+__all__ = ["Score", "Task", "cartpole", "lorenz96", "manipulator", "reacher", "ur5", "walks", "wheels"]
 
 LEVEL = 0.9  # of the intervals
 WALKS, WALK_STD, READING_STD = 10, 0.1, 0.5  # walks, each step of one, each reading of one
@@ -229,6 +230,24 @@ def reacher(episodes: int = 10, steps: int = 400) -> Task:
         return filtered(resized(shipped, members, threshold), data, 1, slice(2, 4))
 
     return Task("reacher", "velocities, rad/s", partial(score, test), partial(score, other))
+
+
+def _pushes(noise: float, episodes: int, seed: int) -> TensorDict:
+    torch.manual_seed(seed)
+    keys = ("state", "observation", "observed", "action")
+    return NoisyCartpole(episodes, noise, missing=0.3, seed=seed).rollout(STEPS).select(*keys)
+
+
+def cartpole(noise: float = 0.3, episodes: int = 20) -> Task:
+    """Velocities of the cartpole of ``benchmarks.control`` under random pushes, by a filter that knows its physics."""
+    test, other = _pushes(noise, episodes, 0), _pushes(noise, episodes, 1)
+
+    def score(data: TensorDict, members: int, threshold: float | None) -> Score:
+        filter = exact_filter(noise, members)
+        localise(filter, threshold)
+        return filtered(filter, data, 1, slice(3, 5))
+
+    return Task("cartpole", "velocities", partial(score, test), partial(score, other))
 
 
 def ur5(folder: Path, demos: int = 200, others: int = 100) -> Task:

@@ -647,6 +647,8 @@ def test_what_is_refused():
         FusedFilter(LinearTransition(F, Q), {}, initial=moments)
     with pytest.raises(TypeError, match="sensors is a dict"):
         FusedFilter(LinearTransition(F, Q), [one["a"]], initial=moments)
+    with pytest.raises(TypeError, match=r"pass partial\(EnsembleAnalysis, \.\.\.\), not one of them"):
+        FusedFilter(LinearTransition(F, Q), one, initial=members, analysis=EnsembleAnalysis("etkf"))
     late = FusedFilter(
         LinearTransition(F, Q), {"a": FusedSensor(LinearObservation(H), R.sqrt(), delay=1)}, initial=moments
     )

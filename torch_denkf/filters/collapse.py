@@ -59,7 +59,7 @@ def _say(
         f"narrow at {place!r}",
         f"The ensemble is too narrow for the readings {module.in_keys[2]!r} at place {place!r}: half of them lie more "
         f"than {float(median):.1f} standard deviations from what it expects.{component} Chance correlations of "
-        "few members shrink what fast sensors say nothing about: take more members, or "
+        "few members shrink what fast sensors say nothing about: take "
         'EnsembleAnalysis(localisation="significance"). Else the noise of these readings, or that of the motion, is '
         "too small.",
     )

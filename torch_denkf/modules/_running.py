@@ -38,7 +38,10 @@ def check_module(name: str, module: Any) -> None:
         TypeError: if it is none; ``name`` is the argument's.
     """
     if not (isinstance(module, nn.Module) and hasattr(module, "in_keys") and hasattr(module, "out_keys")):
-        raise TypeError(f"{name} must be a TensorDict module, such as those of torch_denkf.modules; got {module!r}")
+        hint = ", or LearnedTransition(f), LearnedObservation(f) of a function f" if callable(module) else ""
+        raise TypeError(
+            f"{name} must be a TensorDict module, such as those of torch_denkf.modules{hint}; got {module!r}"
+        )
 
 
 def check_network(name: str, network: Any) -> None:
