@@ -523,6 +523,8 @@ def test_what_does_not_fit_is_refused():
             filter(*parts, initial=GaussianAround([0.1] * 7), reading_space=SO3(), observation_key="pose", **plain)
     with pytest.raises(ValueError, match=error):
         DEnKF(*parts, EnsembleAnalysis("etkf", reading_space=SO3()), initial=around, **plain)
+    with pytest.raises(ValueError, match=error):
+        DEnKF(*parts, initial=around, reading_space=SO3(), observation_key="pose", **plain)
     sensor = FusedSensor(Orientation(), R, reading_space=SO3(), sensor_error=plain["sensor_error"])
     with pytest.raises(ValueError, match=error):
         FusedFilter(Turning(), {"pose": sensor}, initial=around, process_noise=[0.1] * 7)

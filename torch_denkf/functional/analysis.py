@@ -278,7 +278,7 @@ def _one_after_the_other(
 
 def check_significance(threshold: float | Tensor | None, size: int) -> None:
     """Raises a ``ValueError`` where no correlation that E members can show is significant."""
-    if isinstance(threshold, (int, float)) and threshold**2 >= size - 1:
+    if threshold is not None and not isinstance(threshold, Tensor) and threshold**2 >= size - 1:
         raise ValueError(
             f"With {size} members no correlation is {threshold:g} standard deviations away from chance: the largest is "
             f"{math.sqrt(size - 1):.1f}. Take a smaller threshold, or more than {math.floor(threshold**2) + 1} members."
@@ -314,8 +314,8 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
     spread = predicted.square().sum(-2).unsqueeze(-1) * state.square().sum(-2, keepdim=True)
     limit = threshold**2 * spread / (state.shape[-2] - 1)
     explained = cross.square()
-    believed = explained > limit
-    return torch.where(believed, 1 - limit / torch.where(believed, explained, 1), 0)
+    chance = explained <= limit  # a threshold that is NaN stays seen
+    return torch.where(chance, 0, 1 - limit / torch.where(chance, 1, explained))
 
 
 def _ensemble_space(

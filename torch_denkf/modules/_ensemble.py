@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Real
 from typing import Literal, TypedDict
 
 import torch
@@ -105,10 +106,12 @@ class EnsembleUpdate(SubModel):
         if localisation not in (None, "significance"):
             raise ValueError(f'localisation is "significance" or None; got {localisation!r}.')
         if localisation is not None:
+            if not isinstance(threshold, Real | Tensor):
+                raise TypeError(f"threshold is a number or a tensor; got {threshold!r}")
             check_values("threshold", torch.as_tensor(threshold), above=0)
         self.localisation = localisation
         if isinstance(threshold, Tensor) and not isinstance(threshold, nn.Parameter):
-            self.register_buffer("threshold", threshold)
+            self.register_buffer("threshold", threshold.detach().clone())
         else:
             self.threshold = threshold
         self.predicted_key, self.reading_keys = self.in_keys[1], self.in_keys[2:]

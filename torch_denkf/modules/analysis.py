@@ -38,7 +38,8 @@ class EnsembleAnalysis(EnsembleUpdate):
             from chance, see :func:`~torch_denkf.functional.analysis.significant`. It keeps 32 to 64 members honest
             where fast sensors make thousands of updates. ``None`` believes all.
         threshold: of ``"significance"``, in standard deviations: one number or ``[S]``; a ``Parameter`` is trained. The
-            more updates a component sees between two readings about it, the larger.
+            more updates a component sees between two readings about it, the larger. One that is trained beyond
+            sqrt(E - 1) believes nothing, and has no gradient that would bring it back.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
         space: in which the state lives, such as ``Product(SO3(), Euclidean(3))``: members are points, the update is
             made with the tangents at the forecast's mean, and ``var`` is of the tangents at the belief's. See
@@ -185,7 +186,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         options = self._options(noise, taper)
         threshold = self.significance
         if isinstance(threshold, torch.Tensor) and threshold.numel() > 1:
-            options["significance"] = threshold.repeat(lag)
+            options["significance"] = threshold[:dim].repeat(lag)
         moved = self._formula(past.flatten(-2), predicted, observation, variance, observed=observed, **options)
         ensemble = moved.ensemble.unflatten(-1, past.shape[-2:])
         return ensemble if self.space is None or center is None else self.space.plus(center, ensemble)

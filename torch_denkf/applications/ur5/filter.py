@@ -22,7 +22,6 @@ __all__ = ["UR5TableFilter", "UR5TableSettings", "ur5_table"]
 
 STATE, JOINTS = 10, 7  # J1..J6 rad, the gripper's opening rad, x, y, z m; the action is the targets of the first seven
 _STEP = 0.05  # rad: a usual way of a joint in a step
-_THRESHOLD = 1.0  # of significance, in standard deviations: chosen on demos that are for neither training nor tests
 
 
 @dataclass(frozen=True)
@@ -43,6 +42,7 @@ class UR5TableSettings:
         num_cells: hidden layers of the sensor's head and of the transition.
         ensemble_size: members, E.
         inflation: factor on the belief's spread in each step, chosen on validation demos.
+        threshold: of localisation by significance, in standard deviations; ``None`` for none.
     """
 
     pixels: int = 64
@@ -58,6 +58,7 @@ class UR5TableSettings:
     num_cells: tuple[int, ...] = (64, 64)
     ensemble_size: int = 64
     inflation: float = 1.0
+    threshold: float | None = None
 
 
 class UR5TableFilter(DEnKF):
@@ -90,7 +91,9 @@ class UR5TableFilter(DEnKF):
             pixel_scale=s.pixel_std,
             encoding_key=("sensor", "encoding"),
         )
-        analysis = EnsembleAnalysis("sensor", localisation="significance", threshold=_THRESHOLD)
+        analysis = EnsembleAnalysis("sensor")
+        if s.threshold is not None:
+            analysis = EnsembleAnalysis("sensor", localisation="significance", threshold=s.threshold)
         analysis.inflation = s.inflation
         super().__init__(
             transition=_ArmTransition(s),

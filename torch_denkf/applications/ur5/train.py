@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ __all__ = ["evaluate_ur5_table", "whole_demos", "train_ur5_table"]
 
 UNIT = torch.tensor([0.02] * JOINTS + [0.0025] * 3)  # rad and m: what counts as an error of one
 _INFLATIONS = (1.0, 1.01, 1.02, 1.03, 1.05, 1.07, 1.1, 1.15, 1.2, 1.3)
+_THRESHOLD = 1.0  # of significance, behind the training; chosen on demos that are for neither training nor tests
 _LENGTH, _MISSING = 32, 0.3  # steps of a window; share of the frames that are lost in half of them
 
 
@@ -77,8 +79,10 @@ def train_ur5_table(
     _train_filter(model, readings[held:], readings[:held], filter_updates, out / "training/filter", trainer)
     record = {"command": command, "seed": seed, "demos": demos, "sequences": sequences}
     record |= {"sensor_updates": sensor_updates, "filter_updates": filter_updates}
-    save_pretrained(model, out, training=record)
-    return model.eval()
+    localised = UR5TableFilter(replace(model.settings, threshold=_THRESHOLD))
+    localised.load_state_dict(model.state_dict())
+    save_pretrained(localised, out, training=record)
+    return localised.eval()
 
 
 def whole_demos(out: Path, sequences: int = 60, *, processes: int = 1, progress: bool = True) -> Path:
