@@ -213,8 +213,8 @@ def test_the_past_has_the_thresholds_of_the_states_own_components(cases):
 
 
 def test_more_numbers_than_fit_at_once_are_believed_as_far(float64, monkeypatch):
-    """Without significance so many states go in tiles; with it, none are treated as certain."""
-    forecast, reading = torch.randn(12, 40), torch.randn(6)
+    """More readings than members solve in ensemble space, so many states in tiles; with significance neither."""
+    forecast, reading = torch.randn(5, 40), torch.randn(6)
     given = forecast, forecast[:, :6], reading, torch.ones(6)
     expected = analyse(*given, scheme="etkf", significance=1.5).ensemble
     monkeypatch.setattr("torch_denkf.functional.analysis.columns_in_a_tile", lambda *_: 8)
