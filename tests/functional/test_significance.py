@@ -29,7 +29,7 @@ def by_hand(forecast, predicted, threshold):
         for o in range(predicted.shape[-1]):
             for s in range(forecast.shape[-1]):
                 r = torch.corrcoef(torch.stack([predicted[b, :, o], forecast[b, :, s]]))[0, 1]
-                factors[b, o, s] = max(0.0, 1 - threshold**2 / (float(r) ** 2 * (size - 1)))
+                factors[b, o, s] = max(0.0, 1 - threshold**2 / (float(r.detach()) ** 2 * (size - 1)))
     return factors
 
 
@@ -48,6 +48,7 @@ def test_the_factors_are_those_of_the_correlations(cases, threshold):
 def test_readings_are_taken_in_one_after_the_other_with_smaller_gains(cases, scheme, tapered):
     """As updates by one reading each, tapered by the same factors; what the members predict is moved like the state."""
     forecast, predicted, reading, noise = cases
+    forecast = forecast.clone().requires_grad_()
     if scheme == "sensor":
         reading = reading.unsqueeze(-2) + 0.5 * torch.randn_like(predicted)
     draws = torch.randn_like(predicted) if scheme == "perturbed" else None
@@ -66,6 +67,9 @@ def test_readings_are_taken_in_one_after_the_other_with_smaller_gains(cases, sch
     result = analyse(forecast, predicted, reading, noise, **options)
     torch.testing.assert_close(result.ensemble, moved[..., :5], rtol=0, atol=1e-10)
     torch.testing.assert_close(torch.cat([result.nis, result.log_likelihood], -1), scores, rtol=0, atol=1e-10)
+    # The factors are constants for the members' gradient.
+    slopes = [torch.autograd.grad(each.square().sum(), forecast)[0] for each in (result.ensemble, moved[..., :5])]
+    torch.testing.assert_close(*slopes, rtol=0, atol=1e-9)
 
 
 def test_a_square_root_update_by_one_reading_is_the_serial_one_with_a_smaller_gain(cases):
@@ -126,11 +130,12 @@ def test_constant_components_and_hidden_readings_are_left_alone(cases):
 
 
 def test_the_threshold_has_the_gradient_of_finite_differences(cases):
-    forecast, predicted, reading, noise = cases
+    forecast, predicted, *parts = cases
+    one = [predicted[..., :1], *(part[..., :1] for part in parts)]  # of several, the first moves what the second tells
     threshold = torch.full((5,), 1.5, requires_grad=True)
 
     def means(threshold):
-        return analyse(forecast, predicted, reading, noise, scheme="etkf", significance=threshold).ensemble.mean(-2)
+        return analyse(forecast, *one, scheme="etkf", significance=threshold).ensemble.mean(-2)
 
     assert torch.autograd.gradcheck(means, threshold)
     assert math.isfinite(float(torch.autograd.grad(means(threshold).sum(), threshold)[0].sum()))
@@ -152,7 +157,7 @@ def test_more_precise_readings_than_members_can_tell_apart_stay_positive_definit
 
 
 def test_a_local_analysis_weighs_by_the_factors(cases):
-    """As its taper times the same factors; and finite differences, where some weights are 0."""
+    """As its taper times the same factors, which have no gradient; finite differences of the threshold."""
     forecast, predicted, reading, noise = cases
     near = Neighbours(torch.arange(2).expand(5, 2), torch.tensor([[1.0, 0.4]]).expand(5, 2))
     found = letkf(forecast, predicted, reading, noise, near, significance=1.5, tile=2)
@@ -160,13 +165,17 @@ def test_a_local_analysis_weighs_by_the_factors(cases):
     assert (factors == 0).any()
     for b in range(3):
         weighed = Neighbours(near.index, near.taper * factors[b].mT)
-        expected = letkf(forecast[b], predicted[b], reading[b], noise[b], weighed)
+        members = forecast[b].clone().requires_grad_()
+        given = members, members[:, :2] + predicted[b] - forecast[b, :, :2], reading[b], noise[b]
+        expected, moved = letkf(*given, weighed), letkf(*given, near, significance=1.5)
         torch.testing.assert_close(found[b], expected, rtol=0, atol=1e-10)
+        slopes = [torch.autograd.grad(each.square().sum(), members)[0] for each in (moved, expected)]
+        torch.testing.assert_close(*slopes, rtol=0, atol=1e-9)
 
-    def moved(forecast, threshold):
-        return letkf(forecast, predicted[0], reading[0], noise[0], near, significance=threshold)
+    def moved(threshold):
+        return letkf(forecast[0], predicted[0], reading[0], noise[0], near, significance=threshold)
 
-    assert torch.autograd.gradcheck(moved, (forecast[0].requires_grad_(), torch.tensor(1.5, requires_grad=True)))
+    assert torch.autograd.gradcheck(moved, torch.tensor(1.5, requires_grad=True))
 
 
 def test_each_component_has_a_threshold_and_readings_have_their_mean(cases):

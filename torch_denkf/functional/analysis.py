@@ -294,8 +294,11 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
     updates would otherwise shrink what the readings say nothing about. Members enough, and the factor is 1.
 
     Correlation-based localisation: Anderson, Monthly Weather Review 140, 2012; Luo & Bhakta, Computational Geosciences
-    24, 2020; Vishny, Morzfeld, Gwirtz, Bach, Dunbar & Hodyss, JAMES 16, 2024. This factor is smooth, and may be
-    trained through its threshold.
+    24, 2020; Vishny, Morzfeld, Gwirtz, Bach, Dunbar & Hodyss, JAMES 16, 2024. This factor is smooth.
+
+    Gradients reach the threshold, which may be trained, and not the anomalies: for them the factor is a constant, as a
+    taper is. Near the threshold its slope is steepest, and correlations are of chance: filters of 64 members that were
+    trained through it diverged (``benchmarks/ur5``).
 
     Args:
         cross: products of the anomalies, ``[*B, O, S]``.
@@ -311,6 +314,7 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
         >>> significant(anomalies[:, :1].mT @ anomalies, anomalies[:, :1], anomalies, 1.0)
         tensor([[0.5000, 0.0000]])
     """
+    cross, predicted, state = cross.detach(), predicted.detach(), state.detach()
     spread = predicted.square().sum(-2).unsqueeze(-1) * state.square().sum(-2, keepdim=True)
     limit = threshold**2 * spread / (state.shape[-2] - 1)
     explained = cross.square()
