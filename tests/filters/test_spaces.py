@@ -422,10 +422,10 @@ def frames_player(env):
     return env.base_env.player()
 
 
-SELDOM = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("EKF", "perturbed", "particles")]  # as the others
+SELDOM = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("EKF", "UKF", "perturbed", "particles")]
 
 
-@pytest.mark.parametrize("kind", ["UKF", "etkf", *SELDOM])
+@pytest.mark.parametrize("kind", ["etkf", *SELDOM])
 def test_compiled_is_eager(kind):
     filter, data = make(kind), log(steps=5)
     data = with_noise(filter, data)
