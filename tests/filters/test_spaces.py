@@ -1,6 +1,7 @@
 """Filters and smoothers whose state is an orientation: against closed forms, other filters, and a turned world."""
 
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -525,6 +526,10 @@ def test_what_does_not_fit_is_refused():
         DEnKF(*parts, EnsembleAnalysis("etkf", reading_space=SO3()), initial=around, **plain)
     with pytest.raises(ValueError, match=error):
         DEnKF(*parts, initial=around, reading_space=SO3(), observation_key="pose", **plain)
+    on = partial(EnsembleAnalysis, "etkf", reading_space=SO3())
+    sensor = FusedSensor(Orientation(), R, sensor_error=plain["sensor_error"])
+    with pytest.raises(ValueError, match="not for the analysis of 'pose'"):
+        FusedFilter(Turning(), {"pose": sensor}, initial=around, process_noise=[0.1] * 7, analysis=on)
     sensor = FusedSensor(Orientation(), R, reading_space=SO3(), sensor_error=plain["sensor_error"])
     with pytest.raises(ValueError, match=error):
         FusedFilter(Turning(), {"pose": sensor}, initial=around, process_noise=[0.1] * 7)

@@ -13,6 +13,7 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import JoinedObservation, JoinedReading, StateObservation
 from torch_denkf.fusion.sensor import FusedSensor, Wired, noise_key_of
 from torch_denkf.fusion.sensor_weights import SensorWeights, WeightedNoise
+from torch_denkf.modules._running import declared
 from torch_denkf.smoothers.past import lagged
 
 __all__ = ["Updates"]
@@ -131,8 +132,13 @@ class Updates:
         predicted = unravel_key(model.out_keys[0])
         if self.gaussian:
             keys |= {"observation_key": reading, "forecast_prefix": prefix}
-            return {name: make(model, ensemble_key=(prefix, "ensemble"), predicted_key=predicted, **keys)}
-        update = make(forecast_key=(prefix, "ensemble"), predicted_key=predicted, observation_key=reading, **keys)
+            update = make(model, ensemble_key=(prefix, "ensemble"), predicted_key=predicted, **keys)
+        else:
+            update = make(forecast_key=(prefix, "ensemble"), predicted_key=predicted, observation_key=reading, **keys)
+        if declared(update).reading_space is not None and told.get("reading_space") is None:
+            raise ValueError(f"reading_space is for FusedSensor(reading_space=...), not for the analysis of {name!r}.")
+        if self.gaussian:
+            return {name: update}
         return {f"{name}_observation": model, name: lagged(update) if self.lag else update}
 
 
