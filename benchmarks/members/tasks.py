@@ -253,9 +253,9 @@ def cartpole(noise: float = 0.3, episodes: int = 20) -> Task:
 def ur5(folder: Path, demos: int = 200, others: int = 100) -> Task:
     """Joints of the UR5 at its table by the filter that comes with the library, on demos that it has not seen."""
     shipped, side = from_pretrained("ur5-table"), UR5TableSettings.pixels
-    test, other = (folder / "demos/sequences", folder / "validation")
-    for seed, (root, count) in enumerate(((test, demos), (other, others))):
-        collect_ur5_demos(root, count, size=(side, side), seed=seed)
+    test, other = folder / "test", folder / "validation"
+    collect_ur5_demos(test, demos, size=(side, side), seed=0)
+    collect_ur5_demos(other, others, size=(side, side), seed=1)
 
     def score(data: Path, members: int, threshold: float | None) -> Score:
         found = evaluate_ur5_table(resized(shipped, members, threshold), data, cache=folder / "cache", progress=False)

@@ -308,10 +308,13 @@ def test_with_reject_a_bad_mask_is_named(mask):
 
 
 def test_a_sensor_that_is_none_is_named_as_the_sensor():
-    with pytest.raises(
-        TypeError, match=r"^sensor must be a TensorDict module.*LearnedObservation\(f\) of a function f"
-    ):
+    with pytest.raises(TypeError, match=r"^sensor must be a TensorDict module, such as those of .*modules; got"):
         linear_with({"sensor": torch.nn.Linear(2, 2)})
+
+
+def test_a_function_in_the_place_of_an_observation_is_told_its_module():
+    with pytest.raises(TypeError, match=r"^observation must be .*, or LearnedObservation\(f\) of a function f; got"):
+        linear_with({"observation": torch.sin})
 
 
 @pytest.mark.parametrize(

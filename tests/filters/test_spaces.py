@@ -424,6 +424,7 @@ def frames_player(env):
 
 
 SELDOM = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("EKF", "UKF", "perturbed", "particles")]
+# An EKF's compiled step is that of its package, below.
 
 
 @pytest.mark.parametrize("kind", ["etkf", *SELDOM])

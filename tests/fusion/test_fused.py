@@ -647,8 +647,11 @@ def test_what_is_refused():
         FusedFilter(LinearTransition(F, Q), {}, initial=moments)
     with pytest.raises(TypeError, match="sensors is a dict"):
         FusedFilter(LinearTransition(F, Q), [one["a"]], initial=moments)
-    with pytest.raises(TypeError, match=r"pass partial\(EnsembleAnalysis, \.\.\.\), not one of them"):
-        FusedFilter(LinearTransition(F, Q), one, initial=members, analysis=EnsembleAnalysis("etkf"))
+    still, update = LearnedTransition(torch.nn.Identity(), residual=False), EnsembleAnalysis("etkf")
+    read, owned = (FusedSensor(Select([0]), [0.1], analysis=own) for own in (None, update))
+    for sensor, options in ((read, {"analysis": update}), (read, {"analysis": update, "joint": True}), (owned, {})):
+        with pytest.raises(TypeError, match=r"pass partial\(EnsembleAnalysis, \.\.\.\), not a module"):
+            FusedFilter(still, {"a": sensor}, initial=members, process_noise=[0.1] * 2, **options)
     late = FusedFilter(
         LinearTransition(F, Q), {"a": FusedSensor(LinearObservation(H), R.sqrt(), delay=1)}, initial=moments
     )

@@ -297,8 +297,9 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
     24, 2020; Vishny, Morzfeld, Gwirtz, Bach, Dunbar & Hodyss, JAMES 16, 2024. This factor is smooth.
 
     Gradients reach the threshold, which may be trained, and not the anomalies: for them the factor is a constant, as a
-    taper is. Near the threshold its slope is steepest, and correlations are of chance: filters of 64 members that were
-    trained through it diverged (``benchmarks/ur5``).
+    taper is. Near the threshold its slope is steepest, and correlations are of chance: the training of a filter of 64
+    members through it diverged (``benchmarks/ur5``). So of several readings the threshold's gradient leaves out how
+    the first ones change the correlations that the later ones see.
 
     Args:
         cross: products of the anomalies, ``[*B, O, S]``.

@@ -8,6 +8,7 @@ from typing import Any
 
 from tensordict import unravel_key
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import JoinedObservation, JoinedReading, StateObservation
@@ -128,18 +129,21 @@ class Updates:
 
     def _update(self, name, model, prefix, to, told, analysis, *, reading, noise, observed):
         make = self.analysis if analysis is None else analysis
+        if isinstance(make, nn.Module):
+            kind = type(make).__name__
+            raise TypeError(f"analysis makes the update {name!r}: pass partial({kind}, ...), not a module.")
         keys = {"noise_variance_key": noise, "observed_key": observed, "belief_prefix": to, **told}
         predicted = unravel_key(model.out_keys[0])
         if self.gaussian:
             keys |= {"observation_key": reading, "forecast_prefix": prefix}
             update = make(model, ensemble_key=(prefix, "ensemble"), predicted_key=predicted, **keys)
+            modules = {name: update}
         else:
             update = make(forecast_key=(prefix, "ensemble"), predicted_key=predicted, observation_key=reading, **keys)
+            modules = {f"{name}_observation": model, name: lagged(update) if self.lag else update}
         if declared(update).reading_space is not None and told.get("reading_space") is None:
             raise ValueError(f"reading_space is for FusedSensor(reading_space=...), not for the analysis of {name!r}.")
-        if self.gaussian:
-            return {name: update}
-        return {f"{name}_observation": model, name: lagged(update) if self.lag else update}
+        return modules
 
 
 def _joint_angles(sensors: Mapping[str, FusedSensor]) -> list[int]:

@@ -84,8 +84,8 @@ class FusedFilter(Filter):
 
     Raises:
         ValueError: if there is no sensor, a delay is negative or beyond the lag, process noise is missing or given
-            twice, an analysis inflates or relaxes where that is refused, or a sensor has errors that last and the
-            transition moves a mean and a covariance.
+            twice, an analysis inflates or relaxes where that is refused or names a ``reading_space``, or a sensor has
+            errors that last and the transition moves a mean and a covariance or its readings live on a space.
         TypeError: for particles, sensors that are no dict, an analysis in the place of what makes it, or one that
             cannot correct earlier states.
 
@@ -121,9 +121,6 @@ class FusedFilter(Filter):
         check_module("initial", initial)
         if not isinstance(sensors, Mapping) or not all(isinstance(one, FusedSensor) for one in sensors.values()):
             raise TypeError(f"sensors is a dict, {{name: FusedSensor(...)}}; got {type(sensors).__name__}: {sensors}")
-        if isinstance(analysis, torch.nn.Module):
-            kind = type(analysis).__name__
-            raise TypeError(f"analysis makes the update of each sensor: pass partial({kind}, ...), not one of them.")
         if not sensors:
             raise ValueError("FusedFilter needs at least one sensor: sensors={name: FusedSensor(...)}.")
         gaussian = _is_gaussian(initial)

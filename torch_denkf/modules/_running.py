@@ -38,7 +38,8 @@ def check_module(name: str, module: Any) -> None:
         TypeError: if it is none; ``name`` is the argument's.
     """
     if not (isinstance(module, nn.Module) and hasattr(module, "in_keys") and hasattr(module, "out_keys")):
-        hint = ", or LearnedTransition(f), LearnedObservation(f) of a function f" if callable(module) else ""
+        made_of = name in ("transition", "observation") and callable(module)
+        hint = f", or Learned{name.capitalize()}(f) of a function f" if made_of else ""
         raise TypeError(
             f"{name} must be a TensorDict module, such as those of torch_denkf.modules{hint}; got {module!r}"
         )

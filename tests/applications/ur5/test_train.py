@@ -15,7 +15,9 @@ def test_ur5_table(tmp_path):
         for each in (model, from_pretrained(tmp_path))
     )
     assert mine == loaded
-    trained = evaluate_ur5_table(from_pretrained("ur5-table"), demos, cache=cache, progress=False)
+    shipped = from_pretrained("ur5-table")
+    assert model["analysis"].significance == shipped["analysis"].significance == 1.0
+    trained = evaluate_ur5_table(shipped, demos, cache=cache, progress=False)
     assert trained["filter"]["joints, deg"] < 1.2
     assert trained["filter"]["joints, deg"] < trained["last targets"]["joints, deg"]
     assert trained["filter"]["tool, cm"] < trained["sensor"]["tool, cm"]

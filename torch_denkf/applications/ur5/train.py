@@ -28,7 +28,7 @@ __all__ = ["evaluate_ur5_table", "whole_demos", "train_ur5_table"]
 
 UNIT = torch.tensor([0.02] * JOINTS + [0.0025] * 3)  # rad and m: what counts as an error of one
 _INFLATIONS = (1.0, 1.01, 1.02, 1.03, 1.05, 1.07, 1.1, 1.15, 1.2, 1.3)
-_THRESHOLD = 1.0  # of significance, behind the training; chosen on demos that are for neither training nor tests
+_THRESHOLD = 1.0  # of significance, behind the training; by the CRPS of demos that are for neither training nor tests
 _LENGTH, _MISSING = 32, 0.3  # steps of a window; share of the frames that are lost in half of them
 
 
