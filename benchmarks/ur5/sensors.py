@@ -21,7 +21,7 @@ from torch_denkf.training import Stage
 from torch_denkf.training.parts import train_part
 
 SAMPLES = 32  # of a sensor while it is trained
-MEMBERS = 128  # of the ensemble filters, whose states are 27 numbers; they read as many samples
+MEMBERS = 128  # of the ensemble filters, whose states are 34 numbers; they read as many samples
 WRIST = 5  # J6, which turns the gripper
 UNDECIDED = 0.3  # length of (cos, sin) of J6 below which a reading leaves to the forecast which half turn it is
 SALT = 0.02  # share of white pixels of a frame with salt and pepper, and of black ones
