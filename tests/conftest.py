@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from tests.filters.factories import has_compiler
+from torch_denkf.compilation.libraries import clear_damaged_libraries
 from torch_denkf.filters import Filter
-from torch_denkf.inductor.libraries import clear_damaged_libraries
 
 # A cache of the tests' own, kept from one run to the next: what a killed run left unfinished harms nobody else.
 COMPILED = Path(os.environ.get("TORCHINDUCTOR_CACHE_DIR") or f"{tempfile.gettempdir()}/torch_denkf_tests_{os.getuid()}")

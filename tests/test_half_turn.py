@@ -15,10 +15,12 @@ from torch import nn
 
 import torch_denkf
 from tests.filters.factories import FixedEnsemble, NoisyLinear
-from torch_denkf.filters import EKF, UKF, BackpropKF, DEnKF, KalmanFilter, ParticleFilter
+from torch_denkf.baselines import BackpropKF
+from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter, ParticleFilter
 from torch_denkf.functional.localisation import Neighbours
 from torch_denkf.functional.manifolds import Circle, Euclidean, Product
 from torch_denkf.fusion import FusedFilter, FusedSensor, SensorAttention
+from torch_denkf.imperfect import Visible
 from torch_denkf.modules import (
     ConstantNoise,
     EKFTransition,
@@ -30,7 +32,6 @@ from torch_denkf.modules import (
     Select,
     SubModel,
     UKFTransition,
-    Visible,
 )
 from torch_denkf.monitoring import Gated, GatedAnalysis
 from torch_denkf.objectives import (

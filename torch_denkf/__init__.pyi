@@ -1,11 +1,15 @@
 from . import (
     applications,
+    baselines,
+    compilation,
     data,
     deployment,
+    diagnosis,
     envs,
     filters,
     functional,
     fusion,
+    imperfect,
     metrics,
     modules,
     monitoring,
@@ -22,6 +26,7 @@ from .applications.car.kitti.replay import KITTIOdometryExperienceReplay
 from .applications.car.optical_flow import OpticalFlow
 from .applications.ur5.data.replay import UR5ExperienceReplay
 from .applications.ur5.envs.table import UR5TableEnv
+from .baselines import BackpropKF, IEnKS, LSTMFilter
 from .data.lerobot.replay import LeRobotReplay
 from .data.recordings.frames import Images, Video
 from .data.recordings.replay import Recording, RecordingReplay
@@ -38,11 +43,9 @@ from .filters import (
     EKF,
     PFM,
     UKF,
-    BackpropKF,
     DEnKF,
     Filter,
     KalmanFilter,
-    LSTMFilter,
     MixtureParticleFilter,
     ParticleFilter,
 )
@@ -50,7 +53,7 @@ from .fusion import FusedFilter, FusedSensor, Refiltering
 from .monitoring import Gated, Monitored
 from .objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from .pretrained.folders import available, from_pretrained, save_pretrained
-from .smoothers import EnKS, EnRTS, FixedLag, IEnKS, ParticleSmoother, RTSSmoother
+from .smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
 from .training import FilterTrainer, Stage
 from .transforms import DEnKFTransform, LastAction
 
@@ -58,12 +61,16 @@ __version__: str
 
 __all__ = [
     "applications",
+    "baselines",
+    "compilation",
     "data",
     "deployment",
+    "diagnosis",
     "envs",
     "filters",
     "functional",
     "fusion",
+    "imperfect",
     "metrics",
     "modules",
     "monitoring",

@@ -1,7 +1,7 @@
 """What outer rings register with inner ones, which import nothing of theirs: here it is looked up by name.
 
 A folder of ``torch_denkf.applications`` has a file ``registered.py`` with ``BUILDERS`` and ``COMMANDS``, and weights in
-``weights/NAME/``. Nothing else of the library knows an application. ``torch_denkf.inductor`` is what filters compile
+``weights/NAME/``. Nothing else of the library knows an application. ``torch_denkf.compilation`` is what filters compile
 with.
 """
 
@@ -37,7 +37,7 @@ def commands() -> dict[str, tuple[str, str]]:
 
 def compiler() -> ModuleType:
     """The room that knows torch's compiler; importing inductor itself, which it does later, takes half a second."""
-    return import_module("torch_denkf.inductor")
+    return import_module("torch_denkf.compilation")
 
 
 def weights() -> dict[str, Path]:

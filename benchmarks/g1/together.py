@@ -27,7 +27,8 @@ from benchmarks.g1.recordings import Recordings, rows_of
 from benchmarks.g1.sensors import read_code
 from benchmarks.g1.targets import ARM
 from torch_denkf import FusedFilter, FusedSensor
-from torch_denkf.modules import ConstantNoise, FadingBias, LearnedTransition, MappedNoise, MomentPrior, Select
+from torch_denkf.imperfect import FadingBias
+from torch_denkf.modules import ConstantNoise, LearnedTransition, MappedNoise, MomentPrior, Select
 from torch_denkf.training import hold_last
 
 SIZE, RATE = ARM.size, 30  # joints; rows a second

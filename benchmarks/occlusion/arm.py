@@ -24,7 +24,8 @@ from benchmarks.g1.together import LEVEL, RATE, SIZE, Arm, Together, run, scored
 from torch_denkf import EKF
 from torch_denkf.envs import OccludingBox
 from torch_denkf.functional import crps_gaussian
-from torch_denkf.modules import ConstantNoise, LearnedTransition, MappedNoise, Select, Visibility
+from torch_denkf.imperfect import Visibility
+from torch_denkf.modules import ConstantNoise, LearnedTransition, MappedNoise, Select
 from torch_denkf.objectives import SensorLoss
 from torch_denkf.training import hold_last
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint

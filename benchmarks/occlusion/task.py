@@ -10,18 +10,18 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from torch_denkf.filters import EKF, DEnKF, Filter, LSTMFilter, ParticleFilter
+from torch_denkf.baselines import LSTMFilter
+from torch_denkf.filters import EKF, DEnKF, Filter, ParticleFilter
+from torch_denkf.imperfect import FadingBias, Visibility
 from torch_denkf.modules import (
     AroundState,
     DiagonalNoise,
     EnsembleAnalysis,
-    FadingBias,
     GaussianAround,
     ImageSensor,
     LearnedTransition,
     Select,
     SubModel,
-    Visibility,
 )
 
 __all__ = ["KINDS", "RATE", "camera", "drawn", "filter_of", "read", "runs"]

@@ -10,7 +10,8 @@ from torch import nn
 
 from benchmarks.occlusion.task import camera, drawn
 from torch_denkf.filters import Filter
-from torch_denkf.modules import FadingBias, ImageSensor
+from torch_denkf.imperfect import FadingBias
+from torch_denkf.modules import ImageSensor
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, SensorLoss
 
 __all__ = ["fit_camera", "fit_filter", "fit_frames", "lasting_error"]

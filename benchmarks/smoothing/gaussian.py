@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torch_denkf.filters import KalmanFilter
 from torch_denkf.functional import kalman_predict, kalman_update
-from torch_denkf.functional.smoothing import rts_smooth
+from torch_denkf.functional.smoothing.rts import rts_smooth
 
 Parameters = dict[str, Tensor]  # of each quantity, [D]: logarithms of standard deviations, logits of shares
 

@@ -9,9 +9,10 @@ from torch import Tensor
 
 from benchmarks.smoothing.cases import Case
 from benchmarks.smoothing.systems import SYSTEMS, Cycle, frames_of, simulate
+from torch_denkf.baselines import IEnKS
 from torch_denkf.filters import DEnKF, Filter, ParticleFilter
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianLikelihood, GaussianPrior, Select
-from torch_denkf.smoothers import EnRTS, FixedLag, IEnKS
+from torch_denkf.smoothers import EnRTS, FixedLag
 
 BELIEF, SMOOTHED = ("belief", "mean"), ("smoothed", "mean")
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
-from torch_denkf.functional.sharded import analyse_sharded
+from torch_denkf.functional.kernels.sharded import analyse_sharded
 
 SIZES, MEMBERS, EVERY = (10**5, 10**6, 10**7), 32, 10  # components of the state; every tenth is observed
 RESULTS = Path(__file__).parent / "results" / "sharded.csv"

@@ -3,7 +3,7 @@
 Three kinds, for each of the table's ten numbers by itself. A regression on the last readings knows no motion at all. A
 recurrent network remembers all readings of a demo, and is not linear: it may tell a joint that stands still from one
 that moves. A Kalman filter carries the number, its rate, its acceleration if wanted, and the sensor's slow errors
-(:class:`~torch_denkf.modules.FadingBias`); noise, damping, size and time of the errors are fitted. All are fitted on
+(:class:`~torch_denkf.imperfect.FadingBias`); noise, damping, size and time of the errors are fitted. All are fitted on
 the demos that train the filters; nothing here sees a picture.
 """
 
@@ -24,7 +24,7 @@ from benchmarks.ur5.recipes._base import INITIAL
 from benchmarks.ur5.sensors import MEMBERS, WRIST, Preset
 from benchmarks.ur5.study import Base, Study
 from torch_denkf.functional import crps_gaussian, kalman_predict, kalman_update
-from torch_denkf.modules import FadingBias
+from torch_denkf.imperfect import FadingBias
 
 LAGS = (1, 10, 30)  # readings that a regression sees
 KINDS = ((2, 0), (2, 1), (3, 1), (3, 2))  # 2: rates, 3: accelerations, too; and how many biases

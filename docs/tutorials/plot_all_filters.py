@@ -21,7 +21,8 @@ import matplotlib.pyplot as plt
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.filters import DPF, EKF, UKF, BackpropKF, DEnKF, KalmanFilter, LSTMFilter, ParticleFilter
+from torch_denkf.baselines import BackpropKF, LSTMFilter
+from torch_denkf.filters import DPF, EKF, UKF, DEnKF, KalmanFilter, ParticleFilter
 from torch_denkf.functional import crps_ensemble, crps_gaussian, crps_weighted
 from torch_denkf.modules import (
     ConstantNoise,

@@ -24,15 +24,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from torch_denkf import DEnKF
-from torch_denkf.modules import (
-    AroundState,
-    DiagonalNoise,
-    EnsembleAnalysis,
-    ImageSensor,
-    LearnedTransition,
-    Select,
-    Visibility,
-)
+from torch_denkf.imperfect import Visibility
+from torch_denkf.modules import AroundState, DiagonalNoise, EnsembleAnalysis, ImageSensor, LearnedTransition, Select
 from torch_denkf.objectives import SensorLoss
 
 torch.manual_seed(0)

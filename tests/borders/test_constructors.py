@@ -11,6 +11,7 @@ from torch import nn
 from tests.filters.gaussian_for_tests import linear_filter
 from torch_denkf.applications.car import FlowSensor, UnicycleMotion, UnicycleNoise, UnicycleTransition
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
+from torch_denkf.baselines.lstm_cell import LSTMUpdate
 from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.modules import (
@@ -39,7 +40,6 @@ from torch_denkf.modules import (
 )
 from torch_denkf.modules.noise import MemberGain
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition
-from torch_denkf.modules.recurrent import LSTMUpdate
 from torch_denkf.modules.stochastic import FlipoutLinear
 
 EYE, ZERO, ONE = torch.eye(2), torch.zeros(2), torch.ones(2)

@@ -14,8 +14,9 @@ from tests.filters.factories import M, S, linear_denkf, linear_kalman, linear_sy
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf._checks import has_values
+from torch_denkf.baselines import LSTMFilter
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import DEnKF, Filter, KalmanFilter, LSTMFilter, ParticleFilter, finish
+from torch_denkf.filters import DEnKF, Filter, KalmanFilter, ParticleFilter, finish
 from torch_denkf.functional import soft_resample, systematic_resample
 from torch_denkf.modules import (
     ConstantNoise,

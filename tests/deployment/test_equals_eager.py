@@ -10,8 +10,9 @@ from torch import nn
 
 from tests.deployment.test_export import needs_compiler
 from tests.filters.gaussian_for_tests import learned_filter, learned_frames
+from torch_denkf.baselines import IEnKS, LSTMFilter
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import EKF, DEnKF, LSTMFilter
+from torch_denkf.filters import EKF, DEnKF
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
@@ -21,7 +22,6 @@ from torch_denkf.modules import (
     Select,
     StochasticMLP,
 )
-from torch_denkf.smoothers import IEnKS
 
 STATES = 3
 

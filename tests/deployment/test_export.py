@@ -9,9 +9,9 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torch_denkf.compilation import trace_below_autograd
 from torch_denkf.deployment import export, export_step, load_step
 from torch_denkf.filters import DEnKF, KalmanFilter
-from torch_denkf.inductor import trace_below_autograd
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, LearnedTransition, Select, StochasticMLP
 
 needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="no C++ compiler")

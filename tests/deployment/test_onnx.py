@@ -13,9 +13,9 @@ from tests.deployment.test_export import Wrong
 from tests.filters.factories import linear_kalman, toy_denkf, toy_frames
 from tests.filters.gaussian_for_tests import CONTROL, learned_filter, learned_frames, linear_frames
 from tests.filters.test_contract import fused, readings
+from torch_denkf.compilation import trace_below_autograd
 from torch_denkf.deployment import export, export_step, load_step, onnx_model
 from torch_denkf.filters import DEnKF, KalmanFilter
-from torch_denkf.inductor import trace_below_autograd
 from torch_denkf.modules import EnsembleAnalysis, LearnedTransition
 
 pytest.importorskip("onnxruntime")

@@ -18,7 +18,7 @@ from torch_denkf.envs import ReplayEnv
 from torch_denkf.envs.replay import RecordedPolicy
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import ConstantNoise, GaussianPrior, LinearObservation
-from torch_denkf.modules._base import SubModel
+from torch_denkf.submodel import SubModel
 from torch_denkf.transforms import DEnKFTransform
 
 LENGTHS = [6, 9, 4, 7]

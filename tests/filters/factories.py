@@ -4,9 +4,9 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torch_denkf.compilation import need_compiler
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.inductor import need_compiler
 from torch_denkf.modules import EnsembleAnalysis, GaussianPrior, StochasticMLP, SubModel
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation

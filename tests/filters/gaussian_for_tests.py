@@ -5,7 +5,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from tests.filters.factories import NoisyLinear, linear_system
-from torch_denkf.filters import EKF, UKF, BackpropKF
+from torch_denkf.baselines import BackpropKF
+from torch_denkf.filters import EKF, UKF
 from torch_denkf.modules import (
     CholeskyNoise,
     ConstantNoise,

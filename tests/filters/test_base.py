@@ -30,8 +30,9 @@ from tests.filters.gaussian_for_tests import CONTROL, linear_filter
 from tests.filters.gaussian_for_tests import FILTERS as GAUSSIAN_FILTERS
 from tests.filters.particle_for_tests import bootstrap
 from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
+from torch_denkf.baselines import LSTMFilter
 from torch_denkf.envs.linear import LinearGaussianEnv
-from torch_denkf.filters import DEnKF, Filter, LSTMFilter
+from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis
 from torch_denkf.modules.belief import FromSensor, GaussianPrior
 from torch_denkf.modules.observation import LinearObservation, Select

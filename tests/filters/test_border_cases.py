@@ -152,7 +152,7 @@ def test_freezing_a_network_called_keys_is_noticed():
 
 
 def test_guards_that_are_left_out_are_not_about_what_users_change():
-    from torch_denkf.inductor import worth_checking
+    from torch_denkf.compilation import worth_checking
 
     class Guard:
         def __init__(self, name, kind="TYPE_MATCH", is_global=False):

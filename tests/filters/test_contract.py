@@ -18,7 +18,8 @@ from torchrl.modules import set_recurrent_mode
 from tests.filters.factories import NoisyLinear, assert_equal, believing, linear_denkf, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
-from torch_denkf.filters import LSTMFilter, ParticleFilter
+from torch_denkf.baselines import LSTMFilter
+from torch_denkf.filters import ParticleFilter
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import (
     ConstantNoise,

@@ -20,7 +20,7 @@ from tests.filters.gaussian_for_tests import (
     minimise,
     prior,
 )
-from torch_denkf.filters import LSTMFilter
+from torch_denkf.baselines import LSTMFilter
 from torch_denkf.modules import (
     AroundState,
     CholeskyNoise,

@@ -8,8 +8,8 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_system, linear_with
 from torch_denkf.filters import Filter
 from torch_denkf.modules import SubModel
-from torch_denkf.modules._call import Call
-from torch_denkf.modules._running import run_module
+from torch_denkf.running import run_module
+from torch_denkf.submodel import Call
 
 ENSEMBLE, FORECAST = ("belief", "ensemble"), ("forecast", "ensemble")
 

@@ -6,7 +6,8 @@ from torch import nn
 
 from tests.filters.test_spaces import SPACE
 from tests.smoothers.small_angles import PROCESS, SMALL, STARTS, assert_small_differences, linear, readings, rotating
-from torch_denkf.filters import EKF, BackpropKF
+from torch_denkf.baselines import BackpropKF
+from torch_denkf.filters import EKF
 from torch_denkf.functional.manifolds import SO3
 from torch_denkf.modules import DiagonalNoise, GaussianAround
 

@@ -8,7 +8,7 @@ from torch import nn
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system, toy_denkf, toy_frames
 from torch_denkf.modules import ConstantNoise, LinearObservation, SubModel
-from torch_denkf.modules._running import run_module
+from torch_denkf.running import run_module
 
 MEAN, ENSEMBLE = ("belief", "mean"), ("belief", "ensemble")
 

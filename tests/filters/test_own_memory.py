@@ -9,7 +9,8 @@ from torchrl.envs import TransformedEnv
 from tests.filters.factories import linear_denkf
 from tests.filters.test_contract import FILTERS, every_filter, readings
 from tests.transforms.envs_for_tests import base_env
-from torch_denkf.filters import BackpropKF, KalmanFilter
+from torch_denkf.baselines import BackpropKF
+from torch_denkf.filters import KalmanFilter
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,

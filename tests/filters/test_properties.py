@@ -8,7 +8,8 @@ from tensordict import TensorDict
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear
 from tests.properties_for_tests import BATCHES, FIXED, SCALES, SEEDS, Draw, close
-from torch_denkf.filters import EKF, UKF, BackpropKF, DEnKF, KalmanFilter, ParticleFilter
+from torch_denkf.baselines import BackpropKF
+from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter, ParticleFilter
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,

@@ -14,8 +14,8 @@ from tests.filters.test_contract import FILTERS, every_filter
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, LinearObservation, SubModel, VectorSensor
-from torch_denkf.modules._running import reads_of, writes
 from torch_denkf.monitoring import BlackIsMissing, SignGate
+from torch_denkf.running import reads_of, writes
 
 
 @every_filter

@@ -13,22 +13,22 @@ from torchrl.envs import TransformedEnv
 from tests.filters.beliefs_for_tests import close
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import stepwise
+from torch_denkf.baselines import BackpropKF
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import EKF, UKF, BackpropKF, DEnKF, ParticleFilter
+from torch_denkf.diagnosis import check_analysis
+from torch_denkf.filters import EKF, UKF, DEnKF, ParticleFilter
 from torch_denkf.functional.manifolds import SO3, Circle, Euclidean, Product
 from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.imperfect import FadingBias, Visibility
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
     EnsembleAnalysis,
-    FadingBias,
     GaussianAround,
     LearnedTransition,
     MomentPrior,
     Select,
     SubModel,
-    Visibility,
-    check_analysis,
 )
 from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother

@@ -9,8 +9,8 @@ from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.test_contract import fused
+from torch_denkf.baselines.iterated import IEnKS
 from torch_denkf.smoothers import FixedLag
-from torch_denkf.smoothers.iterated import IEnKS
 from torch_denkf.transforms import DEnKFTransform
 
 FILTERS = {

@@ -19,6 +19,7 @@ from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.functional import wrap_angles
 from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
 from torch_denkf.fusion.parts import JoinedReading
+from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import (
     CholeskyNoise,
     ConstantNoise,
@@ -26,7 +27,6 @@ from torch_denkf.modules import (
     EKFAnalysis,
     EKFTransition,
     EnsembleAnalysis,
-    FadingBias,
     GaussianPrior,
     LearnedObservation,
     LearnedTransition,

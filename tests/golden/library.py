@@ -25,6 +25,7 @@ from tests.pretrained.beliefs import all_beliefs
 from torch_denkf.applications.car import read_kitti_drive, write_drives
 from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.applications.car.odometry.failing_drive import track_failing_drive, usual_failures
+from torch_denkf.baselines import IEnKS
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.modules import GaussianLikelihood, GaussianPrior
 from torch_denkf.monitoring import Gated, InnovationMonitor, Monitored, MonitoredSensor
@@ -37,7 +38,7 @@ from torch_denkf.objectives import (
     TransitionLoss,
 )
 from torch_denkf.pretrained import from_pretrained
-from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, IEnKS, ParticleSmoother, RTSSmoother
+from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
 
 __all__ = ["FILE", "values"]
 

@@ -11,14 +11,15 @@ from torch import nn
 from tests.filters.factories import has_compiler
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import ClonedTransition, PairObservation
+from torch_denkf.compilation import options_for_processors
 from torch_denkf.fusion.parts import JoinedObservation, StateObservation
-from torch_denkf.inductor import options_for_processors
+from torch_denkf.imperfect import FadingBias
+from torch_denkf.imperfect.bias import BiasedObservation, BiasedTransition
 from torch_denkf.modules import (
     ConstantNoise,
     ContinuousMotion,
     EKFAnalysis,
     EKFTransition,
-    FadingBias,
     LearnedObservation,
     LearnedTransition,
     LinearObservation,
@@ -28,8 +29,7 @@ from torch_denkf.modules import (
     UKFTransition,
     run_module,
 )
-from torch_denkf.modules._call import Call
-from torch_denkf.modules.bias import BiasedObservation, BiasedTransition
+from torch_denkf.submodel import Call
 
 B, S = 3, 9  # the unicycle's five and two steps of its past; or three times three numbers
 SEEN = ("forecast", "observed")

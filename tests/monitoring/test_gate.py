@@ -10,7 +10,8 @@ from tensordict import TensorDict
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.gaussian_for_tests import linear_filter
 from torch_denkf import DEnKFTransform, LinearGaussianEnv
-from torch_denkf.filters import KalmanFilter, LSTMFilter
+from torch_denkf.baselines import LSTMFilter
+from torch_denkf.filters import KalmanFilter
 from torch_denkf.modules import EnsembleAnalysis, KalmanAnalysis
 from torch_denkf.monitoring import Gated, GatedAnalysis, InnovationMonitor, Monitored, MonitoredSensor
 from torch_denkf.monitoring._calibration import chi_square_table

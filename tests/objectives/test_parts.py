@@ -13,7 +13,8 @@ from tests.filters.gaussian_for_tests import learned_filter, learned_frames
 from tests.filters.particle_for_tests import toy_filter
 from tests.objectives.denkf_for_tests import CLOSE, TERMS, score_by_hand
 from tests.objectives.problem_for_tests import only, problem, stepped
-from torch_denkf.filters import Filter, LSTMFilter
+from torch_denkf.baselines import LSTMFilter
+from torch_denkf.filters import Filter
 from torch_denkf.modules import DiagonalNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select, VectorSensor
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, ObservationLoss, SensorLoss, TransitionLoss
 

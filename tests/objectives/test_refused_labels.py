@@ -15,7 +15,8 @@ from tests.filters.gaussian_for_tests import learned_filter
 from tests.filters.particle_for_tests import bootstrap, toy_filter
 from tests.objectives.denkf_for_tests import TERMS
 from tests.objectives.problem_for_tests import only, problem
-from torch_denkf.filters import LSTMFilter, ParticleFilter
+from torch_denkf.baselines import LSTMFilter
+from torch_denkf.filters import ParticleFilter
 from torch_denkf.modules import DiagonalNoise, GaussianLikelihood, Select
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from torch_denkf.smoothers import EnKS, EnRTS

@@ -12,8 +12,8 @@ from tests.filters.gaussian_for_tests import directional_check
 from tests.functional.checks import assert_refused
 from tests.smoothers.joint import drive, joint_beliefs
 from torch_denkf.applications.car.odometry.filter import car_filter
-from torch_denkf.filters import LSTMFilter
-from torch_denkf.functional.smoothing_ensemble import enrts_step
+from torch_denkf.baselines import LSTMFilter
+from torch_denkf.functional.smoothing.ensemble import enrts_step
 from torch_denkf.modules import GaussianPrior
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
 

@@ -18,7 +18,7 @@ from tests.functional.checks import assert_compiled_is_eager, assert_refused
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional.moments import ensemble_cov
-from torch_denkf.functional.smoothing_ensemble import enrts_smooth, enrts_step
+from torch_denkf.functional.smoothing.ensemble import enrts_smooth, enrts_step
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,

@@ -11,7 +11,7 @@ from tests.functional.checks import assert_compiled_is_eager, assert_refused
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.functional.gaussian import gaussian_log_prob
-from torch_denkf.functional.smoothing_particles import backward_smooth, backward_weights
+from torch_denkf.functional.smoothing.particles import backward_smooth, backward_weights
 from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation, NoisyTransition
 from torch_denkf.smoothers import FixedLag, ParticleSmoother
 from torch_denkf.smoothers.particles import log_density_of_pairs

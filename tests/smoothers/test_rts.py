@@ -8,7 +8,7 @@ from tests.filters.factories import linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check, learned_filter, learned_frames, linear_filter
 from tests.functional.checks import assert_compiled_is_eager
 from tests.smoothers.joint import drive, joint_beliefs
-from torch_denkf.functional.smoothing import rts_smooth
+from torch_denkf.functional.smoothing.rts import rts_smooth
 from torch_denkf.smoothers import FixedLag, RTSSmoother
 
 FILTERS = ["Kalman", "EKF", "UKF", "BackpropKF"]

@@ -23,11 +23,12 @@ from tests.filters.test_spaces import (
     turned_beliefs,
 )
 from tests.smoothers.small_angles import PROCESS, STARTS, assert_small_differences, linear, noise, readings, rotating
+from torch_denkf.baselines import IEnKS
 from torch_denkf.filters import EKF, UKF, ParticleFilter
 from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.functional.manifolds import SO3, Euclidean
 from torch_denkf.modules import AroundState, ConstantNoise, GaussianAround, LearnedTransition, Select, SubModel
-from torch_denkf.smoothers import FixedLag, IEnKS, ParticleSmoother, RTSSmoother
+from torch_denkf.smoothers import FixedLag, ParticleSmoother, RTSSmoother
 from torch_denkf.smoothers.particles import log_density_of_pairs
 
 GAUSSIAN = {"EKF": EKF, "UKF": UKF}

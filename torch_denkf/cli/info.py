@@ -63,7 +63,7 @@ def _opengl() -> str:
 
 
 def _compiler() -> str:
-    from torch_denkf.inductor import need_compiler
+    from torch_denkf.compilation import need_compiler
 
     try:
         need_compiler()

@@ -13,18 +13,18 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._files import write_bytes
-from torch_denkf.deployment.onnx_model import need_onnx, onnx_model
-from torch_denkf.deployment.package import SIGNATURE, run_onnx
-from torch_denkf.filters import Filter
-from torch_denkf.filters.rejection import REJECTED
-from torch_denkf.inductor import (
+from torch_denkf.compilation import (
     clear_damaged_libraries,
     clear_full_cache,
     need_compiler,
     refuse_other_numbers,
     trace_below_autograd,
 )
-from torch_denkf.modules._call import Entries
+from torch_denkf.deployment.onnx_model import need_onnx, onnx_model
+from torch_denkf.deployment.package import SIGNATURE, run_onnx
+from torch_denkf.filters import Filter
+from torch_denkf.filters.rejection import REJECTED
+from torch_denkf.submodel import Entries
 
 Format = Literal["pt2", "onnx"]
 _ONNX = "onnxruntime, or of what writes its models"

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 import torch
 
 from torch_denkf.deployment.package import NEEDS_ONNX, SIGNATURE
-from torch_denkf.functional._small_system import LARGEST, LARGEST_FACTOR
+from torch_denkf.functional.kernels.small_system import LARGEST, LARGEST_FACTOR
 
 __all__ = ["need_onnx", "onnx_model"]
 

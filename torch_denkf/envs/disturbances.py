@@ -204,7 +204,7 @@ class OccludingBox(ImageDisturbance):
     """Hides a part of the picture behind a box.
 
     Append it to a replay, and a sensor learns what it looks like not to see; see
-    :class:`~torch_denkf.modules.Visibility`.
+    :class:`~torch_denkf.imperfect.Visibility`.
 
     Args:
         size: shares of the frame's height and width; by default 150 x 150 pixels of KITTI's 375 x 1242.

@@ -1,12 +1,10 @@
 """Filters: compositions of sub-models on one base."""
 
 from torch_denkf.filters.base import Filter
-from torch_denkf.filters.bkf import BackpropKF
 from torch_denkf.filters.denkf import DEnKF
 from torch_denkf.filters.ekf import EKF
 from torch_denkf.filters.kalman import KalmanFilter
 from torch_denkf.filters.particle import DPF, PFM, MixtureParticleFilter, ParticleFilter
-from torch_denkf.filters.recurrent import LSTMFilter
 from torch_denkf.filters.ukf import UKF
 
 __all__ = [
@@ -15,10 +13,8 @@ __all__ = [
     "KalmanFilter",
     "EKF",
     "UKF",
-    "BackpropKF",
     "ParticleFilter",
     "DPF",
     "MixtureParticleFilter",
     "PFM",
-    "LSTMFilter",
 ]

@@ -12,9 +12,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules import Visibility
-from torch_denkf.modules._running import check_module, declared
-from torch_denkf.modules.visible import heeding
+from torch_denkf.imperfect import Visibility
+from torch_denkf.imperfect.visible import heeding
+from torch_denkf.running import check_module, declared
 
 __all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]
 
@@ -34,8 +34,8 @@ class GaussianOptions(FilterOptions, total=False):
         observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``; ``("sensor", "ensemble")`` by default.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, by default ``"observed"``; a nonlinear observation model
             may write it.
-        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.modules.Visibility`; the
-            update heeds it, see :class:`~torch_denkf.modules.Visible`. ``None`` by default.
+        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.imperfect.Visibility`; the
+            update heeds it, see :class:`~torch_denkf.imperfect.Visible`. ``None`` by default.
     """
 
     inflation: float

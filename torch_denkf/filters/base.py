@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from functools import partial
+from importlib import import_module
 from itertools import chain
 from typing import Any, cast
 
@@ -28,8 +29,6 @@ from torchrl.modules.tensordict_module.rnn import recurrent_mode
 from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_count, check_number
 from torch_denkf._slices import as_rows, starts_of
-from torch_denkf.filters.collapse import say_collapse
-from torch_denkf.filters.compiled import CompiledSteps
 from torch_denkf.filters.finish import (
     own,
     refuse_far_belief,
@@ -39,10 +38,8 @@ from torch_denkf.filters.finish import (
 )
 from torch_denkf.filters.gather import gather_rows
 from torch_denkf.filters.gather import of_one_robot as _of_one_robot
-from torch_denkf.filters.messages import Messages
 from torch_denkf.filters.noise import draw_noise
 from torch_denkf.filters.options import FilterOptions
-from torch_denkf.filters.primer import LastAction
 from torch_denkf.filters.refusals import (
     check_inputs,
     refuse_missing_actions,
@@ -55,9 +52,9 @@ from torch_denkf.filters.refusals import (
 )
 from torch_denkf.filters.scan import Steps, where_rows
 from torch_denkf.filters.structure import KNOWN, Structure, previous_key, sequences_in, submodels
-from torch_denkf.modules._call import Call, Entries, flat_noise
-from torch_denkf.modules._running import check_module, declared, named_modules_of, reads, run_module
 from torch_denkf.modules._summaries import summaries
+from torch_denkf.running import check_module, declared, named_modules_of, reads, run_module
+from torch_denkf.submodel import Call, Entries, flat_noise
 
 __all__ = ["Filter"]
 
@@ -164,8 +161,8 @@ class Filter(Checked, TensorDictSequential):
         if prefix == "next":
             raise ValueError('prefix="next" is where torchrl keeps the next step: give the filter another name')
         self.prefix = prefix
-        self.compiled: CompiledSteps | None = None
-        self.messages = Messages(type(self).__name__)
+        self.compiled: Any = None
+        self.messages = import_module("torch_denkf.diagnosis.messages").Messages(type(self).__name__)
         refuse_two_precisions(self)
         self._sort()
 
@@ -323,7 +320,9 @@ class Filter(Checked, TensorDictSequential):
             kept = self.outer(previous_key(key))
             primers[kept] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
         primers[self.outer(KNOWN)] = Unbounded(shape=(1,), dtype=torch.bool, device=like.device)
-        return LastAction({key: self.outer(previous_key(key)) for key in self.structure.controls}, primers=primers)
+        return import_module("torch_denkf.transforms").LastAction(
+            {key: self.outer(previous_key(key)) for key in self.structure.controls}, primers=primers
+        )
 
     def compile(self, *, chunk: int = 4, **options) -> Filter:
         """From now on runs steps, and sequences in chunks of steps, through ``torch.compile``.
@@ -355,7 +354,8 @@ class Filter(Checked, TensorDictSequential):
             ValueError: if ``chunk`` is negative.
         """
         check_count("chunk", chunk, least=0, cure="It is a number of steps, or 0 for none")
-        self.compiled = CompiledSteps(chunk, options) if chunk else None
+        steps = import_module("torch_denkf.compilation.compiled").CompiledSteps
+        self.compiled = steps(chunk, options) if chunk else None
         return self
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -605,7 +605,7 @@ class Filter(Checked, TensorDictSequential):
                 )[1]
         steps.blank(outputs, gathered.fresh)
         if not (torch.is_grad_enabled() or torch.compiler.is_compiling()):
-            say_collapse(self.messages, structure, outputs)
+            import_module("torch_denkf.diagnosis.collapse").say_collapse(self.messages, structure, outputs)
         return {**own({key: frames[key] for key in keep if key in frames}, given), **outputs}
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:

@@ -15,22 +15,21 @@ from torch_denkf._checks import check_count, check_number
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.functional.manifolds import Space
+from torch_denkf.imperfect import FadingBias, Visibility
+from torch_denkf.imperfect.bias import biased_parts
+from torch_denkf.imperfect.visible import heeding
 from torch_denkf.modules import (
     DiagonalNoise,
     EnsembleAnalysis,
-    FadingBias,
     GaussianPrior,
     ImageSensor,
     LearnedObservation,
     LearnedTransition,
     NoisyTransition,
     StochasticMLP,
-    Visibility,
     as_process_noise,
 )
-from torch_denkf.modules._running import check_module, declared, reading_of
-from torch_denkf.modules.bias import biased_parts
-from torch_denkf.modules.visible import heeding
+from torch_denkf.running import check_module, declared, reading_of
 
 __all__ = ["DEnKF"]
 
@@ -62,11 +61,11 @@ class DEnKF(Filter):
         reading_space: in which the reading lives, in the place of ``angles``. The initial belief has that of the state.
         observation_key: the reading ``[*B, O]``, for the default ``analysis`` without a sensor.
         observed_key: its mask ``[*B, 1]`` or ``[*B, O]``, for the default ``analysis``; ``"observed"`` by default.
-        sensor_error: errors of the sensor that last, :class:`~torch_denkf.modules.FadingBias`: they become part of the
-            state, behind its S components, of transition, process noise, observation and initial belief. All these are
-            given for the state alone.
-        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.modules.Visibility`; the
-            update heeds it, see :class:`~torch_denkf.modules.Visible`.
+        sensor_error: coloured errors of the sensor, such as a ``FadingBias``: they become part of the state, behind its
+            S components, of transition, process noise, observation and initial belief. All these are given for the
+            state alone.
+        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.imperfect.Visibility`; the
+            update heeds it, see :class:`~torch_denkf.imperfect.Visible`.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
             ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
 

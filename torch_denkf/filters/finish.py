@@ -13,7 +13,7 @@ from torch_denkf._checks import flag_value, has_values
 from torch_denkf.filters.rejection import LARGEST_READING, rejected_keys
 from torch_denkf.filters.scan import where_rows
 from torch_denkf.filters.structure import Structure
-from torch_denkf.modules._call import Entries
+from torch_denkf.submodel import Entries
 
 __all__ = [
     "AbsurdReading",

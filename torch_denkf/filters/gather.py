@@ -13,8 +13,8 @@ from torch import Tensor
 from torch_denkf.filters.refusals import refuse_missing_actions
 from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.filters.structure import KNOWN, RESUMES, Structure, previous_key
-from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._summaries import summaries
+from torch_denkf.submodel import Call, Entries
 
 __all__ = ["Rows", "gather_rows", "of_one_robot"]
 

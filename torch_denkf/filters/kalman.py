@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_covariance, check_one_dtype, check_shape, check_square, check_values
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
-from torch_denkf.modules import FadingBias, KalmanAnalysis, LinearTransition, MomentPrior
+from torch_denkf.imperfect import FadingBias
+from torch_denkf.modules import KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules._tensors import as_floating, check_dims
 
 __all__ = ["KalmanFilter"]
@@ -36,7 +37,7 @@ class KalmanFilter(Filter):
         cov: of the initial belief, ``[S, S]``.
         control: B, ``[S, A]``, of the action; ``None`` for none.
         angles: components of the observation that are angles in radians.
-        sensor_error: errors of the readings that last, :class:`~torch_denkf.modules.FadingBias`: they become part of
+        sensor_error: errors of the readings that last, :class:`~torch_denkf.imperfect.FadingBias`: they become part of
             the state, behind its S components, as large and as long as they are now.
         observation_key: readings ``[*B, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.

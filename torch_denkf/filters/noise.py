@@ -10,9 +10,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_denkf.filters.structure import Placed, Structure
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Entries, flat_noise
-from torch_denkf.modules._running import declared, random_parts
+from torch_denkf.running import declared, random_parts
+from torch_denkf.submodel import Entries, SubModel, flat_noise
 
 __all__ = ["draw_noise"]
 

@@ -12,10 +12,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel, Visibility, as_process_noise
-from torch_denkf.modules._running import check_module, declared, reading_of
+from torch_denkf.imperfect import Visibility
+from torch_denkf.imperfect.visible import heeding
+from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel, as_process_noise
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
-from torch_denkf.modules.visible import heeding
+from torch_denkf.running import check_module, declared, reading_of
 
 __all__ = ["DPF", "PFM", "MixtureParticleFilter", "ParticleFilter"]
 
@@ -53,8 +54,8 @@ class ParticleFilter(Filter):
         reading_space: in which the reading lives, in the place of ``angles``. The initial belief has that of the state.
         observation_key: the reading ``[*B, O]``, for the default likelihood without a sensor.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` that resampling and the default likelihood heed.
-        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.modules.Visibility`; the
-            update heeds it, see :class:`~torch_denkf.modules.Visible`. For a Gaussian likelihood.
+        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.imperfect.Visibility`; the
+            update heeds it, see :class:`~torch_denkf.imperfect.Visible`. For a Gaussian likelihood.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
             ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
 

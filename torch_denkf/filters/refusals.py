@@ -8,8 +8,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
 from torch_denkf.filters.structure import Placed, Structure, previous_key, submodels, takes_reading
-from torch_denkf.modules._call import Entries
-from torch_denkf.modules._running import declared, in_sequences, random_parts, writes
+from torch_denkf.running import declared, in_sequences, random_parts, writes
+from torch_denkf.submodel import Entries
 
 __all__ = [
     "check_inputs",

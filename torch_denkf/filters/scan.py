@@ -13,10 +13,9 @@ from torch import Tensor
 
 from torch_denkf.filters.rejection import REJECTED, usable
 from torch_denkf.filters.structure import RESUMES, Placed, Structure, previous_key, takes_reading
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._held import hold_variances
-from torch_denkf.modules._running import is_sequence, named_modules_of, run_module
+from torch_denkf.running import is_sequence, named_modules_of, run_module
+from torch_denkf.submodel import Call, Entries, SubModel
 
 __all__ = ["Steps", "where_rows"]
 

@@ -12,8 +12,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters.rejection import Guard, guards_of
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import (
+from torch_denkf.running import (
     declared,
     in_sequences,
     is_sequence,
@@ -23,6 +22,7 @@ from torch_denkf.modules._running import (
     reads_of,
     writes,
 )
+from torch_denkf.submodel import SubModel
 
 __all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "previous_key", "sequences_in", "submodels"]
 

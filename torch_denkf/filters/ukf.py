@@ -9,10 +9,10 @@ from typing import Unpack
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
-from torch_denkf.modules._running import declared
-from torch_denkf.modules.bias import FadingBias, biased_parts
+from torch_denkf.imperfect.bias import FadingBias, biased_parts
 from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
+from torch_denkf.running import declared
 
 __all__ = ["UKF"]
 
@@ -34,9 +34,9 @@ class UKF(GaussianFilter):
             :mod:`torch_denkf.modules.process_noise`.
         initial: the initial belief, :class:`~torch_denkf.modules.MomentPrior` or
             :class:`~torch_denkf.modules.GaussianAround`; its covariance may be singular.
-        sensor_error: errors of the sensor that last, :class:`~torch_denkf.modules.FadingBias`: they become part of the
-            state, behind its S components, of transition, process noise, observation and initial belief. All these are
-            given for the state alone.
+        sensor_error: coloured errors of the sensor, such as a ``FadingBias``: they become part of the state, behind its
+            S components, of transition, process noise, observation and initial belief. All these are given for the
+            state alone.
         alpha: spread of the sigma points.
         beta: extra weight of the central point in the covariance.
         kappa: their secondary spread. Covariances stay positive where no weight is negative, as by default.

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape, check_shapes
 from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
-from torch_denkf.functional._small_system import LARGEST, solve_written_out
 from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
+from torch_denkf.functional.kernels.small_system import LARGEST, solve_written_out
 from torch_denkf.functional.linalg import cholesky, inverse_square_root_difference
 
 Scheme = Literal["sensor", "perturbed", "etkf", "sakov"]

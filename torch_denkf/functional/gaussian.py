@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_mask, check_one_dtype, check_shape, check_shapes
-from torch_denkf.functional._small_system import LARGEST, gain_written_out
+from torch_denkf.functional.kernels.small_system import LARGEST, gain_written_out
 from torch_denkf.functional.linalg import cholesky
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torch_denkf.functional._small_system import (
+from torch_denkf.functional.kernels.small_system import (
     LARGEST_FACTOR,
     cholesky_solve_written_out,
     cholesky_written_out,

@@ -14,7 +14,7 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import JoinedObservation, JoinedReading, StateObservation
 from torch_denkf.fusion.sensor import FusedSensor, Wired, noise_key_of
 from torch_denkf.fusion.sensor_weights import SensorWeights, WeightedNoise
-from torch_denkf.modules._running import declared
+from torch_denkf.running import declared
 from torch_denkf.smoothers.past import lagged
 
 __all__ = ["Updates"]

@@ -18,6 +18,7 @@ from torch_denkf.fusion._updates import Updates
 from torch_denkf.fusion.joint_moments import JOINT_PAST, JointForecast, PresentOfJoint, joint_space
 from torch_denkf.fusion.parts import OfOwnErrors
 from torch_denkf.fusion.sensor import FusedSensor, wire
+from torch_denkf.imperfect.bias import FadingBias, biased_parts
 from torch_denkf.modules import (
     EKFAnalysis,
     EKFTransition,
@@ -30,8 +31,7 @@ from torch_denkf.modules import (
 )
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition
-from torch_denkf.modules._running import check_module, declared, writes
-from torch_denkf.modules.bias import FadingBias, biased_parts
+from torch_denkf.running import check_module, declared, writes
 from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, with_past
 from torch_denkf.smoothers.past_moments import CrossTransition
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_denkf.functional.smoothing import smoothing_gain
+from torch_denkf.functional.smoothing.rts import smoothing_gain
 
 
 def joint_forecast(

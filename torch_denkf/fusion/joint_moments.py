@@ -13,9 +13,8 @@ from torch import nn
 
 from torch_denkf.functional.manifolds import Repeated, Space
 from torch_denkf.fusion.joint_forecast import joint_forecast
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Entries
 from torch_denkf.smoothers.past import Past
+from torch_denkf.submodel import Entries, SubModel
 
 __all__ = ["JOINT_PAST", "JointForecast", "PresentOfJoint", "joint_space"]
 

@@ -12,10 +12,9 @@ from torch.nn import functional as F
 
 from torch_denkf._checks import check_mask
 from torch_denkf.functional.angles import mean_observation
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Call, Entries
-from torch_denkf.modules._running import check_module, marks_of, reads, run_module, writes
 from torch_denkf.modules.carried import InPlaceOf
+from torch_denkf.running import check_module, marks_of, reads, run_module, writes
+from torch_denkf.submodel import Call, Entries, SubModel
 
 __all__ = ["JoinedObservation", "JoinedReading", "OfOwnErrors", "Renamed", "StateObservation"]
 

@@ -12,8 +12,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf._arguments import Checked
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import Renamed
-from torch_denkf.modules import ConstantNoise, FadingBias
-from torch_denkf.modules._running import marks_of, reading_of, writes
+from torch_denkf.imperfect import FadingBias
+from torch_denkf.modules import ConstantNoise
+from torch_denkf.running import marks_of, reading_of, writes
 
 __all__ = ["FusedSensor", "Wired", "noise_key_of", "wire"]
 
@@ -44,7 +45,7 @@ class FusedSensor(Checked):
         features_key: an entry ``[*B, F]`` that tells how good a reading is, for the filter's ``weights``: one of the
             data, or one that ``sensor`` writes, such as its encoding, under the sensor's own key.
         analysis: makes the sensor's own update, see :class:`FusedFilter`; ``None`` for the filter's.
-        sensor_error: errors of the sensor that last, :class:`~torch_denkf.modules.FadingBias`: they become part of the
+        sensor_error: coloured errors of the sensor, :class:`~torch_denkf.imperfect.FadingBias`: they become part of the
             state, behind its S components and the errors of the sensors before this one. All else is given for the S
             components alone. A constant offset is one with a ``time`` far beyond that of the recordings.
     """

@@ -14,9 +14,9 @@ from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.fusion.parts import StateObservation
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import reads
 from torch_denkf.modules._tensors import mean_of_members
+from torch_denkf.running import reads
+from torch_denkf.submodel import SubModel
 
 __all__ = ["SensorAttention", "SensorWeights", "WeightedNoise"]
 

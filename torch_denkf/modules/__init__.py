@@ -3,12 +3,8 @@
 Import from here: ``from torch_denkf.modules import EnsembleAnalysis, ImageSensor, ...``.
 """
 
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import reads, run_module
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
-from torch_denkf.modules.bias import FadingBias
-from torch_denkf.modules.check import check_analysis
 from torch_denkf.modules.continuous import ContinuousMotion, ContinuousNoise, NoisePerSecond
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
@@ -24,11 +20,11 @@ from torch_denkf.modules.sharded_analysis import ShardedEnsembleAnalysis
 from torch_denkf.modules.stochastic import StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
-from torch_denkf.modules.visible import Visibility, Visible
+from torch_denkf.running import reads, run_module
+from torch_denkf.submodel import SubModel
 
 __all__ = [
     "SubModel",
-    "check_analysis",
     "reads",
     "run_module",
     "StochasticMLP",
@@ -59,7 +55,6 @@ __all__ = [
     "GaussianAround",
     "CholeskyNoise",
     "MappedNoise",
-    "FadingBias",
     "as_process_noise",
     "EKFTransition",
     "EKFAnalysis",
@@ -68,6 +63,4 @@ __all__ = [
     "GaussianLikelihood",
     "LearnedLikelihood",
     "NoisyTransition",
-    "Visibility",
-    "Visible",
 ]

@@ -14,12 +14,11 @@ from torch_denkf._checks import check_number
 from torch_denkf.functional.angles import mean_observation, wrap_angles
 from torch_denkf.functional.gaussian import GaussianUpdate
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Call, Entries
-from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._spaces import checked_space, checked_spaces, without_hidden
 from torch_denkf.modules._tensors import check_dims
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
+from torch_denkf.running import check_module, reads, run_module
+from torch_denkf.submodel import Call, Entries, SubModel
 
 _DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch_denkf._checks import flag_value
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.weighted import weighted_mean, weighted_median
-from torch_denkf.modules._call import Entries
+from torch_denkf.submodel import Entries
 
 __all__ = ["hold_variances"]
 

@@ -10,10 +10,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Entries
-from torch_denkf.modules._running import declared
 from torch_denkf.modules._spaces import moments_on
+from torch_denkf.running import declared
+from torch_denkf.submodel import Entries, SubModel
 
 __all__ = ["summaries"]
 

@@ -12,7 +12,6 @@ from torch import nn
 from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._spaces import checked_space, moments_on
 from torch_denkf.modules._tensors import (
     as_floating,
@@ -21,6 +20,7 @@ from torch_denkf.modules._tensors import (
     mean_of_members,
     register_location,
 )
+from torch_denkf.submodel import SubModel
 
 __all__ = ["AroundState", "FromSensor", "GaussianPrior"]
 

@@ -10,10 +10,8 @@ import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._gaussian import GaussianAnalysis
-from torch_denkf.modules._running import (
+from torch_denkf.running import (
     check_module,
     declared,
     is_sequence,
@@ -22,6 +20,7 @@ from torch_denkf.modules._running import (
     run_module,
     writes,
 )
+from torch_denkf.submodel import Call, Entries, SubModel
 
 __all__ = ["AnalysisAround", "Beside", "InPlaceOf", "Stateful", "with_state"]
 

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torch_denkf.functional import kalman_update
 from torch_denkf.functional.manifolds import Euclidean, Space
-from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
-from torch_denkf.modules._running import reads
+from torch_denkf.running import reads
+from torch_denkf.submodel import Call, Entries
 
 __all__ = ["EKFAnalysis", "EKFTransition"]
 

@@ -10,8 +10,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number, check_values
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._tensors import (
     as_standard_deviations,
     mean_of_members,
@@ -20,6 +18,8 @@ from torch_denkf.modules._tensors import (
     variance_and_floor,
 )
 from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.running import check_module, reads, run_module
+from torch_denkf.submodel import SubModel
 
 __all__ = ["ConstantNoise", "DiagonalNoise", "ScaledNoise", "MemberGain"]
 

@@ -10,10 +10,10 @@ from torch import nn
 
 from torch_denkf._checks import check_values
 from torch_denkf.functional.linalg import product_of_known
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import check_network
 from torch_denkf.modules._tensors import check_dims, register_constant, register_location, register_scale
 from torch_denkf.modules.transition import MemberNetwork
+from torch_denkf.running import check_network
+from torch_denkf.submodel import SubModel
 
 __all__ = ["LearnedObservation", "LinearObservation", "Select"]
 
@@ -111,7 +111,7 @@ class Select(_Observation):
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
         """Returns the selected dimensions of states ``[*, S]``."""
-        # Not index_select: inductor (torch 2.13) adds the rows of its Jacobian up, see tests/inductor/test_compared.py.
+        # Not index_select: inductor (torch 2.13) adds the rows of its Jacobian up.
         return state.gather(-1, self.dims.expand(*state.shape[:-1], -1))
 
 

@@ -26,12 +26,11 @@ from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.resampling import effective_sample_size, jitter_copies
 from torch_denkf.functional.weighted import weighted_innovation, weighted_mean, weighted_var
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Entries
-from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._spaces import checked_space, moments_on, reading_about
 from torch_denkf.modules.carried import Beside
 from torch_denkf.modules.likelihood import GaussianLikelihood
+from torch_denkf.running import check_module, reads, run_module
+from torch_denkf.submodel import Entries, SubModel
 
 __all__ = ["ParticleAnalysis", "ResampledTransition", "with_weights"]
 

@@ -16,8 +16,6 @@ from torch import nn
 from torch.nn import functional as F
 
 from torch_denkf._checks import check_count, check_values
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import check_module, declared, reads, run_module
 from torch_denkf.modules._tensors import (
     as_floating,
     mean_of_members,
@@ -28,6 +26,8 @@ from torch_denkf.modules._tensors import (
 )
 from torch_denkf.modules.noise import ConstantNoise
 from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.running import check_module, declared, reads, run_module
+from torch_denkf.submodel import SubModel
 
 __all__ = ["CholeskyNoise", "MappedNoise", "NoiseThrough", "as_process_noise"]
 

@@ -6,7 +6,7 @@ from typing import Literal, Unpack
 
 import torch.distributed as dist
 
-from torch_denkf.functional.sharded import analyse_sharded
+from torch_denkf.functional.kernels.sharded import analyse_sharded
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys
 from torch_denkf.modules.analysis import EnsembleAnalysis
 
@@ -16,7 +16,7 @@ __all__ = ["ShardedEnsembleAnalysis"]
 class ShardedEnsembleAnalysis(EnsembleAnalysis):
     """:class:`EnsembleAnalysis` of a state that is spread over processes.
 
-    The mathematics is :func:`~torch_denkf.functional.sharded.analyse_sharded`.
+    The mathematics is :func:`~torch_denkf.functional.kernels.sharded.analyse_sharded`.
 
     Each process, as ``torchrun`` starts them, runs the same filter on its own components of the state and of the
     observation, with the same number of members. ``nis`` and ``log_likelihood`` are those of all components; everything

@@ -24,8 +24,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.functional.dropped_relu import dropped_relu
-from torch_denkf.functional.random_bits import dropout_factor, random_bytes, random_signs, representable_rate
+from torch_denkf.functional.kernels.dropped_relu import dropped_relu
+from torch_denkf.functional.kernels.random_bits import dropout_factor, random_bytes, random_signs, representable_rate
 
 __all__ = ["FlipoutLinear", "StochasticMLP", "deterministic"]
 

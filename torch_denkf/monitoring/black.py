@@ -6,8 +6,8 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_number
-from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._tensors import mask_of
+from torch_denkf.submodel import SubModel
 
 __all__ = ["BlackIsMissing"]
 

@@ -11,8 +11,6 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Call, Entries, flat_noise
 from torch_denkf.modules.carried import AnalysisAround
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.monitoring._calibration import IDENTITY, check_observation_dim, chi_square_table, empirical_quantile
@@ -20,6 +18,7 @@ from torch_denkf.monitoring.chi_square import chi_square_quantile
 from torch_denkf.monitoring.gating import adapt, disbelief, spread_about_mean
 from torch_denkf.monitoring.innovation_tests import interpolate
 from torch_denkf.smoothers.past import LaggedAnalysis
+from torch_denkf.submodel import Call, Entries, SubModel, flat_noise
 
 __all__ = ["GateOptions", "GatedAnalysis"]
 

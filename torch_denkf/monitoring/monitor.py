@@ -11,7 +11,6 @@ from tensordict.utils import expand_as_right
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.modules._base import SubModel
 from torch_denkf.monitoring._calibration import (
     IDENTITY,
     check_observation_dim,
@@ -29,6 +28,7 @@ from torch_denkf.monitoring.innovation_tests import (
     observe,
 )
 from torch_denkf.monitoring.signs import floors
+from torch_denkf.submodel import SubModel
 
 __all__ = ["InnovationMonitor", "MonitoredSensor"]
 

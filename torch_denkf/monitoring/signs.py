@@ -9,9 +9,9 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._tensors import mask_of
 from torch_denkf.monitoring._calibration import sign_limits
+from torch_denkf.submodel import SubModel
 
 __all__ = ["SignGate"]
 

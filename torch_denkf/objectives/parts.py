@@ -19,12 +19,12 @@ from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
 from torch_denkf.filters.structure import previous_key
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._call import Call, Entries
-from torch_denkf.modules._running import declared, reads, reads_of, run_module, run_modules
 from torch_denkf.modules._tensors import as_floating
 from torch_denkf.objectives import _terms
 from torch_denkf.objectives._labels import Keys, Truth
 from torch_denkf.objectives.filter_loss import FilterLoss, ReadingsOptions, StateOptions, Term
+from torch_denkf.running import declared, reads, reads_of, run_module, run_modules
+from torch_denkf.submodel import Call, Entries
 
 __all__ = ["ObservationLoss", "SensorLoss", "TransitionLoss"]
 
@@ -84,7 +84,7 @@ class SensorLoss(FilterLoss):
                               :class:`~torch_denkf.objectives.DEnKFLoss`
     ``loss_noise``            negative log-likelihood of the true observation under N(mean of the samples, R), nats
     ``loss_visible``          binary cross entropy of whether the sensor sees, of a filter with a
-                              :class:`~torch_denkf.modules.Visibility`
+                              :class:`~torch_denkf.imperfect.Visibility`
     ========================  =====================================================================================
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied. Frames

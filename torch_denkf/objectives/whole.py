@@ -33,7 +33,7 @@ class DEnKFLoss(FilterLoss):
     ``loss_observation``      squared error of :math:`h_\psi(x_t)` against the true observation
     ``loss_nll``              negative log-likelihood of the innovation, nats; needs no true state
     ``loss_visible``          binary cross entropy of whether the sensor sees, of a filter with a
-                              :class:`~torch_denkf.modules.Visibility`
+                              :class:`~torch_denkf.imperfect.Visibility`
     ``loss_smoothed``         score of the smoothed belief of each time, given what came later, against :math:`x_t`
     ``loss_kl``               KL divergence of flipout weights from their prior, nats
     ========================  =====================================================================================
@@ -184,7 +184,7 @@ class GaussianLoss(FilterLoss):
                               error of one sample or one reading; squared error of their mean with ``score="mse"``
     ``loss_nll``              negative log-likelihood of the innovation, nats; needs no true state
     ``loss_visible``          binary cross entropy of whether the sensor sees, of a filter with a
-                              :class:`~torch_denkf.modules.Visibility`
+                              :class:`~torch_denkf.imperfect.Visibility`
     ========================  =====================================================================================
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied. Only
@@ -261,7 +261,7 @@ class MixtureLoss(FilterLoss):
                               error of one sample or one reading
     ``loss_nll``              negative log-likelihood of the reading, nats; needs no true state
     ``loss_visible``          binary cross entropy of whether the sensor sees, of a filter with a
-                              :class:`~torch_denkf.modules.Visibility`
+                              :class:`~torch_denkf.imperfect.Visibility`
     ========================  =====================================================================================
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied, so

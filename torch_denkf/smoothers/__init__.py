@@ -2,7 +2,6 @@
 
 from torch_denkf.smoothers.ensemble import EnKS, EnRTS
 from torch_denkf.smoothers.fixed_lag import FixedLag
-from torch_denkf.smoothers.iterated import IEnKS
 from torch_denkf.smoothers.particles import ParticleSmoother
 from torch_denkf.smoothers.rts import RTSSmoother
 
@@ -10,7 +9,6 @@ __all__ = [
     "FixedLag",
     "EnKS",
     "EnRTS",
-    "IEnKS",
     "RTSSmoother",
     "ParticleSmoother",
 ]

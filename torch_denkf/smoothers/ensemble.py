@@ -8,7 +8,7 @@ from torch import Tensor
 from torch_denkf._checks import check_number
 from torch_denkf.filters import Filter
 from torch_denkf.filters.structure import submodels
-from torch_denkf.functional.smoothing_ensemble import enrts_smooth
+from torch_denkf.functional.smoothing.ensemble import enrts_smooth
 from torch_denkf.smoothers.base import Smoother, last_of_runs
 from torch_denkf.smoothers.fixed_lag import FixedLag, kind_of
 from torch_denkf.smoothers.past import moments_of
@@ -27,7 +27,7 @@ class EnRTS(Smoother):
         filter: an ensemble filter. Its analysis must keep members in their places: not ``rotate=True``.
         lag: how many later readings count; ``None`` for all.
         damping: factor on each gain, 1 by default. A filter with inflation needs one below 1 / inflation, see
-            :func:`~torch_denkf.functional.smoothing_ensemble.enrts_step`.
+            :func:`~torch_denkf.functional.smoothing.ensemble.enrts_step`.
 
     Raises:
         TypeError: for a filter without an ensemble.

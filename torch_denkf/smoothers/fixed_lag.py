@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters import Filter
-from torch_denkf.modules._running import declared, is_sequence, named_modules_of
 from torch_denkf.modules.particles import ResampledTransition
+from torch_denkf.running import declared, is_sequence, named_modules_of
 from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, lagged, with_past
 from torch_denkf.smoothers.past_moments import MOMENTS_PAST, CrossTransition, LaggedMoments, MomentsPast
 

@@ -12,16 +12,16 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters.structure import previous_key
 from torch_denkf.functional.linalg import cholesky
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.functional.smoothing_particles import backward_smooth
+from torch_denkf.functional.smoothing.particles import backward_smooth
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules import NoisyTransition
-from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._gaussian import as_covariance
-from torch_denkf.modules._running import run_module
 from torch_denkf.modules.particles import ResampledTransition
+from torch_denkf.running import run_module
 from torch_denkf.smoothers.base import Smoother
 from torch_denkf.smoothers.fixed_lag import kind_of
 from torch_denkf.smoothers.past import moments_of
+from torch_denkf.submodel import Call, Entries
 
 __all__ = ["ParticleSmoother"]
 

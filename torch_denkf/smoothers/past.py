@@ -22,11 +22,10 @@ from torch_denkf._checks import check_count, check_shape
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Entries
-from torch_denkf.modules._running import declared
 from torch_denkf.modules._spaces import moments_on
 from torch_denkf.modules.carried import AnalysisAround, Beside, InPlaceOf
+from torch_denkf.running import declared
+from torch_denkf.submodel import Entries, SubModel
 
 __all__ = ["ENSEMBLE_PAST", "EnsemblePast", "LaggedAnalysis", "LaggedBelief", "Past", "lagged", "with_past"]
 

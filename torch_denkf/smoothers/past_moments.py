@@ -15,14 +15,13 @@ from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.functional.smoothing import smoothing_gain
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Entries
+from torch_denkf.functional.smoothing.rts import smoothing_gain
 from torch_denkf.modules._gaussian import GaussianTransition
-from torch_denkf.modules._running import reads
 from torch_denkf.modules.carried import InPlaceOf
 from torch_denkf.modules.kalman import LinearTransition
+from torch_denkf.running import reads
 from torch_denkf.smoothers.past import Past, check_age
+from torch_denkf.submodel import Entries, SubModel
 
 __all__ = ["MOMENTS_PAST", "CrossTransition", "LaggedMoments", "MomentsPast"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from torch_denkf.filters import Filter
-from torch_denkf.functional.smoothing import rts_smooth
+from torch_denkf.functional.smoothing.rts import rts_smooth
 from torch_denkf.smoothers.base import Smoother
 from torch_denkf.smoothers.fixed_lag import kind_of, rebuilt
 from torch_denkf.smoothers.past_moments import CrossTransition

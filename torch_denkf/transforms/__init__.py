@@ -1,7 +1,7 @@
 """What torchrl environments see of a filter."""
 
-from torch_denkf.filters.primer import LastAction
 from torch_denkf.transforms.denkf import DEnKFTransform
+from torch_denkf.transforms.primer import LastAction
 
 __all__ = [
     "DEnKFTransform",

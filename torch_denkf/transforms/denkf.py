@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
+from importlib import import_module
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -17,13 +18,12 @@ from torch_denkf._arguments import Checked
 from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import own, refuse_far_belief, refuse_non_finite
-from torch_denkf.filters.messages import mark_up_to_date
-from torch_denkf.filters.primer import refuse_resets_of_groups
 from torch_denkf.filters.refusals import refuse_unguarded
 from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.filters.scan import where_rows
-from torch_denkf.modules._call import Entries
+from torch_denkf.submodel import Entries
 from torch_denkf.transforms._packaged import PackagedRun, Step
+from torch_denkf.transforms.primer import refuse_resets_of_groups
 
 __all__ = ["DEnKFTransform"]
 
@@ -199,7 +199,7 @@ class DEnKFTransform(Checked, Transform):
         kept = own({key: written[key] for key in self._names}, given)
         for key, name in self._names.items():
             next_tensordict.set(name, kept[key])
-        mark_up_to_date(kept[self.filter.structure.carry[0]])
+        import_module("torch_denkf.diagnosis.messages").mark_up_to_date(kept[self.filter.structure.carry[0]])
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:

@@ -6,9 +6,9 @@ from collections import OrderedDict
 
 from benchmarks.common.arms import AtRest
 from benchmarks.g1.recipes._base import G1Recipe, register
-from torch_denkf.filters import LSTMFilter
+from torch_denkf.baselines import LSTMFilter
+from torch_denkf.baselines.lstm_cell import with_memory
 from torch_denkf.modules import GaussianAround
-from torch_denkf.modules.recurrent import with_memory
 from torch_denkf.objectives import GaussianLoss
 
 HIDDEN = 128

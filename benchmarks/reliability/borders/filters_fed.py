@@ -21,7 +21,8 @@ from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.particle_for_tests import bootstrap
-from torch_denkf.filters import Filter, LSTMFilter
+from torch_denkf.baselines import LSTMFilter
+from torch_denkf.filters import Filter
 from torch_denkf.transforms import DEnKFTransform
 
 B, T = 3, 4

@@ -10,18 +10,8 @@ from tensordict import TensorDict
 
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.target import Subject, Target, targets_of
-from torch_denkf.filters import (
-    DPF,
-    EKF,
-    UKF,
-    BackpropKF,
-    DEnKF,
-    Filter,
-    KalmanFilter,
-    LSTMFilter,
-    MixtureParticleFilter,
-    ParticleFilter,
-)
+from torch_denkf.baselines import BackpropKF, LSTMFilter
+from torch_denkf.filters import DPF, EKF, UKF, DEnKF, Filter, KalmanFilter, MixtureParticleFilter, ParticleFilter
 from torch_denkf.modules import (
     ConstantNoise,
     GaussianLikelihood,

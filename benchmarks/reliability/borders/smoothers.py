@@ -15,9 +15,10 @@ from benchmarks.reliability.borders.filters_made import parts
 from benchmarks.reliability.target import Subject, Target, targets_of
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.gaussian_for_tests import linear_filter
+from torch_denkf.baselines import IEnKS
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.modules import GaussianLikelihood, LearnedTransition
-from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, IEnKS, ParticleSmoother, RTSSmoother
+from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
 
 
 def still(members: int = 8) -> dict[str, Any]:

@@ -16,9 +16,10 @@ from tensordict import TensorDict
 from tests.filters.factories import linear_denkf, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.particle_for_tests import bootstrap
+from torch_denkf.baselines import LSTMFilter
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.deployment.package import PackagedStep
-from torch_denkf.filters import Filter, LSTMFilter
+from torch_denkf.filters import Filter
 from torch_denkf.modules import GaussianPrior
 
 EVERY, STRETCH = 100_000, 10_000  # steps from one stretch without readings to the next, and its length

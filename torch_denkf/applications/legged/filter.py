@@ -21,7 +21,7 @@ from torch_denkf.applications.legged.velocity import BaseVelocity, StartEnsemble
 from torch_denkf.filters import Filter
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import EKFTransition, EnsembleAnalysis, NoisyTransition, UKFTransition
-from torch_denkf.modules._running import named_modules_of
+from torch_denkf.running import named_modules_of
 
 __all__ = ["legged_filter"]
 

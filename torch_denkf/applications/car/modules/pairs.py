@@ -18,11 +18,10 @@ from torch import nn
 
 from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import ensemble_var
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Entries
-from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._tensors import register_constant
 from torch_denkf.modules.carried import Beside
+from torch_denkf.running import check_module, reads, run_module
+from torch_denkf.submodel import Entries, SubModel
 
 __all__ = ["ClonedPrior", "ClonedTransition", "PairObservation", "with_history"]
 

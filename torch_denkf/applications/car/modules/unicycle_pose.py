@@ -7,8 +7,8 @@ from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.applications.car.unicycle import unicycle_jacobians, unicycle_move
-from torch_denkf.modules._base import SubModel
 from torch_denkf.motions.time_step import check_dt, keys_of_dt
+from torch_denkf.submodel import SubModel
 
 __all__ = ["UnicyclePose"]
 

@@ -1,0 +1,149 @@
+"""Compiled steps and chunks: the oracle is the same filter, eager, on the same noise."""
+
+import pickle
+from itertools import pairwise
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from tests.filters.factories import has_compiler, linear_denkf, toy_denkf, toy_frames
+from torch_denkf.compilation import need_compiler
+from torch_denkf.modules import ConstantNoise, LearnedObservation, StochasticMLP
+
+#: float32: a few roundings through eight steps; float64 likewise.
+TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
+
+
+def assert_close(ours, theirs, keys, dtype):
+    for key in keys:
+        torch.testing.assert_close(ours.get(key), theirs.get(key), rtol=TOLERANCE[dtype], atol=TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("dtype", [pytest.param(torch.float32, marks=pytest.mark.slow), torch.float64])
+def test_compiled_is_eager_forward_and_backward(dtype):
+    filter = toy_denkf("perturbed").to(dtype)
+    frames = toy_frames((2, 6), masks=2)  # the start and a chunk, a chunk, and a step that is left over
+    frames["measurement"], frames["action"] = frames["measurement"].to(dtype), frames["action"].to(dtype)
+    filter.draw_noise(frames)
+    eager = filter.sequence(frames.copy(), detach_every=2)
+    eager_step = filter.step(eager[:, 2].copy())
+    gradients = torch.autograd.grad(eager["belief", "mean"].square().sum(), list(filter.parameters()))
+    filter.compile(chunk=2, backend="eager")
+    compiled = filter.sequence(frames.copy(), detach_every=2)
+    compiled_step = filter.step(eager[:, 2].copy())
+    assert sorted(kind[0] for kind in filter.compiled._functions) == ["chunk", "chunk", "first", "step"]
+    assert_close(compiled, eager, filter.out_keys, dtype)
+    assert_close(compiled_step, eager_step, filter.out_keys, dtype)
+    ours = torch.autograd.grad(compiled["belief", "mean"].square().sum(), list(filter.parameters()))
+    for value, expected in zip(ours, gradients, strict=True):
+        torch.testing.assert_close(value, expected, rtol=10 * TOLERANCE[dtype], atol=10 * TOLERANCE[dtype])
+
+
+@pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
+@pytest.mark.parametrize("dtype", [torch.float32, pytest.param(torch.float64, marks=pytest.mark.slow)])
+def test_inductor_gives_the_eager_sequence_and_gradients_for_a_seed(dtype):
+    filter, frames, out = toy_denkf(action=False).to(dtype), toy_frames((2, 2), masks=0, resets=False), []
+    frames["measurement"] = frames["measurement"].to(dtype)
+    for chunk in (0, 1):
+        torch.manual_seed(1)
+        sequence = filter.compile(chunk=chunk).sequence(frames.copy())
+        loss = sequence["belief", "mean"].square().sum()
+        out.append((sequence, torch.autograd.grad(loss, list(filter.parameters()))))
+    (eager, gradients), (compiled, ours) = out
+    assert_close(compiled, eager, filter.out_keys, dtype)
+    assert any((gradient != 0).any() for gradient in gradients)
+    for value, expected in zip(ours, gradients, strict=True):
+        torch.testing.assert_close(value, expected, rtol=10 * TOLERANCE[dtype], atol=10 * TOLERANCE[dtype])
+
+
+@pytest.mark.skipif(not has_compiler(), reason="a compiler is asked for, and dynamo alone is in its place")
+def test_what_changes_after_compiling_is_noticed(monkeypatch):
+    """Of what torch.compile checks before a call some is left out; not that."""
+    compile = torch.compile
+
+    def traced(function, *, options, **others):
+        checks = {"guard_filter_fn": options["guard_filter_fn"]}
+        return compile(function, backend="eager", options=checks, **others)
+
+    monkeypatch.setattr(torch, "compile", traced)
+    filter = linear_denkf()
+    filter.replace("observation", LearnedObservation(StochasticMLP(2, 2, (4,), layer="none")))
+    frames = TensorDict({"observation": torch.randn(2, 2, 2)}, [2, 2])
+    compiled = pickle.loads(pickle.dumps(filter)).compile(chunk=1)
+    means = []
+
+    def agree(change):
+        outs = []
+        for model in (filter, compiled):
+            change(model)
+            sequence = model.sequence(frames.copy())
+            step = model.step(sequence[:, 1].copy())
+            parameters = [p for p in model.parameters() if p.requires_grad]
+            loss = sequence["belief", "mean"].square().sum() + step["belief", "mean"].square().sum()
+            outs.append((sequence, step, torch.autograd.grad(loss, parameters)))
+        (eager, one, gradients), (ours, other, others) = outs
+        assert_close(ours, eager, filter.out_keys, torch.float32)
+        assert_close(other, one, filter.out_keys, torch.float32)
+        for value, expected in zip(others, gradients, strict=True):
+            torch.testing.assert_close(value, expected, rtol=2e-4, atol=2e-4)
+        means.append(torch.cat([eager["belief", "mean"], one["belief", "mean"].unsqueeze(1)], 1).detach())
+
+    def freeze(model, frozen):
+        next(model["observation"].parameters()).requires_grad_(not frozen)
+
+    agree(lambda model: freeze(model, True))
+    agree(lambda model: freeze(model, False))
+    agree(lambda model: setattr(model["analysis"], "inflation", 1.5))
+    agree(lambda model: setattr(model["observation"].module, "activation", nn.Tanh()))
+    agree(lambda model: model.replace("noise", ConstantNoise([1.0, 2.0], in_key="observation")))
+    agree(lambda model: setattr(model, "update_at_reset", True))
+    assert means[0].equal(means[1])
+    for before, after in pairwise(means[1:]):
+        assert not torch.allclose(before, after)
+    frames = frames.double()
+    agree(lambda model: model.double())
+    assert means[-1].dtype == torch.double
+
+
+def test_a_compiled_step_draws_its_noise_outside_and_anew():
+    filter = toy_denkf("perturbed").compile(chunk=1, backend="eager")
+    td = filter.initialise(toy_frames((2,), masks=0, resets=False))
+    means: list[torch.Tensor] = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        means.append(filter.step(td.copy())["belief", "mean"])
+    assert means[0].equal(means[1])
+    assert not means[0].equal(means[2])
+    assert len(filter.compiled._functions) == 1
+
+
+def test_0_goes_back_to_eager():
+    filter = toy_denkf().compile(chunk=3, backend="eager")
+    assert filter.compile(chunk=0).compiled is None
+    with pytest.raises(ValueError, match="number of steps"):
+        filter.compile(chunk=-1)
+
+
+def test_pickles_without_what_was_compiled():
+    filter = toy_denkf().compile(chunk=3, backend="eager")
+    filter.compiled._functions["something"] = lambda: None
+    other = pickle.loads(pickle.dumps(filter))
+    assert other.compiled.chunk == 3
+    assert other.compiled._functions == {}
+
+
+def test_without_a_compiler_it_says_what_to_install(monkeypatch):
+    from torch._inductor import cpp_builder
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    def none():
+        raise InvalidCxxCompiler
+
+    monkeypatch.setattr(cpp_builder, "get_cpp_compiler", none)
+    with pytest.raises(RuntimeError, match="apt install g"):
+        toy_denkf().compile()
+    assert toy_denkf().compile(backend="eager").compiled is not None  # dynamo alone needs none
+    with pytest.raises(RuntimeError, match="C\\+\\+ compiler"):
+        need_compiler()

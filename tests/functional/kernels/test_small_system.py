@@ -1,0 +1,106 @@
+"""Oracle: torch.linalg on the same systems, values and gradients."""
+
+import pytest
+import torch
+
+from torch_denkf.functional import kalman_update
+from torch_denkf.functional.kernels.small_system import (
+    LARGEST,
+    LARGEST_FACTOR,
+    cholesky_solve_written_out,
+    cholesky_written_out,
+    gain_written_out,
+    solve_written_out,
+)
+from torch_denkf.functional.linalg import cholesky
+
+
+def systems(size, batch=(3,)):
+    root = torch.randn(*batch, size, size + 1)
+    return root @ root.mT, torch.randn(*batch, size, 5), torch.randn(*batch, 6, size), torch.randn(*batch, 1, size)
+
+
+@pytest.mark.parametrize("size", range(1, LARGEST + 1))
+def test_solution_and_gradients_are_those_of_linalg(float64, size):
+    inputs = [value.requires_grad_() for value in systems(size)]
+
+    def oracle(gram, cross, shift, mean_shift):
+        matrix = gram + torch.eye(size)
+        square = (mean_shift @ torch.linalg.solve(matrix, mean_shift.mT)).squeeze(-1)
+        return shift @ torch.linalg.solve(matrix, cross), square, matrix.logdet().unsqueeze(-1)
+
+    ours, theirs = solve_written_out(*inputs), oracle(*inputs)
+    for value, expected in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(value, expected, rtol=1e-12, atol=1e-12)
+    seeds = [torch.randn_like(value) for value in ours]
+    gradients = [torch.autograd.grad(values, inputs, seeds, retain_graph=True) for values in (ours, theirs)]
+    # Of G we read the lower triangle, linalg the whole: only the symmetric part of the gradient has a meaning.
+    for value, expected in zip(*gradients, strict=True):
+        symmetric = value.shape[-2:] == (size, size) and value is gradients[0][0]
+        value, expected = (x + x.mT if symmetric else x for x in (value, expected))
+        torch.testing.assert_close(value, expected, rtol=1e-11, atol=1e-11)
+
+
+def test_what_is_not_positive_definite_is_nan_and_alone(float64):
+    gram, cross, shift, mean_shift = systems(2)
+    gram[1] = torch.tensor([[-3.0, 0.0], [0.0, 1.0]])
+    for value in solve_written_out(gram, cross, shift, mean_shift):
+        assert value[1].isnan().all()
+        assert value[[0, 2]].isfinite().all()
+
+
+@pytest.mark.parametrize("size", range(1, LARGEST_FACTOR + 1))
+def test_the_factor_and_its_gradient_are_those_of_linalg(float64, size):
+    matrix = (systems(size)[0] + torch.eye(size)).requires_grad_()
+    ours, theirs = cholesky_written_out(matrix), torch.linalg.cholesky(matrix)
+    torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
+    seed = torch.randn_like(ours).tril()
+    gradients = [torch.autograd.grad(value, matrix, seed)[0] for value in (ours, theirs)]
+    torch.testing.assert_close(*(x + x.mT for x in gradients), rtol=1e-10, atol=1e-10)  # see above
+
+
+@pytest.mark.parametrize("size", range(1, LARGEST_FACTOR + 1))
+def test_the_solution_by_a_factor_is_that_of_linalg(float64, size):
+    gram, right, *_ = systems(size)
+    matrix = gram + torch.eye(size)
+    expected = torch.linalg.solve(matrix, right)
+    torch.testing.assert_close(cholesky_solve_written_out(matrix, right), expected, rtol=1e-11, atol=1e-11)
+    assert cholesky_solve_written_out(-matrix, right).isnan().all()
+
+
+@pytest.mark.parametrize("place", range(3))
+def test_a_matrix_without_a_factor_is_nan_and_alone(float64, place):
+    matrix = torch.eye(3).repeat(2, 1, 1)
+    matrix[1, place, place] = -1
+    factor = cholesky_written_out(matrix)
+    assert torch.equal(factor[0], torch.eye(3))
+    assert factor[1].isnan().all()
+    torch.testing.assert_close(factor, cholesky(matrix), equal_nan=True)
+
+
+@pytest.mark.parametrize("size", range(1, LARGEST + 1))
+def test_the_gain_is_that_of_linalg(float64, size):
+    gram, cross, _, residual = systems(size)
+    matrix, residual = gram + torch.eye(size), residual.squeeze(-2)
+    gain, square, log_det = gain_written_out(matrix, cross, residual)
+    torch.testing.assert_close(gain, torch.linalg.solve(matrix, cross).mT, rtol=1e-12, atol=1e-12)
+    solved = torch.linalg.solve(matrix, residual)
+    torch.testing.assert_close(square, (residual * solved).sum(-1, keepdim=True), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(log_det, matrix.logdet().unsqueeze(-1), rtol=1e-12, atol=1e-12)
+
+
+def test_a_compiled_update_equals_the_eager_one(float64):
+    root, matrix, observation = torch.randn(4, 5, 5), torch.randn(4, 2, 5), torch.randn(4, 2)
+    noise, observed = torch.rand(4, 2) + 0.1, torch.tensor([[True, True], [True, False], [False, False], [True, True]])
+    noise[3] = -100  # no positive definite S
+
+    def update(mean, root):
+        return tuple(kalman_update(mean, root @ root.mT, observation, matrix, noise, observed=observed))
+
+    inputs = torch.randn(4, 5, requires_grad=True), root.requires_grad_()
+    eager, compiled = update(*inputs), torch.compile(update, fullgraph=True, backend="aot_eager")(*inputs)
+    assert all(value[3].isnan().all() for value in (eager[0], eager[1], compiled[0], compiled[1]))
+    torch.testing.assert_close(compiled, eager, rtol=1e-10, atol=1e-10, equal_nan=True)
+    gradients = [torch.autograd.grad(sum(v[:3].square().sum() for v in out), inputs) for out in (compiled, eager)]
+    for ours, theirs in zip(*gradients, strict=True):
+        torch.testing.assert_close(ours[:3], theirs[:3], rtol=1e-9, atol=1e-9)

@@ -1,0 +1,230 @@
+"""Transition, observation and analysis in one, repeated: the update of the iterated ensemble Kalman smoother."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import torch
+from tensordict import NestedKey, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from torch_denkf._checks import check_count, check_number
+from torch_denkf.functional import analyse
+from torch_denkf.functional.inflation import inflate, random_rotation
+from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.smoothing.iterated import iterated_smoothing
+from torch_denkf.modules._gaussian import further_keys
+from torch_denkf.modules._spaces import checked_spaces, reading_about
+from torch_denkf.modules.carried import Beside
+from torch_denkf.modules.motion_noise import NoisyTransition
+from torch_denkf.running import check_module, random_parts, run_module
+from torch_denkf.smoothers.past import moments_of
+from torch_denkf.submodel import Call, Entries, SubModel
+
+__all__ = ["IteratedAnalysis", "with_smoothed"]
+
+_SMOOTHED = ("ensemble", "mean", "var", "age")
+
+
+def with_smoothed(
+    initial: TensorDictModuleBase, *, belief_prefix: str = "belief", smoothed_prefix: str = "smoothed"
+) -> Beside:
+    """An initial belief that is also what is believed of the state before it.
+
+    Args:
+        initial: writes ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]`` under ``belief_prefix``.
+        belief_prefix: see there.
+        smoothed_prefix: prefix of the same, and of ``age`` ``[*B, 1]``, 0 steps.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import GaussianPrior
+        >>> start = with_smoothed(GaussianPrior([0.0], [1.0], ensemble_size=4))
+        >>> start(TensorDict({}))["smoothed", "age"]
+        tensor([0])
+    """
+    return Beside(initial, [(smoothed_prefix, name) for name in _SMOOTHED], partial(_twice, belief_prefix))
+
+
+def _twice(prefix: str, belief: Entries, batch_size: torch.Size) -> list[torch.Tensor]:
+    same = [belief[prefix, name] for name in _SMOOTHED[:3]]
+    return [*same, torch.zeros(*batch_size, 1, dtype=torch.int64, device=same[0].device)]
+
+
+class IteratedAnalysis(SubModel):
+    r"""Finds from where the reading says that the last step began, and makes the step anew from there.
+
+    Gauss-Newton steps in the space of the members, each with a run of transition and observation; see
+    :func:`~torch_denkf.functional.smoothing.iterated.iterated_smoothing`. Where the motion has Gaussian noise, the
+    noise of each member is part of what is looked for (Sakov, Haussaire & Bocquet 2018).
+
+    Args:
+        transition: forecasts ``("forecast", "ensemble")`` from ``("belief", "ensemble")``; deterministic, or a
+            :class:`NoisyTransition` around a deterministic one.
+        observation: observes the forecast, writes ``("forecast", "observation")``; deterministic.
+        iterations: of Gauss-Newton.
+        inflation: factor on the anomalies of the smoothed members, where anything is observed.
+        rotate: random mean-preserving rotation of them.
+        space: in which the state lives; ``None`` for plain numbers. Members are corrected as tangents at their mean.
+        reading_space: in which the reading lives; innovation and R are tangents.
+        ensemble_key: members before the step, ``[*B, E, S]``.
+        observation_key: learned observations ``[*B, E, O]``, whose mean is used, or one reading ``[*B, O]``.
+        noise_variance_key: variances ``[*B, O]``.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
+        belief_prefix: prefix of what is written of the new time: ``ensemble``, ``mean``, ``var``.
+        smoothed_prefix: prefix of the same of the time before, and of ``age`` ``[*B, 1]``, 1 step.
+        info_prefix: prefix of ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``, of the forecast
+            that has not seen the reading.
+
+    Raises:
+        ValueError: if transition or observation draw other noise.
+        KeyError: if an entry is missing.
+    """
+
+    reads_components = True
+
+    def __init__(
+        self,
+        transition: TensorDictModuleBase,
+        observation: TensorDictModuleBase,
+        *,
+        iterations: int = 10,
+        inflation: float = 1.0,
+        rotate: bool = False,
+        space: Space | None = None,
+        reading_space: Space | None = None,
+        ensemble_key: NestedKey = ("belief", "ensemble"),
+        observation_key: NestedKey = ("sensor", "ensemble"),
+        noise_variance_key: NestedKey = ("sensor", "noise"),
+        observed_key: NestedKey = "observed",
+        belief_prefix: str = "belief",
+        smoothed_prefix: str = "smoothed",
+        info_prefix: str = "info",
+    ):
+        check_module("transition", transition)
+        check_module("observation", observation)
+        check_count("iterations", iterations)
+        check_number("inflation", inflation, above=0)
+        _refuse_other_noise(transition, observation)
+        self_made = [ensemble_key, *map(unravel_key, transition.out_keys)]
+        further, optional = further_keys([transition, observation], [*self_made, observation_key, noise_variance_key])
+        out_keys = [(belief_prefix, name) for name in ("ensemble", "mean", "var")]
+        out_keys += [(smoothed_prefix, name) for name in _SMOOTHED]
+        out_keys += [(info_prefix, name) for name in ("innovation", "nis", "log_likelihood")]
+        super().__init__(
+            nn.ModuleDict({"transition": transition, "observation": observation}),
+            [ensemble_key, observation_key, noise_variance_key, *further],
+            out_keys,
+            optional_keys=[observed_key, *optional],
+        )
+        self.iterations, self.inflation, self.rotate = iterations, inflation, rotate
+        self.space, self.reading_space = checked_spaces(space, reading_space, ())
+        self.info_prefix, self.observed_key = info_prefix, unravel_key(observed_key)
+        self.noise_variance_key = unravel_key(noise_variance_key)
+        self.reading_keys = self.in_keys[1:3]
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Rotations, where wanted."""
+        return ("",) if self.rotate else ()
+
+    def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
+        """Draws rotations ``[*B, E, E]``."""
+        if not self.rotate or members is None:
+            return None
+        return random_rotation(members, tuple(batch_size), device=device, dtype=dtype, generator=generator)
+
+    def noise_sizes(self, ensemble, *_):
+        """E, from the ensemble."""
+        return {"members": ensemble.shape[-2]}
+
+    def parts(self):
+        """The transition, whose noise is looked for; the observation has none."""
+        return {"transition": self.module["transition"]}
+
+    def on_entries(self, entries, call):
+        """The belief, the smoothed belief, and the diagnostics."""
+        ensemble, reading, variance = (self.required(entries, key) for key in self.in_keys[:3])
+        space, on = self.space, self.reading_space
+        if reading.ndim == ensemble.ndim:
+            reading = reading.mean(-2) if on is None else on.mean(reading)
+        center = ensemble[..., :1, :] if space is None else space.mean(ensemble).unsqueeze(-2)
+        start = ensemble if space is None else space.minus(ensemble, center)
+        observed, dim = entries.get(self.observed_key), start.shape[-1]
+        noise = self._motion_noise(entries, start, call)
+        whole = torch.cat([start, *noise.values()], -1)
+
+        def states(members: torch.Tensor) -> torch.Tensor:
+            return members[..., :dim] if space is None else space.plus(center, members[..., :dim])
+
+        def forecast(members: torch.Tensor) -> Entries:
+            work, begin = {**entries, unravel_key(self.in_keys[0]): states(members)}, dim
+            for key, value in noise.items():
+                work[key] = members[..., begin : begin + value.shape[-1]]
+                begin += value.shape[-1]
+            transition = self.module["transition"]
+            return {**work, **run_module(transition, work, call.part("transition"))}
+
+        def predict(members: torch.Tensor) -> torch.Tensor:
+            observation = self.module["observation"]
+            written = run_module(observation, forecast(members), call._replace(sample=False))
+            predicted = written[unravel_key(observation.out_keys[0])]
+            if on is None:
+                return predicted
+            about, read = reading_about(on, predicted, reading, observed)
+            return about - read.unsqueeze(-2)  # as seen from the reading: each iteration has tangents of its own
+
+        due = reading if on is None else torch.zeros_like(variance)
+        smoothed, predicted = iterated_smoothing(
+            whole, predict, due, variance, observed=observed, iterations=self.iterations
+        )
+        diagnostics = analyse(predicted, predicted, due, variance, scheme="sakov", observed=observed)[1:]
+        smoothed = self._after(smoothed, observed, self._noise(entries, [ensemble], call))
+        moved = forecast(smoothed)[unravel_key(self.module["transition"].out_keys[0])]
+        before = states(smoothed)
+        age = torch.ones(*call.batch_size, 1, dtype=torch.int64, device=ensemble.device)
+        out = (
+            *(moved, *moments_of(moved, None, space)),
+            *(before, *moments_of(before, None, space), age),
+            *diagnostics,
+        )
+        return dict(zip(self.out_keys, out, strict=True))
+
+    def _motion_noise(self, entries: Entries, ensemble: torch.Tensor, call: Call) -> Entries:
+        """The noise of the members' motion, drawn once for all iterations."""
+        noise: Entries = {}
+        if not call.sample:
+            return noise
+        for place, part in random_parts(self.module["transition"], call.part("transition").place):
+            value: object = entries.get(("noise", place))
+            if value is None:
+                value = part.draw_noise(
+                    call.batch_size,
+                    members=ensemble.shape[-2],
+                    state_dim=ensemble.shape[-1],
+                    device=ensemble.device,
+                    dtype=ensemble.dtype,
+                )
+            assert isinstance(value, torch.Tensor)
+            noise["noise", place] = value
+        return noise
+
+    def _after(self, smoothed, observed, rotation) -> torch.Tensor:
+        """The smoothed members, inflated and rotated where anything was observed."""
+        changed = inflate(smoothed, self.inflation) if self.inflation != 1.0 else smoothed
+        if rotation is not None:
+            mean = changed.mean(-2, keepdim=True)
+            changed = mean + rotation @ (changed - mean)
+        return changed if observed is None else torch.where(observed.any(-1)[..., None, None], changed, smoothed)
+
+
+def _refuse_other_noise(transition: TensorDictModuleBase, observation: TensorDictModuleBase) -> None:
+    parts: Sequence = [*random_parts(transition, "transition"), *random_parts(observation, "observation")]
+    other = [f"{place} ({type(part).__name__})" for place, part in parts if not isinstance(part, NoisyTransition)]
+    if other or any(place.startswith("observation") for place, _ in parts):
+        raise ValueError(
+            f"The iterated smoother repeats a step from other states, and needs to know what its noise does; {other} "
+            "draw noise of their own. Take a deterministic network (layer='none'), and process_noise for the motion's."
+        )

@@ -1,0 +1,124 @@
+"""An LSTM as a filter: the baseline that has no model of motion, observation or noise, and must learn all of it."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+
+from torch_denkf.baselines.lstm_cell import LSTMTransition, LSTMUpdate, with_memory
+from torch_denkf.filters._gaussian import refuse_other_beliefs
+from torch_denkf.filters.base import Filter
+from torch_denkf.filters.options import FilterOptions
+from torch_denkf.modules.kalman import MomentPrior
+from torch_denkf.submodel import SubModel
+
+__all__ = ["LSTMFilter"]
+
+
+class LSTMFilter(Filter):
+    """A recurrent network that reads what a filter's sensor wrote and believes a Gaussian.
+
+    Its belief is ``("belief", "mean")`` ``[*B, S]``, ``("belief", "cov")`` (diagonal unless ``motion`` is given) and
+    ``("belief", "var")``, and its memory ``("belief", "hidden")`` and ``("belief", "cell")`` ``[*B, num_layers,
+    hidden_size]``; resets, steps, sequences, masks and primer are those of every filter. Train it with
+    :class:`~torch_denkf.objectives.GaussianLoss` and ``transition=0``: it has no forecast, and no innovation.
+
+    Args:
+        sensor: writes the encoding, or the reading, or both; ``None`` where they are in the tensordict. The *same*
+            sensor as that of the filter it is compared with makes the comparison fair.
+        features: size of the encoding at ``encoding_key``; 0 where the LSTM does not read it.
+        state_dim: S.
+        motion: a module that writes the belief from the last one, under ``"forecast"``, and the velocities that the
+            LSTM estimates, ``("velocity", "mean")`` and ``("velocity", "cov")``; it has ``velocity_dim``, their
+            number. Such is :class:`~torch_denkf.applications.car.modules.unicycle_pose.UnicyclePose` for a car.
+            ``None``: the LSTM estimates the whole state.
+        initial: the belief at reset, a mean and a covariance, e.g. :class:`~torch_denkf.modules.GaussianAround`; by
+            default ``N(loc, scale²)``, which is no state where ``motion`` is given.
+        loc: mean of what the LSTM estimates, ``[S]``, or one number a velocity with ``motion``; zero by default.
+        scale: its standard deviation; one by default.
+        hidden_size: of each layer.
+        num_layers: of cells.
+        observation_dim: O, where the LSTM reads ``observation_key``.
+        encoding_key: the sensor's encoding ``[*B, features]``; ``None`` for none.
+        observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used; read where
+            ``observation_dim`` is given.
+        control_keys: see :class:`Filter`; give the action's key in ``extra_keys``, too.
+        init_key: see :class:`Filter`.
+        update_at_reset: see :class:`Filter`; not with ``motion``: nothing moves into the first frame.
+        **kwargs: passed on to :class:`~torch_denkf.baselines.lstm_cell.LSTMUpdate`: ``extra_keys`` and
+            ``extra_features``, ``floor``, ``observation_loc``, ``observation_scale``, ``observed_key``; and
+            ``variance_ceiling``, ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
+
+    Raises:
+        ValueError: if there is a ``motion`` and no ``initial``, or ``update_at_reset``.
+
+    Reference:
+        The LSTM baselines of Haarnoja et al. 2016, arXiv:1605.07148, and Kloss, Martius & Bohg 2021,
+        arXiv:2012.14313.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> lstm = LSTMFilter(None, features=16, state_dim=3, encoding_key="features")
+        >>> lstm.sequence(TensorDict({"features": torch.randn(4, 10, 16)}, [4, 10]))["belief", "mean"].shape
+        torch.Size([4, 10, 3])
+    """
+
+    def __init__(
+        self,
+        sensor: TensorDictModuleBase | None,
+        *,
+        features: int = 0,
+        state_dim: int,
+        motion: SubModel | None = None,
+        initial: TensorDictModuleBase | None = None,
+        loc: Sequence[float] | torch.Tensor | None = None,
+        scale: Sequence[float] | torch.Tensor | None = None,
+        hidden_size: int = 128,
+        num_layers: int = 1,
+        observation_dim: int = 0,
+        encoding_key: NestedKey = ("sensor", "encoding"),
+        observation_key: NestedKey = ("sensor", "ensemble"),
+        control_keys: Sequence[NestedKey] = ("action",),
+        init_key: NestedKey = "is_init",
+        update_at_reset: bool = False,
+        **kwargs,
+    ):
+        if motion is not None and (initial is None or update_at_reset):
+            raise ValueError(
+                "With motion= the state is known at reset and not updated there: give initial=, such as "
+                f"GaussianAround(...), and not update_at_reset; got initial={initial}, "
+                f"update_at_reset={update_at_reset}."
+            )
+        options = {name: kwargs.pop(name) for name in FilterOptions.__annotations__ if name in kwargs}
+        update = LSTMUpdate(
+            state_dim if motion is None else motion.velocity_dim,
+            features=features,
+            observation_dim=observation_dim,
+            hidden_size=hidden_size,
+            num_layers=num_layers,
+            loc=loc,
+            scale=scale,
+            encoding_key=encoding_key if features else None,
+            observation_key=observation_key if observation_dim else None,
+            belief_prefix="belief" if motion is None else "velocity",
+            **kwargs,
+        )
+        if initial is None:
+            initial = MomentPrior(update.loc, update.scale.square().diag())
+        refuse_other_beliefs(type(self).__name__, initial, [("belief", "mean"), ("belief", "cov")])
+        modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
+        modules.update(transition=LSTMTransition(), lstm=update)
+        if motion is not None:
+            modules["motion"] = motion
+        super().__init__(
+            modules,
+            initial=with_memory(initial, hidden_size, num_layers=num_layers),
+            control_keys=control_keys,
+            init_key=init_key,
+            update_at_reset=update_at_reset,
+            **options,
+        )

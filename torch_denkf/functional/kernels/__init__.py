@@ -1,0 +1,1 @@
+"""Fast forms of formulas: small systems written out, random bits, shards of an ensemble."""

@@ -1,0 +1,440 @@
+r"""A sensor's slow errors as part of the state: biases that fade, in any filter.
+
+A sensor that reads wrongly often reads wrongly in the next frame, too. A filter that takes such errors for white noise
+believes them more with each frame, and its intervals become too narrow. Here the state is :math:`(x, b)`: S numbers of
+the system, then K biases of the sensor, each an Ornstein-Uhlenbeck process with its own standard deviation and its own
+time; the reading is :math:`h(x) + b`. With several times for each component of the reading the errors may be slow and
+slower.
+
+.. math:: b_t = \rho \circ b_{t-1} + \eta_t, \quad \rho = e^{-1 / \tau}, \quad \eta_t \sim N(0, \sigma^2 (1 - \rho^2))
+
+``sensor_error=FadingBias(...)`` of a filter does it. By hand, give transition, process noise and observation
+the same :class:`FadingBias`, and the initial belief S + K dimensions: ``FadingBias.std`` for the biases. For a linear
+system with such "coloured" reading errors the filter then is the optimal one: the Kalman filter of the augmented state.
+
+Source: Bryson & Henrikson 1968, J. Spacecraft Rockets 5 ("Estimation using sampled data containing sequentially
+correlated noise"); Uhlenbeck & Ornstein 1930.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from tensordict import unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from torch_denkf._checks import check_values
+from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.manifolds import Space
+from torch_denkf.modules._tensors import as_standard_deviations
+from torch_denkf.modules.process_noise import as_process_noise
+from torch_denkf.running import check_module, declared, reads, run_module, writes
+from torch_denkf.submodel import SubModel
+
+__all__ = ["BiasedBelief", "BiasedNoise", "BiasedObservation", "BiasedTransition", "FadingBias", "biased_parts"]
+
+
+class FadingBias(nn.Module):
+    """K biases that fade: Ornstein-Uhlenbeck processes, whose size and time are learned.
+
+    Args:
+        std: standard deviation of each bias in the long run ``[K]``, in the reading's units, before training.
+        time: steps in which each bias fades to 1/e, ``[K]`` or one number for all, before training.
+        trainable: whether both are parameters; else buffers.
+        factor: whether they are errors of a factor: the reading is :math:`h(x) (1 + b)`, and ``std`` has no unit.
+
+    Raises:
+        ValueError: if a standard deviation or a time is not positive.
+
+    Example:
+        >>> bias = FadingBias([2.0], time=10.0)
+        >>> bias.decay.item(), bias.variance.item()  # after one step; new in one step
+        (0.904..., 0.725...)
+    """
+
+    log_std: Tensor
+    log_time: Tensor
+
+    def __init__(
+        self,
+        std: Sequence[float] | Tensor,
+        time: float | Sequence[float] | Tensor,
+        *,
+        trainable: bool = True,
+        factor: bool = False,
+    ):
+        super().__init__()
+        self.factor = factor
+        std = as_standard_deviations("std", std)
+        time = torch.as_tensor(time, dtype=std.dtype).expand_as(std)
+        check_values("std, a standard deviation,", std, above=0)
+        check_values("time, in steps,", time, above=0)
+        for name, value in (("log_std", std.log()), ("log_time", time.log())):
+            if trainable:
+                self.register_parameter(name, nn.Parameter(value.clone()))
+            else:
+                self.register_buffer(name, value.clone())
+
+    @classmethod
+    def from_residuals(
+        cls, residuals: Tensor, *, trainable: bool = True, per_run: bool = False
+    ) -> tuple[FadingBias, Tensor]:
+        r"""The biases that explain how long a sensor's errors last, and what is left: white noise.
+
+        The autocovariance of :math:`b + w` at lag k is :math:`\sigma^2 e^{-k / \tau}`, and at lag 0 it is more by the
+        white variance. Size and time are those of the least squares over lags of one step and more, each lag counted
+        by its pairs, up to three times :math:`\tau`. Errors that last longer than the runs are taken for ones that last
+        as long.
+
+        Args:
+            residuals: reading minus what it should have been, ``[N, T, K]``, N runs of T steps, on data that the sensor
+                was not trained on; NaN where there is none. Their mean is not taken off.
+            trainable: see the class.
+            per_run: whether the errors also have a part that is the same for a whole run, as those of a learned sensor
+                in new surroundings have. There are then 2 K biases, K that last 100 times as long as a run and K that
+                fade. It takes about ten runs. One time for both kinds fits neither.
+
+        Returns:
+            K biases, or 2 K; and the standard deviations of the white part ``[K]``, for the noise of the reading.
+
+        Raises:
+            ValueError: if the shape is another, a component has fewer than 100 pairs of neighbours, its errors do not
+                last at all, or ``per_run`` is given one run.
+
+        Example:
+            >>> torch.manual_seed(0)
+            <...>
+            >>> true, error, readings = FadingBias([2.0], time=10.0, trainable=False), torch.zeros(500, 1), []
+            >>> for _ in range(150):
+            ...     error = true.decay * error + true.variance.sqrt() * torch.randn(500, 1)
+            ...     readings.append(error + 0.5 * torch.randn(500, 1))
+            >>> bias, white = FadingBias.from_residuals(torch.stack(readings[50:], 1), trainable=False)
+            >>> [round(value.item(), 1) for value in (bias.std, bias.log_time.exp() / 10, white)]
+            [2.0, 1.0, 0.5]
+        """
+        if residuals.ndim != 3 or residuals.shape[1] < 3:
+            raise ValueError(f"residuals must be [N, T, K], T at least 3; got {list(residuals.shape)}")
+        if per_run and len(residuals) < 2:
+            raise ValueError("per_run=True tells errors of a whole run by how runs differ: give about ten; got one")
+        values = residuals.detach().double()
+        known = ~values.isnan()
+        found = [_fit(*_autocovariance(values[..., k], known[..., k]), k, per_run) for k in range(values.shape[-1])]
+        std, time, white, whole = (residuals.new_tensor(column) for column in zip(*found, strict=True))
+        if per_run:
+            std, time = torch.cat([whole, std]), torch.cat([torch.full_like(time, 100.0 * values.shape[1]), time])
+        return cls(std, time, trainable=trainable), white
+
+    def __len__(self) -> int:
+        return len(self.log_std)
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviations in the long run ``[K]``: of the biases in an initial belief."""
+        return self.log_std.exp()
+
+    @property
+    def decay(self) -> Tensor:
+        """What is left of a bias after a step, ``[K]``."""
+        return (-(-self.log_time).exp()).exp()
+
+    @property
+    def variance(self) -> Tensor:
+        """Variance of what is new in a step, ``[K]``: with it the biases stay as large as they are."""
+        return (2 * self.log_std).exp() * -torch.expm1(-2 * (-self.log_time).exp())
+
+
+class BiasedTransition(SubModel):
+    """A transition of S numbers, and behind them biases that fade.
+
+    Args:
+        transition: moves ensembles ``[*B, E, S]``; its keys are kept, its noise too.
+        bias: shared with the noise and the observation.
+
+    Raises:
+        KeyError: if an entry is missing.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import LearnedTransition
+        >>> still = LearnedTransition(nn.Identity(), residual=False)
+        >>> move = BiasedTransition(still, FadingBias([1.0], time=1.0))
+        >>> move(TensorDict({("belief", "ensemble"): torch.ones(1, 2)}))["forecast", "ensemble"]
+        tensor([[1.0000, 0.3679]], grad_fn=...)
+    """
+
+    def __init__(self, transition: TensorDictModuleBase, bias: FadingBias):
+        check_module("transition", transition)
+        needed, optional = reads(transition)
+        super().__init__(transition, needed, transition.out_keys, optional_keys=optional)
+        self.bias = bias
+
+    def parts(self):
+        """The transition."""
+        return {"transition": self.module}
+
+    def on_entries(self, entries, call):
+        """The forecast of both, and whatever else the transition writes."""
+        key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
+        state, slow = _split(self.required(entries, key), self.bias, self)
+        written = run_module(self.module, {**entries, key: state}, call.part("transition"))
+        return {**written, out_key: torch.cat([written[out_key], self.bias.decay * slow], -1)}
+
+
+class BiasedNoise(SubModel):
+    """The process noise of a state and of the biases behind it: variances ``[*B, N + K]`` or a covariance.
+
+    Args:
+        noise: of the state: writes variances ``[*B, N]`` or a covariance ``[*B, N, N]``; its keys are kept.
+        bias: shared with the transition.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import ConstantNoise
+        >>> q = ConstantNoise([0.5], in_key=("belief", "mean"), out_key=("forecast", "noise"))
+        >>> both = BiasedNoise(q, FadingBias([1.0], time=10.0))
+        >>> both(TensorDict({("belief", "mean"): torch.zeros(2)}))["forecast", "noise"]
+        tensor([0.2500, 0.1813], grad_fn=...)
+    """
+
+    def __init__(self, noise: TensorDictModuleBase, bias: FadingBias):
+        check_module("noise", noise)
+        needed, optional = reads(noise)
+        super().__init__(noise, needed, noise.out_keys, optional_keys=optional)
+        self.bias = bias
+
+    def parts(self):
+        """The noise module."""
+        return {"noise": self.module}
+
+    def on_entries(self, entries, call):
+        """Q of both."""
+        out, key = run_module(self.module, entries, call.part("noise")), unravel_key(self.out_keys[0])
+        of_state, slow = out[key], self.bias.variance.to(out[key].dtype)
+        if of_state.ndim == len(call.batch_size) + 1:
+            return {**out, key: torch.cat([of_state, slow.expand(*of_state.shape[:-1], -1)], -1)}
+        size, count = of_state.shape[-1], len(slow)
+        corner = slow.diag_embed().expand(*of_state.shape[:-2], -1, -1)
+        rows = nn.functional.pad(of_state, (0, count)), nn.functional.pad(corner, (size, 0))
+        return {**out, key: torch.cat(rows, -2)}
+
+
+class BiasedObservation(SubModel):
+    """What the sensor reads of the state, plus its biases.
+
+    With K = G O biases each component of the reading has G of them: the first O belong to components 1 to O, and so do
+    the next O.
+
+    Args:
+        observation: observes ensembles ``[*B, E, S]``, writes ``[*B, E, O]``; its keys are kept.
+        bias: shared with the transition.
+        dims: components of the reading that biases belong to, ``[K]``; by default all O, as often as K holds them.
+
+    Raises:
+        KeyError: if an entry is missing.
+        ValueError: if there are not as many ``dims`` as biases, or without ``dims`` if K is no multiple of O.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import Select
+        >>> read = BiasedObservation(Select([0, 1]), FadingBias([1.0], time=10.0), dims=[1])
+        >>> read(TensorDict({("forecast", "ensemble"): torch.tensor([[3.0, 4.0, 0.5]])}))["forecast", "observation"]
+        tensor([[3.0000, 4.5000]])
+    """
+
+    def __init__(self, observation: TensorDictModuleBase, bias: FadingBias, dims: Sequence[int] | None = None):
+        check_module("observation", observation)
+        if dims is not None and len(dims) != len(bias):
+            raise ValueError(f"dims names {len(dims)} components of the reading, and there are {len(bias)} biases")
+        needed, optional = reads(observation)
+        super().__init__(observation, needed, observation.out_keys, optional_keys=optional)
+        self.bias = bias
+        self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
+
+    def parts(self):
+        """The observation model."""
+        return {"observation": self.module}
+
+    def on_entries(self, entries, call):
+        """The predicted observations."""
+        key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
+        state, slow = _split(self.required(entries, key), self.bias, self)
+        written = run_module(self.module, {**entries, key: state}, call.part("observation"))
+        read = written[out_key]
+        if self.dims is not None:
+            slow = torch.zeros_like(read).index_add(-1, self.dims, slow)
+            return {**written, out_key: read * (1 + slow) if self.bias.factor else read + slow}
+        if len(self.bias) % read.shape[-1]:
+            raise ValueError(
+                f"{len(self.bias)} biases are not as many for each of the {read.shape[-1]} components of the reading; "
+                "say in dims which component each belongs to"
+            )
+        slow = slow.unflatten(-1, (-1, read.shape[-1])).sum(-2)
+        return {**written, out_key: read * (1 + slow) if self.bias.factor else read + slow}
+
+
+class BiasedBelief(SubModel):
+    """The initial belief of a state, and of the biases behind it: independent, with mean 0 and ``FadingBias.std``.
+
+    Args:
+        initial: of the state: an ensemble, or a mean and a covariance; its keys are kept.
+        bias: shared with the transition.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import MomentPrior
+        >>> start = BiasedBelief(MomentPrior(torch.zeros(1), torch.eye(1)), FadingBias([2.0], time=5.0))
+        >>> start(TensorDict({}))["belief", "cov"]
+        tensor([[1., 0.],
+                [0., 4.]], grad_fn=...)
+    """
+
+    def __init__(self, initial: TensorDictModuleBase, bias: FadingBias):
+        check_module("initial", initial)
+        needed, optional = reads(initial)
+        super().__init__(initial, needed, writes(initial), optional_keys=optional)
+        self.bias, told = bias, declared(initial)
+        self.ensemble_size, self.observation_dim = told.ensemble_size, told.observation_dim
+        self.input_dim = told.input_dim or told.state_dim
+        self.state_dim = None if told.state_dim is None else told.state_dim + len(bias)
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """The draws of an ensemble's biases."""
+        return ("",) if any(key[-1] == "ensemble" for key in self.out_keys) else ()
+
+    def parts(self):
+        """The initial belief of the state."""
+        return {"initial": self.module}
+
+    def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
+        """Draws standard-normal values ``[*batch_size, E, K]``."""
+        members = self.ensemble_size if members is None else members
+        if members is None:
+            return None
+        return torch.randn((*batch_size, members, len(self.bias)), device=device, dtype=dtype, generator=generator)
+
+    def on_entries(self, entries, call):
+        """The belief of both."""
+        written = dict(run_module(self.module, entries, call.part("initial")))
+        names = {key[-1]: key for key in map(unravel_key, self.out_keys)}
+        std, size = self.bias.std, call.batch_size
+        if "ensemble" in names:
+            ensemble = written[names["ensemble"]]
+            noise = entries.get(("noise", call.place))
+            if noise is None:
+                noise = torch.randn((*ensemble.shape[:-1], len(std)), dtype=ensemble.dtype, device=ensemble.device)
+            ensemble = torch.cat([ensemble, std.to(ensemble.dtype) * noise.to(ensemble.dtype)], -1)
+            mean = ensemble_mean(ensemble)
+            now = {"ensemble": ensemble, "mean": mean, "var": ensemble_var(ensemble, mean)}
+        else:
+            mean, cov = (written[names[name]] for name in ("mean", "cov"))
+            std, count = std.to(mean.dtype), len(std)
+            corner = std.square().diag_embed().expand(*size, count, count)
+            rows = nn.functional.pad(cov, (0, count)), nn.functional.pad(corner, (cov.shape[-1], 0))
+            cov = torch.cat(rows, -2)
+            now = {"mean": nn.functional.pad(mean, (0, count)), "cov": cov, "var": cov.diagonal(dim1=-2, dim2=-1)}
+        return {**written, **{names[name]: value for name, value in now.items() if name in names}}
+
+
+class BiasedParts(NamedTuple):
+    """What a filter is made of whose state holds its sensor's errors, see :func:`biased_parts`."""
+
+    transition: TensorDictModuleBase
+    observation: TensorDictModuleBase
+    process_noise: TensorDictModuleBase
+    initial: TensorDictModuleBase
+
+
+def biased_parts(
+    bias: FadingBias,
+    transition: TensorDictModuleBase,
+    observation: TensorDictModuleBase,
+    process_noise: TensorDictModuleBase | Sequence[float] | float | None,
+    initial: TensorDictModuleBase,
+    reading_space: Space | None = None,
+) -> BiasedParts:
+    """Gives each part of a filter the same biases.
+
+    Args:
+        bias: of the sensor.
+        transition: moves ensembles of the state.
+        observation: observes them.
+        process_noise: of the state; ``None`` for none, where the transition has its own.
+        initial: the belief of the state.
+        reading_space: in which the sensor's reading lives; ``None`` for plain numbers.
+    """
+    if not isinstance(bias, FadingBias):
+        raise TypeError(f"sensor_error is a FadingBias, or None; got {type(bias).__name__}")
+    if declared(initial).space is not None:
+        raise ValueError(
+            f"sensor_error is for states of plain numbers, not for {declared(initial).space}: put the biases into the "
+            "state, Product(..., Euclidean(K))."
+        )
+    if reading_space is not None:
+        raise ValueError(f"sensor_error is added to readings of plain numbers, not to points of {reading_space}.")
+    of_state = as_process_noise(
+        torch.zeros_like(bias.std[0]).detach() if process_noise is None else process_noise, initial
+    )
+    return BiasedParts(
+        BiasedTransition(transition, bias),
+        BiasedObservation(observation, bias),
+        BiasedNoise(of_state, bias),
+        BiasedBelief(initial, bias),
+    )
+
+
+def _autocovariance(values: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Means of products of values ``[N, T]`` that lie 0, 1, ... steps apart, and how many there are."""
+    values, steps = torch.where(known, values, 0), values.shape[1]
+    products, counts = [], []
+    for lag in range(min(steps, 1000)):
+        both = known[:, lag:] & known[:, : steps - lag]
+        products.append((values[:, lag:] * values[:, : steps - lag]).sum())
+        counts.append(both.sum())
+    count = torch.stack(counts)
+    return torch.stack(products) / count.clamp_min(1), count
+
+
+def _fit(covariance: Tensor, count: Tensor, component: int, per_run: bool) -> tuple[float, float, float, float]:
+    """Standard deviation and time of the fading part, standard deviations of the white and of a run's part."""
+    if count[1] < 100:
+        raise ValueError(f"component {component} has {int(count[1])} pairs of neighbouring residuals; it takes 100")
+    longest = len(covariance)
+    # What fades more slowly than half a run cannot be told from what is the same for all of it.
+    slowest = longest / 2 if per_run else 100 * longest
+    times = torch.logspace(math.log10(0.5), math.log10(slowest), 2000, dtype=torch.double)
+    lags, size, whole, last = torch.arange(longest, dtype=torch.double), 0.0, 0.0, longest
+    for _ in range(1 if per_run else 3):
+        shape = torch.exp(-lags[1:last] / times.unsqueeze(-1))
+        weight = count[1:last] / count[1:last].sum()
+        level, seen = torch.zeros_like(times), covariance[1:last].expand(len(times), -1)
+        if per_run:  # the least squares of both parts, or of what fades alone where the other would be negative
+            middle, mean = (weight * shape).sum(-1), (weight * seen).sum(-1)
+            centred = shape - middle.unsqueeze(-1)
+            sizes = ((weight * centred * seen).sum(-1) / (weight * centred.square()).sum(-1)).clamp_min(0)
+            level = (mean - sizes * middle).clamp_min(0)
+            seen = seen - level.unsqueeze(-1)
+        sizes = ((weight * shape * seen).sum(-1) / (weight * shape.square()).sum(-1)).clamp_min(0)
+        best = (weight * (seen - sizes.unsqueeze(-1) * shape).square()).sum(-1).argmin()
+        size, time, whole = float(sizes[best]), float(times[best]), float(level[best])
+        last = min(longest, max(4, math.ceil(3 * time) + 1))  # later lags are of chance alone
+    # Within three standard errors of what white noise shows from one step to the next there is nothing to estimate.
+    if not size * math.exp(-1 / time) + whole > 3 * float(covariance[0]) / math.sqrt(float(count[1])):
+        raise ValueError(f"the residuals of component {component} do not last: take them for white noise")
+    least, white = 1e-6 * (size + whole), float(covariance[0]) - size - whole
+    return math.sqrt(max(size, least)), time, math.sqrt(max(white, least)), math.sqrt(max(whole, least))
+
+
+def _split(state: Tensor, bias: FadingBias, module: nn.Module) -> tuple[Tensor, Tensor]:
+    """The system's part of a state, and the biases."""
+    count = len(bias)
+    if state.shape[-1] <= count:
+        raise ValueError(
+            f"{type(module).__name__} splits a state of {state.shape[-1]} into the system's and {count} biases: "
+            "the initial belief must hold both"
+        )
+    return state[..., :-count], state[..., -count:]

@@ -1,0 +1,287 @@
+r"""A sensor that says whether it sees, and updates that heed it.
+
+A camera that looks at a pillar still reads something. :class:`Visibility` is a head beside a sensor: it writes the
+probability p that this reading is about the state at all. :class:`Visible` goes around an analysis: the density of a
+reading is
+
+.. math:: p\, N(y; h(x), S) + (1 - p)\, b(y)
+
+with b broad, and the belief has the mean and the covariance of the mixture of update and forecast. Both are
+differentiable, so that p is learned from labels, or from the likelihood of the readings alone.
+
+Source: the probabilistic data association filter, with one reading and one target (Bar-Shalom & Tse 1975, Automatica
+11); mixtures with a broad component against outliers: Box & Tiao 1968, Biometrika 55.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import cast
+
+import torch
+from tensordict import NestedKey, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from torch_denkf._checks import check_count, check_number
+from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.angles import align_angles
+from torch_denkf.functional.mixture import log_mixture, mix_members, mix_moments, responsibility
+from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.weighted import scored_innovation
+from torch_denkf.modules._tensors import mean_of_members
+from torch_denkf.modules.carried import AnalysisAround
+from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.running import check_module
+from torch_denkf.submodel import Call, Entries, SubModel
+
+__all__ = ["Visibility", "Visible", "heeding"]
+
+
+class Visibility(SubModel):
+    r"""The probability that a reading is about the state at all, from what the sensor encodes.
+
+    Labels teach it where there are some: the term ``visible`` of the losses, a binary cross entropy. Where there are
+    none, the likelihood of the readings does, ``nll``, and so does each score of the belief.
+
+    Args:
+        encoding_dim: F, size of the encoding.
+        num_cells: hidden layers.
+        start: p before training, the same for all encodings.
+        floor: p stays between ``floor`` and ``1 - floor``: no reading is ever certain, nor lost for good. A filter that
+            is wrong and sure of it finds back the sooner, the surer a head may be.
+        encoding_key: an entry ``[*B, F]``, or of members ``[*B, E, F]``, whose mean is used.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; encodings of frames of which nothing is observed may be
+            NaN.
+        out_key: p, ``[*B, 1]``.
+
+    Raises:
+        ValueError: if ``floor`` is not in (0, 0.5), or ``start`` not between it and 1 - ``floor``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({("sensor", "encoding"): torch.randn(3, 16)}, [3])
+        >>> Visibility(16)(td)["sensor", "visible"].flatten()
+        tensor([0.9000, 0.9000, 0.9000], grad_fn=...)
+    """
+
+    judges_reading = True
+
+    def __init__(
+        self,
+        encoding_dim: int,
+        *,
+        num_cells: Sequence[int] = (32,),
+        start: float = 0.9,
+        floor: float = 1e-6,
+        encoding_key: NestedKey = ("sensor", "encoding"),
+        observed_key: NestedKey = "observed",
+        out_key: NestedKey = ("sensor", "visible"),
+    ):
+        check_count("encoding_dim", encoding_dim)
+        check_number("floor", floor, above=0, below=0.5)
+        check_number("start", start, above=floor, below=1 - floor)
+        network = StochasticMLP(encoding_dim, 1, num_cells, layer="none", output_gain=0.0)
+        share = (start - floor) / (1 - 2 * floor)
+        with torch.no_grad():
+            cast(nn.Linear, network.layers[-1]).bias.fill_(math.log(share / (1 - share)))
+        super().__init__(network, [encoding_key], [out_key], optional_keys=[observed_key])
+        self.floor = floor
+
+    def compute(self, encoding, observed=None, *, batch_size):
+        """The probability."""
+        encoding = mean_of_members(encoding, batch_size)
+        if observed is not None:
+            encoding = torch.where(observed.any(-1, keepdim=True), encoding, 0)
+        return self.floor + (1 - 2 * self.floor) * self.module(encoding).sigmoid()
+
+
+class Visible(AnalysisAround):
+    r"""Lets a reading count as far as it is about the state.
+
+    The analysis runs once. With q, the probability that the reading was about the state now that it is known, the
+    belief is that of the mixture, of q times what the analysis makes of the reading and 1 - q times the forecast:
+
+    =====================  =============================================================================================
+    belief                 what becomes of it
+    =====================  =============================================================================================
+    mean and covariance    the mixture's, q (1 - q) d dᵀ of the way d between both means included
+    ensemble               members with the mixture's mean and sample covariance, see
+                           :func:`~torch_denkf.functional.mixture.mix_members`; a past that is corrected, too
+    particles              the exact mixture: each particle's likelihood is one
+    =====================  =============================================================================================
+
+    With p = 1 that is the analysis alone, with p = 0 the forecast. ``(info_prefix, "log_likelihood")`` is that of the
+    mixture, and ``(info_prefix, "visible")`` ``[*B, 1]`` is q, 0 where nothing is observed. Innovation and ``nis`` are
+    those of the reading as it came. b is the Gaussian that the reading is expected from, ``broad`` times as wide: it is
+    in the reading's own unit, and grows while nothing is seen. A reading of O components that fits the forecast speaks
+    for itself with up to ``broad`` to the power O: with many components, leave out the readings that p says are hidden.
+
+    Args:
+        analysis: of an ensemble, of a mean and a covariance, or of particles with a Gaussian likelihood. Its keys and
+            its noise are kept.
+        broad: factor on the standard deviations of b; above 1. It says how far off a reading is that is about something
+            else: about what it may read, divided by how far off it is where it sees.
+        visible_key: p, ``[*B, 1]``, see :class:`Visibility`.
+
+    Raises:
+        TypeError: for another analysis, whose forecast or reading is not known, or for one on a space.
+        ValueError: if ``broad`` is not above 1.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import KalmanAnalysis
+        >>> update = Visible(KalmanAnalysis(torch.eye(1), torch.ones(1)))
+        >>> for reading in (1.0, 9.0):
+        ...     td = TensorDict({
+        ...         "forecast": {"mean": torch.zeros(1), "cov": torch.eye(1)},
+        ...         "observation": torch.tensor([reading]),
+        ...         "sensor": {"visible": torch.tensor([0.5])},
+        ...     })
+        ...     td = update(td)
+        ...     print(f"{td['info', 'visible'].item():.2f} {td['belief', 'mean'].item():.2f}")
+        0.89 0.44
+        0.00 0.00
+    """
+
+    def __init__(self, analysis: SubModel, *, broad: float = 10.0, visible_key: NestedKey = ("sensor", "visible")):
+        check_number("broad", broad, above=1)
+        self_made = _kind(analysis)
+        if analysis.space is not None or analysis.reading_space is not None:
+            raise TypeError(f"Visible is for plain numbers; {type(analysis).__name__} is on a space.")
+        super().__init__(
+            analysis,
+            [*analysis.in_keys, visible_key],
+            [*analysis.out_keys, (analysis.info_prefix, "visible")],
+            optional_keys=analysis.optional_keys,
+        )
+        self.kind, self.broad, self.visible_key = self_made, broad, unravel_key(visible_key)
+        self.info_prefix, self.reading_keys = analysis.info_prefix, analysis.reading_keys
+        self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
+        self.noise_variance_key, self.predicted_key = analysis.noise_variance_key, analysis.predicted_key
+
+    def noise_sizes(self, *values):
+        """Those of the analysis."""
+        return self.module.noise_sizes(*values)
+
+    def reading_dims(self, entries, call):
+        """Those of the analysis."""
+        return self.module.reading_dims(entries, call)
+
+    def around(self, analysis: SubModel) -> Visible:
+        """The same around another analysis.
+
+        Args:
+            analysis: of the same reading, e.g. a :class:`~torch_denkf.smoothers.past.LaggedAnalysis`.
+        """
+        return Visible(analysis, broad=self.broad, visible_key=self.visible_key)
+
+    def on_entries(self, entries, call):
+        """The belief and the diagnostics."""
+        if self.observed_key is not None:
+            entries = self.with_mask(entries, call)
+        mask = None if self.observed_key is None else entries.get(self.observed_key)
+        visible = entries.get(self.visible_key)
+        if visible is None:  # where a step is taken without the reading, nothing says whether it sees
+            like = self.required(entries, self.in_keys[0])
+            visible = like.new_ones(*call.batch_size, 1)
+            if mask is None:
+                self.required(entries, self.visible_key)
+        seen = None if mask is None else mask.any(-1, keepdim=True)
+        if seen is not None:  # of a frame that is hidden p may be anything
+            visible = torch.where(seen, visible, 1)
+        if self.kind == "particles":
+            return self._particles(entries, call, visible, mask, seen)
+        out = self.module.on_entries(entries, call)
+        nis, own, innovation = (out[self.info_prefix, name] for name in ("nis", "log_likelihood", "innovation"))
+        count = torch.full_like(nis, innovation.shape[-1])
+        if mask is not None:
+            count = mask.expand(innovation.shape).sum(-1, keepdim=True, dtype=nis.dtype)
+        other = own + 0.5 * nis * (1 - self.broad**-2) - count * math.log(self.broad)
+        share = responsibility(visible, own, other)
+        mixed = self._moments(entries, out, share) if self.kind == "moments" else self._members(entries, out, share)
+        if seen is not None:  # where there is no reading, not even rounding moves anything
+            mixed = {key: torch.where(_like(seen, value), value, out[key]) for key, value in mixed.items()}
+            share = torch.where(seen, share, 0)
+        told = {"log_likelihood": log_mixture(visible, own, other), "visible": share}
+        return {**out, **mixed, **{(self.info_prefix, name): value for name, value in told.items()}}
+
+    def _moments(self, entries: Entries, out: Entries, share: Tensor) -> Entries:
+        """Mean, covariance and variances."""
+        keys = self.module.out_keys[:3]
+        mean, cov = mix_moments(share, out[keys[0]], out[keys[1]], *(entries[key] for key in self.module.in_keys[:2]))
+        return dict(zip(keys, (mean, cov, cov.diagonal(dim1=-2, dim2=-1)), strict=True))
+
+    def _members(self, entries: Entries, out: Entries, share: Tensor) -> Entries:
+        """Ensemble, mean and variances; a past, and a covariance, where the analysis writes them."""
+        analysis = self.module
+        pairs = [(analysis.in_keys[0], analysis.out_keys[0])]
+        pairs += [(key, key) for key in analysis.in_keys if key in analysis.out_keys]  # the past is corrected in place
+        before = [entries[key].flatten(len(share.shape)) for key, _ in pairs]
+        after = [out[key].flatten(len(share.shape)) for _, key in pairs]
+        both = mix_members(share, torch.cat(after, -1), torch.cat(before, -1))
+        parts = both.split([part.shape[-1] for part in after], -1)
+        mixed = {key: part.reshape(out[key].shape) for (_, key), part in zip(pairs, parts, strict=True)}
+        ensemble = mixed[pairs[0][1]]
+        mean = ensemble_mean(ensemble)
+        told = {"mean": mean, "var": ensemble_var(ensemble, mean)}
+        for key in analysis.out_keys[1:]:
+            if key[:-1] == pairs[0][1][:-1] and key[-1] in ("mean", "var", "cov"):
+                mixed[key] = told[key[-1]] if key[-1] in told else ensemble_cov(ensemble)
+        return mixed
+
+    def _particles(
+        self, entries: Entries, call: Call, visible: Tensor, mask: Tensor | None, seen: Tensor | None
+    ) -> Entries:
+        """What the analysis makes of likelihoods that are mixtures."""
+        prior, likelihood = (self.required(entries, key) for key in self.module.in_keys[1:3])
+        predicted, reading, variance = (self.required(entries, key) for key in self.module.in_keys[3:6])
+        predicted, reading = align_angles(predicted, reading, self.module.angles, mask)
+        if reading.ndim == predicted.ndim:
+            reading = reading.mean(-2)
+        innovation, nis, log_det = scored_innovation(predicted, prior, reading, variance, observed=mask)
+        count = torch.full_like(nis, innovation.shape[-1])
+        if mask is not None:
+            count = mask.expand(innovation.shape).sum(-1, keepdim=True, dtype=nis.dtype)
+        other = -0.5 * (nis / self.broad**2 + log_det + count * math.log(2 * math.pi * self.broad**2))
+        mixed = log_mixture(visible, likelihood, other)
+        if seen is not None:
+            mixed = torch.where(seen, mixed, likelihood)
+        out = self.module.on_entries({**entries, self.module.in_keys[2]: mixed}, call)
+        share = responsibility(visible, torch.logsumexp(prior + likelihood, -1, keepdim=True), other)
+        return {**out, (self.info_prefix, "visible"): share if seen is None else torch.where(seen, share, 0)}
+
+
+def heeding(visibility: Visibility | None, analysis: TensorDictModuleBase) -> TensorDictModuleBase:
+    """The analysis, which heeds what a head says; as it is without one."""
+    if visibility is None:
+        return analysis
+    check_module("visibility", visibility)
+    return Visible(cast(SubModel, analysis), visible_key=visibility.out_keys[0])
+
+
+def _like(seen: Tensor, value: Tensor) -> Tensor:
+    """A mask ``[*B, 1]`` with as many dimensions as a value ``[*B, ...]``."""
+    return seen.reshape(*seen.shape[:-1], *(1,) * (value.ndim - seen.ndim + 1))
+
+
+def _kind(analysis: SubModel) -> str:
+    """What an analysis updates: ``"members"``, ``"moments"`` or ``"particles"``."""
+    if isinstance(analysis, SubModel) and not isinstance(analysis, AnalysisAround) and analysis.info_prefix is not None:
+        written = [cast("tuple[str, ...]", unravel_key(key)) for key in analysis.out_keys]
+        scores = {(analysis.info_prefix, name) for name in ("nis", "innovation", "log_likelihood")}
+        read = [key[-1] for key in map(unravel_key, analysis.in_keys[:2])]
+        if scores <= set(written):
+            if "log_weight" in (key[-1] for key in written):
+                return "particles"
+            if read == ["mean", "cov"] and [key[-1] for key in written[:3]] == ["mean", "cov", "var"]:
+                return "moments"
+            if analysis.updates_ensemble:
+                return "members"
+    raise TypeError(
+        f"{type(analysis).__name__} does not say where its forecast and its reading are. Visible goes around an "
+        "EnsembleAnalysis, LocalEnsembleAnalysis, KalmanAnalysis, EKFAnalysis or UKFAnalysis, around ParticleAnalysis "
+        "with a GaussianLikelihood, or around one of your own that updates an ensemble and writes innovation, nis and "
+        "log_likelihood under its info_prefix."
+    )

@@ -1,0 +1,180 @@
+"""Any TensorDict module: how it runs on entries, what it reads and writes, and which of its parts draw noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, TypeGuard, cast
+
+import torch
+from tensordict import NestedKey, TensorDict, unravel_key
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import nn
+
+from torch_denkf.submodel import EXPLAINED, Call, Entries, SubModel
+
+__all__ = [
+    "check_module",
+    "check_network",
+    "declared",
+    "in_sequences",
+    "is_sequence",
+    "marks_of",
+    "named_modules_of",
+    "random_parts",
+    "reading_of",
+    "reads",
+    "reads_of",
+    "run_module",
+    "run_modules",
+    "writes",
+]
+
+
+def check_module(name: str, module: Any) -> None:
+    """Raises unless an argument is a TensorDict module.
+
+    Raises:
+        TypeError: if it is none; ``name`` is the argument's.
+    """
+    if not (isinstance(module, nn.Module) and hasattr(module, "in_keys") and hasattr(module, "out_keys")):
+        made_of = name in ("transition", "observation") and callable(module)
+        hint = f", or Learned{name.capitalize()}(f) of a function f" if made_of else ""
+        raise TypeError(
+            f"{name} must be a TensorDict module, such as those of torch_denkf.modules{hint}; got {module!r}"
+        )
+
+
+def check_network(name: str, network: Any) -> None:
+    """Raises unless an argument can be called, as networks and functions can.
+
+    Raises:
+        TypeError: if it cannot; ``name`` is the argument's.
+    """
+    if not callable(network):
+        raise TypeError(f"{name} must be a network or a function of tensors; got {network!r}")
+
+
+def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> Entries:
+    """What a module writes where ``entries`` are: a sub-model, a sequence of modules, or any TensorDict module.
+
+    Another TensorDict module gets a TensorDict of what it names among its keys, so it sees the same in a step as in a
+    sequence. So does a sub-model with a ``forward`` of its own, or with forward hooks.
+    """
+    if not (module._forward_hooks or module._forward_pre_hooks):
+        if isinstance(module, SubModel) and type(module).forward is SubModel.forward:
+            try:
+                return module.on_entries(entries, call)
+            except EXPLAINED as error:
+                if torch.compiler.is_compiling():
+                    raise
+                raise module.explained(error, entries) from error
+        if is_sequence(module):
+            return run_modules(named_modules_of(module), entries, call)
+    keys, optional = reads(module)
+    tensordict = TensorDict({}, batch_size=call.batch_size)
+    for key in (*keys, *optional):
+        value = entries.get(key)
+        if value is not None:
+            tensordict.set(key, value)
+    for place, part in random_parts(module, call.place):
+        for name in part.noise_names:
+            value = entries.get(("noise", place, name) if name else ("noise", place))
+            if value is not None:
+                own = "self" if place == call.place else place.removeprefix(call.place + ".")
+                tensordict.set(("noise", own, name) if name else ("noise", own), value)
+    missing = [key for key in keys if key not in entries]
+    if missing and isinstance(module, TensorDictModule) and not isinstance(module, SubModel):
+        raise KeyError(
+            f"{type(module).__name__} reads {missing}, which is missing; there is {sorted(map(str, entries))}."
+        )
+    tensordict = module(tensordict)
+    return {key: tensordict.get(key) for key in map(unravel_key, module.out_keys)}
+
+
+def run_modules(modules: Iterable[tuple[str, TensorDictModuleBase]], entries: Entries, call: Call) -> Entries:
+    """What named modules write, one after the other."""
+    entries, written = dict(entries), {}
+    for name, module in modules:
+        out = run_module(module, entries, call.part(name))
+        entries.update(out)
+        written.update(out)
+    return written
+
+
+def is_sequence(module: Any) -> TypeGuard[TensorDictSequential]:
+    """Whether a module is a plain sequence of others, and not a filter, for example.
+
+    Torch's tracer shows modules as objects of a class of its own, which inherits theirs: their type alone says nothing.
+    """
+    return isinstance(module, TensorDictSequential) and type(module).forward is TensorDictSequential.forward
+
+
+def named_modules_of(sequence: TensorDictSequential) -> list[tuple[str, TensorDictModuleBase]]:
+    """The modules of a sequence and their names, which are numbers unless it was made of a dictionary."""
+    return list(sequence.module._modules.items())
+
+
+def reads(module: TensorDictModuleBase) -> tuple[list[NestedKey], list[NestedKey]]:
+    """What a module must find, and what it uses where it is there."""
+    if not is_sequence(module):
+        may = [unravel_key(key) for key in getattr(module, "optional_keys", ())]
+        must = [key for key in map(unravel_key, module.in_keys) if key not in may]
+        return list(dict.fromkeys(must)), list(dict.fromkeys(may))
+    return reads_of(part for _, part in named_modules_of(module))
+
+
+def reads_of(modules: Iterable[TensorDictModuleBase]) -> tuple[list[NestedKey], list[NestedKey]]:
+    """What modules must find that run one after the other, and what they use where it is there."""
+    needed: dict[NestedKey, None] = {}
+    optional: dict[NestedKey, None] = {}
+    made: set[NestedKey] = set()
+    for module in modules:
+        must, may = reads(module)
+        needed.update((key, None) for key in must if key not in made)
+        optional.update((key, None) for key in may if key not in made)
+        made.update(writes(module))
+    return list(needed), [key for key in optional if key not in needed]
+
+
+def writes(module: TensorDictModuleBase) -> list[NestedKey]:
+    """What a module writes; of a plain sequence what its modules write now, one of which may have been replaced."""
+    return list(dict.fromkeys(unravel_key(key) for part in in_sequences(module) for key in part.out_keys))
+
+
+def in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
+    """The module, or those of a plain sequence."""
+    if is_sequence(module):
+        for _, part in named_modules_of(module):
+            yield from in_sequences(part)
+    else:
+        yield module
+
+
+def reading_of(sensor: TensorDictModuleBase) -> NestedKey:
+    """Where a sensor writes its reading: first what the last of its modules writes that makes one."""
+    *_, last = (part for part in in_sequences(sensor) if not declared(part).judges_reading)
+    return writes(last)[0]
+
+
+def marks_of(module: TensorDictModuleBase) -> dict[NestedKey, NestedKey]:
+    """The masks that a module makes where it finds readings that are missing, and of which masks it makes them."""
+    parts = [part for part in in_sequences(module) if isinstance(part, SubModel)]
+    return {made: given for part in parts for made, given in part.marks.items()}
+
+
+def declared(module: nn.Module) -> SubModel:
+    """What a module says about itself: a sub-model what it declares, any other module what is declared by default."""
+    return module if isinstance(module, SubModel) else cast(SubModel, SubModel)  # the class holds the defaults
+
+
+def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str, SubModel]]:
+    """The sub-models that draw noise, and their places, in the order in which they run."""
+    parts: Iterable[tuple[str, TensorDictModuleBase]]
+    if isinstance(module, SubModel):
+        if module.noise_names:
+            yield place, module
+        parts = module.parts().items()
+    else:
+        parts = named_modules_of(module) if is_sequence(module) else ()
+    for name, part in parts:
+        yield from random_parts(part, name if place == "self" else f"{place}.{name}")

@@ -1,0 +1,449 @@
+"""What every sub-model is: a function of tensors, with names for what it reads and what it writes."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+
+from torch_denkf._arguments import Checked
+from torch_denkf.functional.manifolds import Space
+
+__all__ = ["EXPLAINED", "Call", "Entries", "Noise", "SubModel", "flat_noise"]
+
+#: Tensors by unravelled key: what a step of a filter works on.
+Entries: TypeAlias = dict[NestedKey, Tensor]
+#: The noise of one call of a sub-model: one tensor, several by name, or ``None`` for the deterministic forward.
+Noise: TypeAlias = "Tensor | Mapping[str, Tensor] | None"
+
+
+class Call(NamedTuple):
+    """One call of a module on entries.
+
+    Attributes:
+        batch_size: ``[*B]``, in front of every entry.
+        place: where the module stands in the filter, e.g. ``"transition"``; its noise is ``("noise", place)``.
+        sample: whether random modules draw; if not, they run their deterministic forward.
+        time: whether the last dimension of ``batch_size`` is time.
+        missing: entries that an initial belief must do without.
+    """
+
+    batch_size: torch.Size
+    place: str = "self"
+    sample: bool = True
+    time: bool = False
+    missing: frozenset[NestedKey] = frozenset()
+
+    def part(self, name: str) -> Call:
+        """The call of a part of the module."""
+        return self._replace(place=name if self.place == "self" else f"{self.place}.{name}")
+
+
+def flat_noise(noise: Noise | TensorDictBase, *place: str) -> Entries:
+    """Noise as entries ``("noise", *place)``, or ``("noise", *place, name)`` where it is several tensors."""
+    if noise is None:
+        return {}
+    if isinstance(noise, Tensor):
+        return {("noise", *place): noise}
+    if isinstance(noise, TensorDictBase):
+        keys = noise.keys(True, True)
+        return {("noise", *place, *((key,) if isinstance(key, str) else key)): noise.get(key) for key in keys}
+    return {("noise", *place, name): value for name, value in noise.items()}
+
+
+class SubModel(Checked, TensorDictModule):
+    """A part of a filter: a function of tensors, and the keys of what it reads and writes.
+
+    A sub-class declares its keys in ``__init__`` and implements :meth:`compute`. Called on a TensorDict it reads and
+    writes there like any TensorDict module; a filter calls :meth:`on_entries` on a dictionary instead: it costs less.
+    Noise that it finds there is used instead of fresh noise: in a filter under ``("noise", place)``, by itself under
+    ``("noise", "self")``.
+
+    Args:
+        network: the module that holds the parameters; ``torch.nn.Identity()`` if there is none.
+        in_keys: entries that must be there.
+        out_keys: entries that are written.
+        optional_keys: entries that are used where they are there.
+
+    Attributes:
+        noise_names: names of the tensors that :meth:`draw_noise` draws: ``()`` for a deterministic sub-model, ``("",)``
+            for one tensor without a name of its own.
+        marks: masks that the sub-model makes where it finds readings that are missing, and the masks it makes them of.
+        reading_keys: the entries that it takes a reading from: the reading, and behind it its noise.
+        observed_key: the mask that hides them, ``[*B, 1]`` or ``[*B, O]``.
+        source_keys: of what it reads, that of which it makes a reading, where the rest only informs it.
+        reads_components: whether each component of a reading counts, and is hidden, by itself.
+        joins_readings: whether it looks at several readings together, and has nothing to say without one of them.
+        judges_reading: whether it writes no reading, but what that of the module before it is worth.
+        predicted_key: what predicts that reading, ``[*B, E, O]``, which tells how many components it has.
+        noise_variance_key: the variances of its reading, which tell how many components that has.
+        mask_key: a mask that says whether the frame is observed, of one that takes in no reading itself.
+        info_prefix: prefix of its diagnostics.
+        observation_dim: O of what it writes, where it is known beforehand.
+        state_dim: S of an initial belief; on a space, the numbers of a tangent.
+        space: in which the states of an initial belief or of an analysis live; ``None`` for plain numbers.
+        reading_space: in which the reading of an analysis lives.
+        ensemble_size: E of an initial belief.
+        input_dim: size of what an initial belief reads, where that is not S.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> class Wind(SubModel):
+        ...     def __init__(self):
+        ...         super().__init__(nn.Identity(), [("forecast", "ensemble"), "wind"], [("forecast", "ensemble")])
+        ...
+        ...     def compute(self, ensemble, wind):  # [*B, E, S], [*B, S]
+        ...         return ensemble + wind.unsqueeze(-2)
+        >>> td = TensorDict({"forecast": {"ensemble": torch.zeros(8, 2)}, "wind": torch.ones(2)})
+        >>> Wind()(td)["forecast", "ensemble"].mean()
+        tensor(1.)
+    """
+
+    if TYPE_CHECKING:
+
+        @property
+        def noise_names(self) -> tuple[str, ...]:
+            """A tuple in the class, or a property."""
+
+    else:
+        noise_names = ()
+    marks: Mapping[NestedKey, NestedKey] = MappingProxyType({})
+    reading_keys: Sequence[NestedKey] = ()
+    observed_key: NestedKey | None = None
+    source_keys: Sequence[NestedKey] = ()
+    reads_components: bool = False
+    joins_readings: bool = False
+    judges_reading: bool = False
+    predicted_key: NestedKey = ("forecast", "observation")
+    noise_variance_key: NestedKey | None = None
+    mask_key: NestedKey | None = None
+    info_prefix: str | None = None
+    observation_dim: int | None = None
+    state_dim: int | None = None
+    space: Space | None = None
+    reading_space: Space | None = None
+    ensemble_size: int | None = None
+    input_dim: int | None = None
+    _wants: frozenset[str] = frozenset()
+
+    def __init_subclass__(cls, **kwargs):
+        super().__init_subclass__(**kwargs)
+        # tensordict wraps every __init__ and so must come first; what compute asks for is looked up once a class.
+        cls._wants = frozenset({"noise", "batch_size"} & inspect.signature(cls.compute).parameters.keys())
+
+    def __init__(
+        self,
+        network: nn.Module,
+        in_keys: Sequence[NestedKey],
+        out_keys: Sequence[NestedKey],
+        *,
+        optional_keys: Sequence[NestedKey] = (),
+    ):
+        super().__init__(network, in_keys=list(in_keys), out_keys=list(out_keys))
+        required = set(map(unravel_key, self.in_keys))
+        self.optional_keys = [key for key in dict.fromkeys(map(unravel_key, optional_keys)) if key not in required]
+
+    # Unlike TensorDictModule, show no attributes of the network: its "loc" or "scale" would hide our buffers.
+    __getattr__ = nn.Module.__getattr__
+
+    def compute(self, *values: Any, **_: Any) -> Tensor | tuple[Tensor, ...]:
+        """What the sub-model writes: one tensor for each of ``out_keys``, or a tensor alone if that is one.
+
+        Args:
+            *values: the entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
+            **_: a sub-class may ask for ``batch_size``, the ``[*B]`` in front of every entry, and, if it has
+                ``noise_names``, for ``noise``: what :meth:`draw_noise` drew, or ``None`` for the deterministic forward.
+        """
+        raise TypeError(f"{type(self).__name__} has no compute(): write it, see SubModel.")
+
+    def draw_noise(
+        self,
+        batch_size: Sequence[int],
+        *,
+        members: int | None = None,
+        state_dim: int | None = None,
+        observation_dim: int | None = None,
+        time: bool = False,
+        device: torch.device | None = None,
+        dtype: torch.dtype | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Noise:
+        """Draws the noise of one call on ``batch_size`` elements.
+
+        Args:
+            batch_size: ``[*B]``, or ``[*B, T]`` for a whole sequence.
+            members: E, the size of the ensemble.
+            state_dim: S.
+            observation_dim: O, of the reading that the sub-model uses.
+            time: whether the last of ``batch_size`` is time.
+            device: where to draw.
+            dtype: of floating noise.
+            generator: source of randomness; torch's global one by default.
+
+        Returns:
+            A tensor ``[*batch_size, ...]``, or several by ``noise_names``; ``None`` where there is no noise, or a size
+            that it depends on is not known.
+        """
+        return None
+
+    def noise_sizes(self, *values: Any, **_: Any) -> dict[str, int]:
+        """The sizes that :meth:`draw_noise` needs, from the values that :meth:`compute` gets by position."""
+        return {}
+
+    def parts(self) -> dict[str, TensorDictModuleBase]:
+        """The modules inside that may draw noise of their own, by name."""
+        return {}
+
+    def reading_dims(self, entries: Entries, call: Call) -> Sequence[int]:
+        """How many numbers each of ``reading_keys`` has, where it is missing and zeros behind a mask stand for it.
+
+        By default O: ``observation_dim``, or what :attr:`predicted_key` holds. On a space the noise is of tangents.
+
+        Raises:
+            KeyError: if that is not known.
+        """
+        if self.reading_space is not None:
+            others = [self.reading_space.tangent_dim] * (len(self.reading_keys) - 1)
+            return [self.reading_space.point_dim, *others]
+        dim, predicted = self.observation_dim, entries.get(self.predicted_key)
+        if predicted is not None:
+            dim = predicted.shape[-1]
+        if dim is None:
+            raise KeyError(
+                f"{type(self).__name__} does not know how many numbers {list(self.reading_keys)} have, so that they "
+                f"cannot be left out. Hide them with their mask, {self.observed_key!r}; or let reading_dims() of "
+                f"{type(self).__name__} say it."
+            )
+        return [dim] * len(self.reading_keys)
+
+    @property
+    def draws(self) -> bool:
+        """Whether :meth:`compute` asks for noise."""
+        return "noise" in self._wants
+
+    @property
+    def updates_ensemble(self) -> bool:
+        """Whether it reads an ensemble, what its members predict of a reading, the reading, and its noise; and a mask.
+
+        Such an analysis can be given a past to correct (:meth:`move_past`).
+        """
+        keys = [unravel_key(key) for key in self.in_keys]
+        read = [unravel_key(key) for key in (self.predicted_key, *self.reading_keys)]
+        return keys[1:] == read and self.optional_keys == [self.observed_key]
+
+    def move_past(
+        self,
+        past: Tensor,
+        predicted: Tensor,
+        observation: Tensor,
+        variance: Tensor,
+        observed: Tensor | None = None,
+        *,
+        noise: Noise = None,
+    ) -> Tensor:
+        """Of an analysis of an ensemble: what a reading says of earlier states of the same members.
+
+        By default what :meth:`compute` would do to them if they were one state of L times S components, inflation and
+        the like included. Where :meth:`compute` holds anything of S components, write this method, too.
+
+        Args:
+            past: ``[*B, E, L, S]``.
+            predicted: predicted observations ``[*B, E, O]``.
+            observation: learned observations ``[*B, E, O]``, or one reading ``[*B, O]``.
+            variance: of the reading, ``[*B, O]``.
+            observed: mask ``[*B, 1]`` or ``[*B, O]``; ``None`` where all is observed.
+            noise: what :meth:`compute` was given: the same draws.
+
+        Returns:
+            The updated past, ``[*B, E, L, S]``.
+
+        Raises:
+            RuntimeError: if :meth:`compute` does not take so many components.
+        """
+        extra = {"noise": noise} if self.draws else {}
+        try:
+            out = self.by_key(self.compute(past.flatten(-2), predicted, observation, variance, observed, **extra))
+        except RuntimeError as error:
+            raise RuntimeError(
+                f"{type(self).__name__} is to correct earlier states, and its compute() fails on their "
+                f"{past.shape[-2]} times {past.shape[-1]} components: write {type(self).__name__}.move_past()."
+            ) from error
+        return out[self.out_keys[0]].unflatten(-1, past.shape[-2:])
+
+    def aligned(self, entries: Entries) -> Entries:
+        """Of an analysis: the entries with all angles on one turn, so that they can be averaged like other numbers."""
+        return entries
+
+    def on_aligned(self, entries: Entries, call: Call) -> Entries:
+        """What :meth:`on_entries` gives of entries that are :meth:`aligned` already."""
+        return self.on_entries(entries, call)
+
+    def without_step(self, entries: Entries) -> Entries:
+        """Of a transition: what it writes beside the forecast where an episode begins, and no step leads there."""
+        return {}
+
+    def of_carry(self, entries: Entries) -> Entries:
+        """Of an initial belief: what else of the belief follows from the entries that are carried on, by key."""
+        return {}
+
+    def on_entries(self, entries: Entries, call: Call) -> Entries:
+        """What the sub-model writes where ``entries`` are; changes nothing.
+
+        Raises:
+            KeyError: if an entry is missing.
+        """
+        try:
+            values: list[Any] = list(map(entries.__getitem__, self.in_keys))
+            values.extend(map(entries.get, self.optional_keys))
+        except KeyError:  # the message says what there is
+            values = self.values(entries)
+        extra: dict[str, Any] = {}
+        if "batch_size" in self._wants:
+            extra["batch_size"] = call.batch_size
+        if "noise" in self._wants:
+            extra["noise"] = self._noise(entries, values, call)
+        out = self.compute(*values, **extra)
+        if type(out) is tuple and len(out) == len(self.out_keys):
+            return dict(zip(self.out_keys, out, strict=True))
+        if isinstance(out, Tensor) and len(self.out_keys) == 1:
+            return {self.out_keys[0]: out}
+        return self.by_key(out)
+
+    def values(self, entries: Entries) -> list[Any]:
+        """The entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
+
+        Raises:
+            KeyError: if an entry of ``in_keys`` is missing.
+        """
+        return [*(self.required(entries, key) for key in self.in_keys), *map(entries.get, self.optional_keys)]
+
+    def by_key(self, out: Tensor | Sequence[Tensor] | None) -> Entries:
+        """What :meth:`compute` returned, under :attr:`out_keys`.
+
+        Raises:
+            ValueError: if it is not one tensor for each of them.
+        """
+        values = (out,) if isinstance(out, Tensor) else out if isinstance(out, (tuple, list)) else None
+        if values is None or len(values) != len(self.out_keys):
+            got = type(out).__name__ if values is None else f"{len(values)} values"
+            raise ValueError(
+                f"{type(self).__name__}.compute() returns a tensor for each of its out_keys, in their order: "
+                f"{list(self.out_keys)}, {len(self.out_keys)} values; it returned {got}."
+            )
+        return dict(zip(self.out_keys, values, strict=True))
+
+    def required(self, entries: Entries, key: NestedKey) -> Tensor:
+        """The entry ``key``.
+
+        Raises:
+            KeyError: if it is missing; the message names it and lists what is there.
+        """
+        value = entries.get(key)
+        if value is None:
+            present = ", ".join(sorted(map(str, entries))) or "nothing"
+            raise KeyError(
+                f"{type(self).__name__} reads {key!r}, which is missing. There is {present}. Give the filter it "
+                "(does the environment or the data have it?), put the module that writes it in front, or rename the "
+                f"key in the constructor of {type(self).__name__}."
+            )
+        return value
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Reads, computes and writes on a TensorDict."""
+        entries = {}
+        for key in (*self.in_keys, *self.optional_keys):
+            value = tensordict.get(key, None)
+            if value is not None:
+                entries[key] = value
+        if len(entries) < len(self.in_keys):  # the message is to list all that is there
+            entries = dict.fromkeys(map(unravel_key, tensordict.keys(True, True))) | entries
+        entries.update(flat_noise(tensordict.get("noise", None)))
+        try:
+            written = self.on_entries(entries, Call(tensordict.batch_size))
+        except EXPLAINED as error:
+            raise self.explained(error, entries) from error
+        for key, value in written.items():
+            tensordict.set(key, value)
+        return tensordict
+
+    def explained(self, error: Exception, entries: Entries) -> Exception:
+        """The error with what was read, and constants, in its message; one of another kind as it is.
+
+        Raises:
+            TypeError: if entries and parameters differ in precision, or a mask is not boolean.
+        """
+        self._explain_dtypes(error, entries)
+        if type(error) not in EXPLAINED:  # it may not be made of a message alone
+            return error
+        return type(error)(f"{error} {self._what_there_was(entries)}")
+
+    def _what_there_was(self, entries: Entries) -> str:
+        """What was read, and constants, with their shapes: for the message of an error."""
+        values = {key: entries.get(key) for key in (*self.in_keys, *self.optional_keys)}
+        read = [_shown(key, value) for key, value in values.items() if isinstance(value, Tensor)]
+        named = (*self.named_buffers(recurse=False), *self.named_parameters(recurse=False))
+        own = [f"{name} {list(value.shape)}" for name, value in named]
+        text = f"({type(self).__name__} read {', '.join(read) or 'nothing'}"
+        return f"{text}; its constants are {', '.join(own)})" if own else f"{text})"
+
+    def _noise(self, entries: Entries, values: Sequence[Tensor | None], call: Call) -> Noise:
+        names = self.noise_names
+        if not names or not call.sample:
+            return None
+        given: Noise
+        if names == ("",):
+            given = entries.get(("noise", call.place))
+        else:
+            found = {name: entries.get(("noise", call.place, name)) for name in names}
+            given = {name: value for name, value in found.items() if value is not None}
+            given = given if len(given) == len(found) else None
+        if given is None:
+            where: dict[str, Any] = {}
+            # Where nothing is read, what is drawn lies beside the constants.
+            for value in values if values else (*self.parameters(), *self.buffers()):
+                if value is not None and value.is_floating_point():
+                    where = {"device": value.device, "dtype": value.dtype}
+                    break
+            where.update(self.noise_sizes(*values))
+            given = self.draw_noise(call.batch_size, time=call.time, **where)
+            if given is None:  # it would run as if no noise were wanted
+                raise ValueError(
+                    f"{type(self).__name__} at place {call.place!r} names noise, and its draw_noise drew none. Where "
+                    "that needs the number of members, or another size, return it from noise_sizes(self, *values): "
+                    'for example {"members": ensemble.shape[-2]}.'
+                )
+        return given
+
+    def _explain_dtypes(self, error: Exception, entries: Entries) -> None:
+        if "bool" in str(error):
+            for key in self.optional_keys:  # masks, and counts of steps
+                mask = entries.get(key)
+                if mask is not None and mask.dtype not in (torch.bool, torch.int64):
+                    raise TypeError(
+                        f"{type(self).__name__} reads the mask {key!r}, which must be boolean, True where observed; "
+                        f"got {mask.dtype}. Convert it with .bool()."
+                    ) from error
+        own = {p.dtype for p in (*self.parameters(), *self.buffers()) if p.is_floating_point()}
+        values = {key: entries.get(key) for key in (*self.in_keys, *self.optional_keys)}
+        given = {key: v.dtype for key, v in values.items() if v is not None and v.is_floating_point()}
+        if len(own | set(given.values())) > 1 and any(word in str(error) for word in ("dtype", "scalar type")):
+            raise TypeError(
+                f"{type(self).__name__} computes in {', '.join(map(str, own)) or 'what it is given'} and got "
+                + ", ".join(f"{key!r} in {dtype}" for key, dtype in given.items())
+                + ". Convert the data (torchrl's DoubleToFloat(), or tensordict.float()) or the filter "
+                "(filter.double())."
+            ) from error
+
+
+#: Errors that can be raised again with more words.
+EXPLAINED = (RuntimeError, TypeError, ValueError, IndexError)
+
+
+def _shown(key: NestedKey, value: Tensor) -> str:
+    return f"{key!r} {list(value.shape)} {str(value.dtype).removeprefix('torch.')}"
