@@ -11,11 +11,11 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torch.testing import assert_close
+from torch_denkf.filters.rejection import REJECTED
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check
 from torch_denkf.filters import EKF, DEnKF, Filter, KalmanFilter
-from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.functional import wrap_angles
 from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
 from torch_denkf.fusion.parts import JoinedReading
