@@ -11,6 +11,7 @@ from torchrl.envs import ExcludeTransform, TransformedEnv, check_env_specs
 from torchrl.modules import set_recurrent_mode
 from torchrl.modules.utils import get_env_transforms_from_module
 
+from tests.borders.test_readings import from_sensor
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.transforms.envs_for_tests import base_env, forked_env, toy_base_env, toy_filter
@@ -261,8 +262,29 @@ def test_gradients_of_a_reading_are_finite():
     assert ((scaled.grad != 0) == torch.tensor([[True, False], [False, True], [False, False]])).all()
 
 
-def test_in_a_policy():
+@pytest.mark.parametrize("masked", ["each time", "once", "never"])
+def test_a_mask_is_that_of_its_reading(masked):
+    """In a loop the tensordict keeps what was written: a reading that was rejected hides no later one."""
+    reject, seen = RejectReadings({"x": "seen"}), torch.tensor([[True], [False]])
+    row, found = TensorDict({"x": torch.tensor([[NAN], [1.0]])}, [2]), []
+    if masked != "never":
+        row["seen"] = seen
+    for value in (1.0, NAN, 2.0):
+        found.append(reject(row)["seen"][0].item())
+        assert reject(row)["seen"][0].item() == found[-1]  # twice is once
+        assert row["seen"][1].item() == (masked == "never")
+        row["x"] = torch.tensor([[value], [1.0]])
+        if masked == "each time":
+            row["seen"] = seen.clone()
+    assert found == [False, True, False]
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_in_a_policy(given):
     frames, masked = drive(2, 6)
+    if not given:
+        del frames["observed"]
+        masked["observed"] = frames["observation"].abs() <= 1e18
     filter, outs = linear_kalman(), []
     for data, modules in (
         (frames, [RejectReadings({"observation": "observed"}, by_component=["observation"])]),
@@ -305,7 +327,7 @@ def rejecting_env(filter, *, silent=True, **options):
 
 @pytest.mark.parametrize("apart", [False, True])
 @pytest.mark.parametrize("update_at_reset", [False, True])
-@pytest.mark.parametrize("make", [linear_kalman, lambda **kw: linear_denkf("etkf", **kw)])
+@pytest.mark.parametrize("make", [linear_kalman, lambda **kw: linear_denkf("etkf", **kw), from_sensor])
 def test_in_an_environment(make, update_at_reset, apart):
     """An environment that says when a reading is missing, and one that does not: the beliefs are the same."""
     filter, rollouts = make(update_at_reset=update_at_reset), []

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal, get_args
+from weakref import ref
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
@@ -19,6 +21,9 @@ from torch_denkf.submodel import Entries
 __all__ = ["RejectReadings"]
 
 OnBad = Literal["mask", "raise"]
+#: Of each mask that was written, the mask that was given, and references to the readings that it was written for. In a
+#: loop a tensordict keeps a mask after its reading was replaced.
+_WRITTEN = WeakIdKeyDictionary()
 
 
 class RejectReadings(Checked, Transform):
@@ -32,6 +37,10 @@ class RejectReadings(Checked, Transform):
     a ``TensorDictSequential``, or into a policy. It is a transform, too: append it to an environment in front of
     :class:`~torch_denkf.transforms.DEnKFTransform`, or to a replay buffer. Like each TensorDict module it sets entries
     of the tensordict that it is given, and leaves the tensors alone: ``reject(td.copy())`` keeps the NaN in ``td``.
+
+    In a loop, call it on the frame before that is merged: ``filter.step(belief.update(reject(frame)))``. A tensordict
+    that goes on from step to step, also that of a policy, keeps the mask of the step before. It is not taken for the
+    mask of a new reading, unless the tensordict was cloned in between or the call is compiled.
 
     Args:
         masks: the observed mask of each reading, such as ``{"pixels": "observed", "gps": "gps_observed"}``. A mask that
@@ -109,29 +118,47 @@ class RejectReadings(Checked, Transform):
         size = tensordict.ndim
         written: Entries = {}
         usable = {key: self._usable(key, tensordict, written) for key in self.hidden_by}
-        count = torch.zeros(1, dtype=torch.int64, device=next(iter(written.values())).device)
-        count = count.expand(*tensordict.batch_size, 1)
-        for mask in dict.fromkeys(self.hidden_by.values()):
-            fine = None
-            for key in usable:
-                if self.hidden_by[key] == mask:
-                    fine = usable[key] if fine is None else fine & usable[key]
-            observed = tensordict.get(mask, None)
-            if observed is None:
-                observed = torch.ones_like(fine)
-            check_mask(f"the mask {mask!r}", observed)
-            if observed.shape[:-1] != tensordict.batch_size or not _fits(observed.shape[size:], fine.shape[size:]):
+        fine: Entries = {}
+        for key, mask in self.hidden_by.items():
+            fine[mask] = fine[mask] & usable[key] if mask in fine else usable[key]
+        count = torch.zeros(*tensordict.batch_size, 1, dtype=torch.int64, device=next(iter(fine.values())).device)
+        observed, before = {}, {}
+        for mask, seen in fine.items():
+            now, before[mask] = self._given(mask, tensordict)
+            observed[mask] = now = torch.ones_like(seen) if now is None else now
+            check_mask(f"the mask {mask!r}", now)
+            if now.shape[:-1] != tensordict.batch_size or not _fits(now.shape[size:], seen.shape[size:]):
                 raise ValueError(
                     f"the mask {mask!r} must be [*B, 1] or [*B, O] with B = {list(tensordict.batch_size)}; got "
-                    f"{list(observed.shape)}"
+                    f"{list(now.shape)}"
                 )
-            written[mask] = observed & fine
-            count = count + (observed & ~fine).sum(-1, keepdim=True)
+            written[mask] = now & seen
+            count = count + (now & ~seen).sum(-1, keepdim=True)
         if self.on_bad == "raise" and flag_value((count > 0).any()):
-            raise ValueError(next(self._messages(tensordict, usable)))
+            raise ValueError(next(self._messages(tensordict, usable, observed)))
         for key, value in written.items():
             tensordict.set(key, value)
+        if not torch.compiler.is_compiling():
+            for mask, given in before.items():
+                _WRITTEN[written[mask]] = given, [ref(written[key]) for key in self._hidden(mask)]
         return tensordict.set(self.count_key, count)
+
+    def _hidden(self, mask: NestedKey) -> list[NestedKey]:
+        """The readings of a mask."""
+        return [key for key, other in self.hidden_by.items() if other == mask]
+
+    def _given(self, mask: NestedKey, tensordict: TensorDictBase) -> tuple[Tensor | None, Tensor | None]:
+        """The mask of the readings that are there, and the mask before anything was rejected.
+
+        Both are the latter where the mask was written for readings that have been replaced since.
+        """
+        observed = tensordict.get(mask, None)
+        if observed is None or torch.compiler.is_compiling() or observed not in _WRITTEN:
+            return observed, observed
+        before, readings = _WRITTEN[observed]
+        now = map(tensordict.get, self._hidden(mask))
+        rejected_already = any(old() is new for old, new in zip(readings, now, strict=True))
+        return observed if rejected_already else before, before
 
     def _usable(self, key: NestedKey, tensordict: TensorDictBase, written: Entries) -> Tensor:
         """Tells which components of a reading can be used, ``[*B, 1]``, ``[*B, O]`` or ``[*B, D]``.
@@ -183,12 +210,16 @@ class RejectReadings(Checked, Transform):
             raise KeyError(f"RejectReadings reads {key!r}, which is not there; there are {present}.")
         return value
 
-    def _messages(self, tensordict: TensorDictBase, usable: Mapping[NestedKey, Tensor]) -> Iterator[str]:
+    def _messages(
+        self,
+        tensordict: TensorDictBase,
+        usable: Mapping[NestedKey, Tensor],
+        observed: Mapping[NestedKey, Tensor],
+    ) -> Iterator[str]:
         """Names the first bad number of each reading, and of its noise, that no mask hides."""
         for key, fine in usable.items():
             mask, noise = self.hidden_by[key], self.noises.get(key)
-            observed = tensordict.get(mask, None)
-            lost = ~fine if observed is None else observed & ~fine
+            lost = observed[mask] & ~fine
             cure = f'. Set its mask {mask!r} to False there, or let RejectReadings(..., on_bad="mask") do it.'
             for row in lost.any(-1).nonzero().tolist()[:1]:
                 for name in (key,) if noise is None else (key, noise):
@@ -224,7 +255,7 @@ class RejectReadings(Checked, Transform):
 
 
 def _fits(given: Sequence[int], due: Sequence[int]) -> bool:
-    """Whether a mask of the width that is given can be combined with one of the other width."""
+    """Tells whether masks of two widths can be combined."""
     return len(given) == 1 and (given[0] == 1 or due[0] in (1, given[0]))
 
 
