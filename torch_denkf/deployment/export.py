@@ -23,7 +23,6 @@ from torch_denkf.compilation import (
 from torch_denkf.deployment.onnx_model import need_onnx, onnx_model
 from torch_denkf.deployment.package import SIGNATURE, run_onnx
 from torch_denkf.filters import Filter
-from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.submodel import Entries
 
 Format = Literal["pt2", "onnx"]
@@ -66,8 +65,8 @@ def export_step(
     ONNX lacks factors of matrices. Small systems are written out: readings of up to 4 numbers, and covariances of up to
     6 x 6. What remains is refused by the name of its operator.
 
-    A package cannot raise. That of a filter with ``reject=True`` counts readings that are not finite as missing, and
-    returns their number, ``"info.rejected"``; that of another one has a belief of NaN from then on.
+    A package cannot raise: after a reading that is not finite its belief is NaN from then on. Put a mask into
+    ``example``, and set it to ``False`` for such readings.
 
     What the package returns for the example is compared with the eager step, see
     :meth:`~torch_denkf.filters.Filter.compile`; with noise in the example number by number, otherwise within what the
@@ -128,7 +127,7 @@ def export_step(
     structure = filter.structure
     inner = {filter.outer(key): key for key in (*structure.frame_keys, *filter.steps().step_keys)}
     asked = [inner.get(key, key) for key in map(unravel_key, out_keys)]
-    out_keys = list(dict.fromkeys([*structure.carry, *structure.belief, *asked, *[REJECTED] * filter.reject]))
+    out_keys = list(dict.fromkeys([*structure.carry, *structure.belief, *asked]))
     unknown = [key for key in out_keys if key not in inner.values()]
     if unknown:
         raise ValueError(f"the filter does not write {unknown}; it writes {list(inner)}")

@@ -144,11 +144,11 @@ class RejectReadings(Checked, Transform):
         return tensordict.set(self.count_key, count)
 
     def _hidden(self, mask: NestedKey) -> list[NestedKey]:
-        """The readings of a mask."""
+        """Lists the readings that a mask hides."""
         return [key for key, other in self.hidden_by.items() if other == mask]
 
     def _given(self, mask: NestedKey, tensordict: TensorDictBase) -> tuple[Tensor | None, Tensor | None]:
-        """The mask of the readings that are there, and the mask before anything was rejected.
+        """Returns the mask of the readings that are there, and the mask before any of them was rejected.
 
         Both are the latter where the mask was written for readings that have been replaced since.
         """
