@@ -390,7 +390,7 @@ def test_in_a_replay_buffer():
         ([[1.0, 2.0]], {"n": [[1.0, -2.0]]}, "'n' is -2 at [0, 1], and a variance must be at least zero"),
         ([[1.0, 2.0]], {"n": [[1.0, INF]]}, "'n' is inf at [0, 1], and a variance must be finite"),
         ([[1.0, 2.0]], {"n": [[[1.0, 2.0], [2.0, 1.0]]]}, "'n' at [0] is no covariance"),
-        ([[NAN, NAN]], {"seen": [[False, True]]}, "'x' is nan at [0, 1], and a reading must be finite"),
+        ([[1.0, NAN]], {"seen": [[False, True]]}, "'x' is nan at [0, 1], and a reading must be finite"),
     ],
 )
 @pytest.mark.parametrize("apart", [False, True])
@@ -405,6 +405,19 @@ def test_bad_readings_raise(rows, others, message, apart):
     out = RejectReadings({"x": "seen"}, noises=noises, by_component=apart, on_bad="raise")(td)
     assert all(value.isfinite().all() for value in out.values(True, True) if value.is_floating_point())
     assert out[COUNT].sum() == 0
+
+
+def test_of_several_bad_numbers_one_that_no_mask_hides_raises():
+    seen = torch.tensor([[False, True]])
+    td = of("x", [NAN, INF], seen=seen)
+    with pytest.raises(ValueError, match=r"^'x' is inf at \[0, 1\]"):
+        RejectReadings({"x": "seen"}, by_component=["x"], on_bad="raise")(td)
+    with pytest.raises(ValueError, match=r"^'x' is nan at \[0, 0\]"):  # a whole reading needs all of its numbers
+        RejectReadings({"x": "seen"}, on_bad="raise")(of("x", [NAN, 1.0], seen=seen))
+    with pytest.raises(ValueError, match=r"^'pose' is nan at \[0, 1\]"):  # so does a pose
+        RejectReadings({"pose": "seen"}, spaces={"pose": SE2()}, on_bad="raise")(
+            of("pose", [0.5, NAN, 2.0], seen=torch.tensor([[True, False, True]]))
+        )
 
 
 @pytest.mark.parametrize(

@@ -226,7 +226,7 @@ class RejectReadings(Checked, Transform):
                     value = tensordict.get(name)[tuple(row)].detach()
                     negative = (value < 0) & (name == noise and value.ndim == 1)
                     bad = ~self._within(value) | negative
-                    if lost.shape[-1:] == value.shape[-1:]:  # other components may be hidden
+                    if key in self.by_component and lost.shape[-1:] == value.shape[-1:]:  # others may be hidden
                         bad = bad & lost[tuple(row)]
                     for place in bad.nonzero().tolist()[:1]:
                         number, what = value[tuple(place)].item(), "variance" if name == noise else "reading"
