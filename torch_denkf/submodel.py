@@ -31,14 +31,14 @@ class Call(NamedTuple):
         place: where the module stands in the filter, e.g. ``"transition"``; its noise is ``("noise", place)``.
         sample: whether random modules draw; if not, they run their deterministic forward.
         time: whether the last dimension of ``batch_size`` is time.
-        missing: entries that an initial belief must do without.
+        drawn: collects, in a trial step, the modules that draw noise and the sizes they ask for.
     """
 
     batch_size: torch.Size
     place: str = "self"
     sample: bool = True
     time: bool = False
-    missing: frozenset[NestedKey] = frozenset()
+    drawn: dict | None = None
 
     def part(self, name: str) -> Call:
         """The call of a part of the module."""
@@ -410,7 +410,10 @@ class SubModel(Checked, TensorDictModule):
                 if value is not None and value.is_floating_point():
                     where = {"device": value.device, "dtype": value.dtype}
                     break
-            where.update(self.noise_sizes(*values))
+            sizes = self.noise_sizes(*values)
+            if call.drawn is not None:
+                call.drawn[call.place] = self, sizes
+            where.update(sizes)
             given = self.draw_noise(call.batch_size, time=call.time, **where)
             if given is None:  # it would run as if no noise were wanted
                 raise ValueError(

@@ -353,7 +353,7 @@ def test_an_update_at_reset_sees_the_first_frame_and_no_late_one(float64, kind):
     late, order = arriving(frames, PATTERNS["three steps late"]), frames.copy()
     order["second_observed"] = order["second_observed"].clone()
     order["second_observed"][:, -DELAY:] = False
-    plain.update_at_reset = True
+    plain = plain.with_options(update_at_reset=True)
     expected = plain.sequence(order)
     F, Q, _, _ = linear_system()
     motion = LinearTransition(F, Q) if kind == "Kalman" else NoisyLinear(F)

@@ -125,7 +125,7 @@ def export_step(
     if any(example.get(key, None) is None for key in filter.carry_keys):
         example = filter.initialise(example.copy())
     structure = filter.structure
-    inner = {filter.outer(key): key for key in (*structure.frame_keys, *filter.steps().step_keys)}
+    inner = {filter.outer(key): key for key in (*structure.frame_keys, *structure.step_keys)}
     asked = [inner.get(key, key) for key in map(unravel_key, out_keys)]
     out_keys = list(dict.fromkeys([*structure.carry, *structure.belief, *asked]))
     unknown = [key for key in out_keys if key not in inner.values()]
@@ -133,7 +133,7 @@ def export_step(
         raise ValueError(f"the filter does not write {unknown}; it writes {list(inner)}")
     entries = filter.entries_of(example, one_step=True)
     if format == "onnx":
-        entries |= filter.missing_noise(entries, example.batch_size, structure.modules)[0]
+        entries |= filter.missing_noise(entries, example.batch_size)
     in_keys = _inputs(filter, entries, example)
     # Not parts of one another, whose strides the graph would hold.
     values = tuple(entries[key].clone(memory_format=torch.contiguous_format) for key in in_keys)

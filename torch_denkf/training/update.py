@@ -107,6 +107,7 @@ class Updates:
         return True
 
     def _skip(self, batch: TensorDictBase) -> bool:
+        """Leaves the step out, and says which entries of the batch are not finite."""
         self.skipped, self.in_a_row = self.skipped + 1, self.in_a_row + 1
         values = batch.items(True, True) if isinstance(batch, TensorDictBase) else batch.items()
         keys = [key for key, value in values if value.is_floating_point() and not bool(value.isfinite().all())]
