@@ -65,7 +65,7 @@ def test_observed_nan_raises_and_names_the_key(make_base, make_filter):
         )
 
     assert make().rollout(2).shape == (3, 2)
-    assert_refused(ValueError, r"NaN or infinity in \['observation'\].*'observed'", make().rollout, 8)
+    assert_refused(ValueError, r"NaN or infinity in \['observation'\].*RejectReadings", make().rollout, 8)
     # Where such a reading is rejected the beliefs are those under a mask that tells the truth.
     reject = RejectReadings({"observation": "observed"})
     assert_equal(make(reject).rollout(8)["next"], make(honest=True).rollout(8)["next"], BELIEF)
