@@ -101,11 +101,11 @@ def _stepped(filter: Filter, frames: TensorDict) -> TensorDict:
     """Steps through the frames, as a robot does."""
     torch.manual_seed(2)
     rows = frames.exclude("is_init").unbind(1)
-    carry, out = filter.initialise(rows[0].copy()), []
+    carry, out, check = filter.initialise(rows[0].copy()), [], _front(filter, "raise")
     for row in rows[1:]:
         for key in filter.belief_keys:
             row.set(key, carry.get(key))
-        carry = filter.step(row)
+        carry = filter.step(check(row))
         out.append(carry.select(*filter.belief_keys).copy())
     return torch.stack(out, 1)
 
