@@ -92,6 +92,10 @@ class Belief:
         """Tells whether a carried entry is finite, as a boolean tensor ``[]``."""
         return value.isfinite().all()
 
+    def flaws(self, entries: Mapping[NestedKey, Tensor]) -> list[str]:
+        """Names what is wrong with a belief whose numbers are finite."""
+        return []
+
     def limited(self, held: Mapping[str, Tensor], ceiling: float) -> dict[str, Tensor]:
         """Clamps variances to a ceiling; correlations stay, and the mean stays within reach of zero.
 
@@ -125,6 +129,13 @@ class Moments(Belief):
         """Computes the variances."""
         _, cov = carried
         return cov.diagonal(dim1=-2, dim2=-1) if name == "var" else None
+
+    def flaws(self, entries):
+        """Names a covariance whose variances are negative."""
+        key = self.key("cov")
+        cov = entries.get(key)
+        negative = cov is not None and bool((cov.diagonal(dim1=-2, dim2=-1) < 0).any())
+        return [f"negative variances in {[key]}"] if negative else []
 
 
 class Ensemble(Belief):

@@ -167,7 +167,10 @@ def test_readings_of_several_robots_are_not_averaged(make, way):
         "policy": lambda: filter(row.set("previous", row.select("belief"))),
         "transform": lambda: TransformedEnv(ReplayedFrames(frames), DEnKFTransform(filter)).rollout(3),
     }
-    with pytest.raises(ValueError, match=r"The reading 'observation' is .* 1 dimension\(s\) too many. Readings of sev"):
+    with pytest.raises(
+        ValueError,
+        match=r"'observation' is .* 1 dimension\(s\) too many. Readings of sev|observation must be \[\*B, E, O\]",
+    ):
         run[way]()
 
 

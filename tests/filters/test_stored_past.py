@@ -71,5 +71,5 @@ def test_an_iterated_smoother_goes_on_too(float64):
         torch.testing.assert_close(out[key], whole[key][:, 4:], rtol=0, atol=1e-10)
     for key in filter.carry_keys:
         rest = frames[:, 4:].copy().set(key, whole[key][:, 4:])
-    with pytest.raises(KeyError, match=r"\('smoothed', 'ensemble'\) does not follow .* store it beside the belief"):
+    with pytest.raises(KeyError, match=r"\('smoothed', 'ensemble'\) does not follow .* store it with the belief"):
         filter.sequence(rest)

@@ -70,7 +70,9 @@ def check_belief(structure: Structure, entries: Entries, written: Entries) -> No
         return
     kinds, given = dict(structure.carried), {key: value for key, value in entries.items() if value.is_floating_point()}
     bad = [key for key, value in given.items() if not (kinds.get(key) or Belief()).finite(key[-1], value)]
-    why = f"NaN or infinity in {bad}" if bad else "its motion: all inputs are finite, and the filter diverged"
+    flaws = [flaw for kind in structure.kinds for flaw in kind.flaws(entries)]
+    why = f"NaN or infinity in {bad}" if bad else " and ".join(flaws)
+    why = why or "its motion: all inputs are finite, and the filter diverged"
     raise ValueError(
         f"The new belief is not finite, because of {why}. The tensordict was left as it is. "
         "Where an input is not finite: a mask that is False hides it, and RejectReadings in front of the filter makes "

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from tensordict import unravel_key
@@ -329,7 +329,7 @@ class BiasedBelief(SubModel):
         std, size = self.bias.std, call.batch_size
         if "ensemble" in names:
             ensemble = written[names["ensemble"]]
-            noise = self._noise(entries, [ensemble], call._replace(sample=True))
+            noise = cast(Tensor, self._noise(entries, [ensemble], call._replace(sample=True)))
             ensemble = torch.cat([ensemble, std.to(ensemble.dtype) * noise.to(ensemble.dtype)], -1)
             mean = ensemble_mean(ensemble)
             now = {"ensemble": ensemble, "mean": mean, "var": ensemble_var(ensemble, mean)}

@@ -3,6 +3,7 @@ r"""Process noise of an ensemble, where the transition has none or too little of
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from tensordict import NestedKey, unravel_key
@@ -143,7 +144,7 @@ class NoisyTransition(SubModel):
                 f"The noise model writes {covariance.shape[-1]} variances in {model.out_keys[0]!r} for {size} dims; "
                 f"give it an output for each of dims={dims}."
             )
-        normal = self._noise(entries, [ensemble], call)
+        normal = cast("torch.Tensor | None", self._noise(entries, [ensemble], call))
         if normal is None:
             return ensemble
         normal = normal[..., :size]  # a point may have more numbers than its tangent
