@@ -1,10 +1,9 @@
-"""What every sub-model is: a function of tensors, with names for what it reads and what it writes."""
+"""The base class of a filter's parts: a function of tensors, with names for what it reads and what it writes."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import torch
@@ -13,7 +12,6 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf._arguments import Checked
-from torch_denkf.functional.manifolds import Space
 
 __all__ = ["EXPLAINED", "Call", "Entries", "Noise", "SubModel", "flat_noise"]
 
@@ -63,7 +61,8 @@ class SubModel(Checked, TensorDictModule):
     A sub-class declares its keys in ``__init__`` and implements :meth:`compute`. Called on a TensorDict it reads and
     writes there like any TensorDict module; a filter calls :meth:`on_entries` on a dictionary instead: it costs less.
     Noise that it finds there is used instead of fresh noise: in a filter under ``("noise", place)``, by itself under
-    ``("noise", "self")``.
+    ``("noise", "self")``. What a filter must know of a part in its role, say of an update, the classes of
+    :mod:`torch_denkf.roles` declare: derive from them.
 
     Args:
         network: the module that holds the parameters; ``torch.nn.Identity()`` if there is none.
@@ -74,23 +73,6 @@ class SubModel(Checked, TensorDictModule):
     Attributes:
         noise_names: names of the tensors that :meth:`draw_noise` draws: ``()`` for a deterministic sub-model, ``("",)``
             for one tensor without a name of its own.
-        marks: masks that the sub-model makes where it finds readings that are missing, and the masks it makes them of.
-        reading_keys: the entries that it takes a reading from: the reading, and behind it its noise.
-        observed_key: the mask that hides them, ``[*B, 1]`` or ``[*B, O]``.
-        source_keys: of what it reads, that of which it makes a reading, where the rest only informs it.
-        reads_components: whether each component of a reading counts, and is hidden, by itself.
-        joins_readings: whether it looks at several readings together, and has nothing to say without one of them.
-        judges_reading: whether it writes no reading, but what that of the module before it is worth.
-        predicted_key: what predicts that reading, ``[*B, E, O]``, which tells how many components it has.
-        noise_variance_key: the variances of its reading, which tell how many components that has.
-        mask_key: a mask that says whether the frame is observed, of one that takes in no reading itself.
-        info_prefix: prefix of its diagnostics.
-        observation_dim: O of what it writes, where it is known beforehand.
-        state_dim: S of an initial belief; on a space, the numbers of a tangent.
-        space: in which the states of an initial belief or of an analysis live; ``None`` for plain numbers.
-        reading_space: in which the reading of an analysis lives.
-        ensemble_size: E of an initial belief.
-        input_dim: size of what an initial belief reads, where that is not S.
 
     Example:
         >>> from tensordict import TensorDict
@@ -113,23 +95,6 @@ class SubModel(Checked, TensorDictModule):
 
     else:
         noise_names = ()
-    marks: Mapping[NestedKey, NestedKey] = MappingProxyType({})
-    reading_keys: Sequence[NestedKey] = ()
-    observed_key: NestedKey | None = None
-    source_keys: Sequence[NestedKey] = ()
-    reads_components: bool = False
-    joins_readings: bool = False
-    judges_reading: bool = False
-    predicted_key: NestedKey = ("forecast", "observation")
-    noise_variance_key: NestedKey | None = None
-    mask_key: NestedKey | None = None
-    info_prefix: str | None = None
-    observation_dim: int | None = None
-    state_dim: int | None = None
-    space: Space | None = None
-    reading_space: Space | None = None
-    ensemble_size: int | None = None
-    input_dim: int | None = None
     _wants: frozenset[str] = frozenset()
 
     def __init_subclass__(cls, **kwargs):
@@ -200,97 +165,10 @@ class SubModel(Checked, TensorDictModule):
         """The modules inside that may draw noise of their own, by name."""
         return {}
 
-    def reading_dims(self, entries: Entries, call: Call) -> Sequence[int]:
-        """How many numbers each of ``reading_keys`` has, where it is missing and zeros behind a mask stand for it.
-
-        By default O: ``observation_dim``, or what :attr:`predicted_key` holds. On a space the noise is of tangents.
-
-        Raises:
-            KeyError: if that is not known.
-        """
-        if self.reading_space is not None:
-            others = [self.reading_space.tangent_dim] * (len(self.reading_keys) - 1)
-            return [self.reading_space.point_dim, *others]
-        dim, predicted = self.observation_dim, entries.get(self.predicted_key)
-        if predicted is not None:
-            dim = predicted.shape[-1]
-        if dim is None:
-            raise KeyError(
-                f"{type(self).__name__} does not know how many numbers {list(self.reading_keys)} have, so that they "
-                f"cannot be left out. Hide them with their mask, {self.observed_key!r}; or let reading_dims() of "
-                f"{type(self).__name__} say it."
-            )
-        return [dim] * len(self.reading_keys)
-
     @property
     def draws(self) -> bool:
         """Whether :meth:`compute` asks for noise."""
         return "noise" in self._wants
-
-    @property
-    def updates_ensemble(self) -> bool:
-        """Whether it reads an ensemble, what its members predict of a reading, the reading, and its noise; and a mask.
-
-        Such an analysis can be given a past to correct (:meth:`move_past`).
-        """
-        keys = [unravel_key(key) for key in self.in_keys]
-        read = [unravel_key(key) for key in (self.predicted_key, *self.reading_keys)]
-        return keys[1:] == read and self.optional_keys == [self.observed_key]
-
-    def move_past(
-        self,
-        past: Tensor,
-        predicted: Tensor,
-        observation: Tensor,
-        variance: Tensor,
-        observed: Tensor | None = None,
-        *,
-        noise: Noise = None,
-    ) -> Tensor:
-        """Of an analysis of an ensemble: what a reading says of earlier states of the same members.
-
-        By default what :meth:`compute` would do to them if they were one state of L times S components, inflation and
-        the like included. Where :meth:`compute` holds anything of S components, write this method, too.
-
-        Args:
-            past: ``[*B, E, L, S]``.
-            predicted: predicted observations ``[*B, E, O]``.
-            observation: learned observations ``[*B, E, O]``, or one reading ``[*B, O]``.
-            variance: of the reading, ``[*B, O]``.
-            observed: mask ``[*B, 1]`` or ``[*B, O]``; ``None`` where all is observed.
-            noise: what :meth:`compute` was given: the same draws.
-
-        Returns:
-            The updated past, ``[*B, E, L, S]``.
-
-        Raises:
-            RuntimeError: if :meth:`compute` does not take so many components.
-        """
-        extra = {"noise": noise} if self.draws else {}
-        try:
-            out = self.by_key(self.compute(past.flatten(-2), predicted, observation, variance, observed, **extra))
-        except RuntimeError as error:
-            raise RuntimeError(
-                f"{type(self).__name__} is to correct earlier states, and its compute() fails on their "
-                f"{past.shape[-2]} times {past.shape[-1]} components: write {type(self).__name__}.move_past()."
-            ) from error
-        return out[self.out_keys[0]].unflatten(-1, past.shape[-2:])
-
-    def aligned(self, entries: Entries) -> Entries:
-        """Of an analysis: the entries with all angles on one turn, so that they can be averaged like other numbers."""
-        return entries
-
-    def on_aligned(self, entries: Entries, call: Call) -> Entries:
-        """What :meth:`on_entries` gives of entries that are :meth:`aligned` already."""
-        return self.on_entries(entries, call)
-
-    def without_step(self, entries: Entries) -> Entries:
-        """Of a transition: what it writes beside the forecast where an episode begins, and no step leads there."""
-        return {}
-
-    def of_carry(self, entries: Entries) -> Entries:
-        """Of an initial belief: what else of the belief follows from the entries that are carried on, by key."""
-        return {}
 
     def on_entries(self, entries: Entries, call: Call) -> Entries:
         """What the sub-model writes where ``entries`` are; changes nothing.

@@ -17,11 +17,12 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing.iterated import iterated_smoothing
 from torch_denkf.modules._gaussian import further_keys
 from torch_denkf.modules._spaces import checked_spaces, reading_about
-from torch_denkf.modules.carried import Beside
+from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.motion_noise import NoisyTransition
+from torch_denkf.roles import Update
 from torch_denkf.running import check_module, random_parts, run_module
 from torch_denkf.smoothers.past import moments_of
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.submodel import Call, Entries
 
 __all__ = ["IteratedAnalysis", "with_smoothed"]
 
@@ -30,7 +31,7 @@ _SMOOTHED = ("ensemble", "mean", "var", "age")
 
 def with_smoothed(
     initial: TensorDictModuleBase, *, belief_prefix: str = "belief", smoothed_prefix: str = "smoothed"
-) -> Beside:
+) -> AugmentedBelief:
     """An initial belief that is also what is believed of the state before it.
 
     Args:
@@ -45,7 +46,7 @@ def with_smoothed(
         >>> start(TensorDict({}))["smoothed", "age"]
         tensor([0])
     """
-    return Beside(initial, [(smoothed_prefix, name) for name in _SMOOTHED], partial(_twice, belief_prefix))
+    return AugmentedBelief(initial, [(smoothed_prefix, name) for name in _SMOOTHED], partial(_twice, belief_prefix))
 
 
 def _twice(prefix: str, belief: Entries, batch_size: torch.Size) -> list[torch.Tensor]:
@@ -53,7 +54,7 @@ def _twice(prefix: str, belief: Entries, batch_size: torch.Size) -> list[torch.T
     return [*same, torch.zeros(*batch_size, 1, dtype=torch.int64, device=same[0].device)]
 
 
-class IteratedAnalysis(SubModel):
+class IteratedAnalysis(Update):
     r"""Finds from where the reading says that the last step began, and makes the step anew from there.
 
     Gauss-Newton steps in the space of the members, each with a run of transition and observation; see

@@ -53,7 +53,8 @@ from torch_denkf.filters.refusals import (
 from torch_denkf.filters.scan import Steps, where_rows
 from torch_denkf.filters.structure import KNOWN, Structure, previous_key, sequences_in, submodels
 from torch_denkf.modules._summaries import summaries
-from torch_denkf.running import check_module, declared, named_modules_of, reads, run_module
+from torch_denkf.roles import Initial, Transition, Update, role
+from torch_denkf.running import check_module, named_modules_of, reads, run_module
 from torch_denkf.submodel import Call, Entries, flat_noise
 
 __all__ = ["Filter"]
@@ -220,8 +221,8 @@ class Filter(Checked, TensorDictSequential):
         except AttributeError:
             names = [name for name, _ in named_modules_of(self)]
             raise KeyError(f"{type(self).__name__} has no module at {place!r}; it has {names}.") from None
-        mask = declared(old).observed_key
-        other = declared(module).observed_key
+        mask = role(old, Update).observed_key
+        other = role(module, Update).observed_key
         if None not in (mask, other) and mask not in chain(*reads(module)):
             self.messages.once(
                 f"mask of {place!r}",
@@ -308,7 +309,7 @@ class Filter(Checked, TensorDictSequential):
         Like :meth:`torchrl.modules.LSTMModule.make_tensordict_primer`; where actions drive the filter, it also brings
         the last action (:class:`torch_denkf.transforms.LastAction`).
         """
-        told, like = declared(self.initial), self.like()
+        told, like = role(self.initial, Initial), self.like()
         like = torch.zeros(()) if like is None else like
         size = told.input_dim or told.state_dim or 1
         zeros = torch.zeros(size, dtype=like.dtype, device=like.device)
@@ -442,7 +443,8 @@ class Filter(Checked, TensorDictSequential):
         refuse_nameless_readings(self.structure)
         tensordict = self.of_one_robot(tensordict)
         hidden = tensordict.copy()
-        for key in dict.fromkeys(part.mask_key for part in submodels(self.module) if part.mask_key is not None):
+        masks = (role(part, Transition).mask_key for part in submodels(self.module))
+        for key in dict.fromkeys(mask for mask in masks if mask is not None):
             hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=tensordict.device))
         out = self.step(hidden, without=self.structure.readings)
         written = [key for key in self.out_keys if out.get(key, None) is not None]

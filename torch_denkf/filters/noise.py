@@ -10,7 +10,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_denkf.filters.structure import Placed, Structure
-from torch_denkf.running import declared, random_parts
+from torch_denkf.roles import Initial, Update, role
+from torch_denkf.running import random_parts
 from torch_denkf.submodel import Entries, SubModel, flat_noise
 
 __all__ = ["draw_noise"]
@@ -79,7 +80,7 @@ def _sizes(structure: Structure, initial: TensorDictModuleBase, entries: Entries
         if key[-1] == "ensemble" and key in entries:
             members, state_dim = entries[key].shape[-2:]
             return members, state_dim
-    told = declared(initial)
+    told = role(initial, Initial)
     return told.ensemble_size, told.state_dim
 
 
@@ -89,11 +90,11 @@ def _observation_dim(structure: Structure, part: SubModel, entries: Entries) -> 
     A sub-model that does not name the entry of its variances is told where all that is known of what it reads agrees.
     """
     known = structure.observation_dims
-    key = part.noise_variance_key
+    key = role(part, Update).noise_variance_key
     if key is not None:
         return entries[key].shape[-1] if key in entries else known.get(key)
     found = {known[key] for key in map(unravel_key, part.in_keys) if key in known}
-    found |= {entries[key].shape[-1] for key in map(unravel_key, part.reading_keys) if key in entries}
+    found |= {entries[key].shape[-1] for key in map(unravel_key, role(part, Update).reading_keys) if key in entries}
     return found.pop() if len(found) == 1 else None
 
 

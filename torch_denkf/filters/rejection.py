@@ -13,7 +13,8 @@ from tensordict import NestedKey, unravel_key
 from torch import Tensor
 
 from torch_denkf._checks import check_mask
-from torch_denkf.submodel import Entries, SubModel
+from torch_denkf.roles import Update
+from torch_denkf.submodel import Entries
 
 __all__ = ["LARGEST_READING", "REJECTED", "Guard", "guards_of", "rejected_keys", "usable"]
 
@@ -39,7 +40,7 @@ class Guard(NamedTuple):
 
 
 def guards_of(
-    parts: Iterable[SubModel],
+    parts: Iterable[Update],
     sources: Mapping[NestedKey, Sequence[NestedKey]],
     made_of: Mapping[NestedKey, NestedKey],
 ) -> tuple[Guard, ...]:
@@ -50,7 +51,7 @@ def guards_of(
         sources: the entries from outside that each reading is made of.
         made_of: the mask from outside, of a mask that a module makes of it.
     """
-    readers: dict[NestedKey, list[SubModel]] = {}
+    readers: dict[NestedKey, list[Update]] = {}
     for part in parts:
         mask = part.observed_key
         if mask is not None and part.reading_keys:
@@ -72,7 +73,7 @@ def guards_of(
     return tuple(guards)
 
 
-def _direct(part: SubModel, sources: Mapping[NestedKey, Sequence[NestedKey]]) -> frozenset[NestedKey]:
+def _direct(part: Update, sources: Mapping[NestedKey, Sequence[NestedKey]]) -> frozenset[NestedKey]:
     """The readings that come from outside as they are; all readings, where a module makes them."""
     keys = [unravel_key(key) for key in part.reading_keys]
     return frozenset([key for key in keys if key in sources.get(key, ())] or keys)

@@ -14,8 +14,9 @@ from torch import Tensor
 from torch_denkf.filters.rejection import REJECTED, usable
 from torch_denkf.filters.structure import RESUMES, Placed, Structure, previous_key, takes_reading
 from torch_denkf.modules._held import hold_variances
+from torch_denkf.roles import Transition, Update, role
 from torch_denkf.running import is_sequence, named_modules_of, run_module
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.submodel import Call, Entries
 
 __all__ = ["Steps", "where_rows"]
 
@@ -161,8 +162,8 @@ class Steps(NamedTuple):
         if structure.beside and in_sequence:  # their shapes follow from a step out of the start
             out = self.run((structure.transition,), dict(entries), call)
             forecast |= {key: torch.zeros_like(out[key]) for key in structure.beside}
-        elif structure.beside and isinstance(structure.transition[1], SubModel):
-            forecast |= structure.transition[1].without_step(entries)
+        elif structure.beside:
+            forecast |= role(structure.transition[1], Transition).without_step(entries)
         every = torch.ones(*call.batch_size, 1, dtype=torch.bool, device=next(iter(start.values())).device)
         return self.step(entries, call, frames=False, reset=every, start=start, forecast=forecast, missing=missing)
 
@@ -245,7 +246,7 @@ def _refuse_groups(structure: Structure, key: NestedKey, entries: Entries, batch
         )
 
 
-def _hidden(module: SubModel, entries: Entries, call: Call) -> Entries:
+def _hidden(module: Update, entries: Entries, call: Call) -> Entries:
     """The entries with ones in the place of readings that are missing, and a mask that hides them."""
     like = next(entries[key] for key in module.in_keys if key in entries)
     dims = zip(module.reading_keys, module.reading_dims(entries, call), strict=True)

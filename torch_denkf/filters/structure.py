@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
-from typing import NamedTuple, TypeGuard
+from typing import NamedTuple, TypeGuard, TypeVar
 
 import torch
 from tensordict import NestedKey, unravel_key
@@ -12,8 +12,8 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters.rejection import Guard, guards_of
 from torch_denkf.functional.manifolds import Space
+from torch_denkf.roles import Initial, Sensor, Update, role
 from torch_denkf.running import (
-    declared,
     in_sequences,
     is_sequence,
     marks_of,
@@ -34,6 +34,7 @@ KNOWN = ("previous", "known")
 #: Whether an element of a sequence begins with the belief that is stored before it.
 RESUMES = ("previous", "resumes")
 _SUMMARIES = ("mean", "var", "cov")
+R = TypeVar("R", bound=SubModel)
 
 
 def previous_key(key: NestedKey) -> tuple[str, ...]:
@@ -41,14 +42,14 @@ def previous_key(key: NestedKey) -> tuple[str, ...]:
     return ("previous", key) if isinstance(key, str) else ("previous", *key)
 
 
-def submodels(module: torch.nn.Module) -> list[SubModel]:
-    """Returns the sub-models inside ``module``, also those inside others."""
-    return [part for part in module.modules() if isinstance(part, SubModel)]
+def submodels(module: torch.nn.Module, kind: type[R] = SubModel) -> list[R]:  # type: ignore[assignment]
+    """Returns the sub-models inside ``module`` in the role ``kind``, also those inside others."""
+    return [part for part in module.modules() if isinstance(part, kind)]
 
 
-def takes_reading(module: TensorDictModuleBase) -> TypeGuard[SubModel]:
+def takes_reading(module: TensorDictModuleBase) -> TypeGuard[Update]:
     """Whether a module takes in a reading, and heeds a mask that hides it."""
-    return isinstance(module, SubModel) and bool(module.reading_keys) and module.observed_key is not None
+    return isinstance(module, Update) and bool(module.reading_keys) and module.observed_key is not None
 
 
 def sequences_in(sequence: TensorDictSequential) -> Iterator[TensorDictSequential]:
@@ -117,7 +118,7 @@ class Structure(NamedTuple):
 
     def readers(self, key: NestedKey) -> list[TensorDictModuleBase]:
         """The sub-models of the update that take in a reading that is made of the entry ``key``."""
-        parts = [part for _, module in self.update for part in submodels(module)]
+        parts = [part for _, module in self.update for part in submodels(module, Update)]
         direct = [part for part in parts if key in map(unravel_key, part.reading_keys)]
         return direct or [part for part in parts if part.reading_keys]
 
@@ -205,7 +206,7 @@ class Structure(NamedTuple):
             unmasked=tuple(_unmasked(steps, carry)),
             own_info=own_info,
             totals=totals,
-            space=declared(initial).space,
+            space=role(initial, Initial).space,
             likelihoods=tuple(_likelihoods(steps, own_info, totals)),
             frame_keys=tuple(dict.fromkeys(key for _, module in frames for key in writes(module))),
             step_keys=step_keys,
@@ -312,7 +313,7 @@ def _observation_dims(modules: Sequence[Placed]) -> dict[NestedKey, int]:
     sizes: dict[NestedKey, set[int]] = {}
     for _, module in modules:
         for part in submodels(module):
-            own = [part] if part.observation_dim is not None else submodels(part)
+            own = [part] if role(part, Sensor).observation_dim is not None else submodels(part, Sensor)
             found = {inner.observation_dim for inner in own if inner.observation_dim is not None}
             for key in map(unravel_key, part.out_keys):
                 sizes.setdefault(key, set()).update(found)
@@ -323,7 +324,7 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
     """The entries from outside of which the analyses' readings are made, through whatever sensors."""
     found: dict[NestedKey, None] = {}
     for _, module in update:
-        for part in submodels(module):
+        for part in submodels(module, Update):
             found.update(dict.fromkeys(map(unravel_key, part.reading_keys)))
     for _, module in reversed([*frames, *update]):
         if not found.keys().isdisjoint(writes(module)):
@@ -335,7 +336,7 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
 def _plain(update: Sequence[Placed], needed: Sequence[NestedKey]) -> Iterator[NestedKey]:
     """The readings that come from outside as they are; of an analysis they stand in front of their noise."""
     for _, module in update:
-        for part in submodels(module):
+        for part in submodels(module, Update):
             first = [unravel_key(key) for key in part.reading_keys[:1]]
             yield from (key for key in first if key in needed)
 
@@ -344,19 +345,19 @@ def _guards(
     frames: Sequence[Placed], update: Sequence[Placed], needed: Sequence[NestedKey], initial: TensorDictModuleBase
 ) -> tuple[Guard, ...]:
     """What each mask hides, of the entries from outside that the readings are made of."""
-    parts = [part for module in (*(module for _, module in update), initial) for part in submodels(module)]
+    parts = [part for module in (*(module for _, module in update), initial) for part in submodels(module, Update)]
     made_by_steps = {key for _, module in update for key in writes(module)}
     sources: dict[NestedKey, list[NestedKey]] = {}
     for key in {unravel_key(key) for part in parts for key in part.reading_keys}:
         found = {key: None}
         for _, module in reversed([*frames, *update]):
             if not found.keys().isdisjoint(writes(module)):
-                found.update(dict.fromkeys(declared(module).source_keys or reads(module)[0]))
+                found.update(dict.fromkeys(getattr(module, "source_keys", None) or reads(module)[0]))
         sources[key] = [source for source in found if source in needed and source not in made_by_steps]
     return guards_of(_in_front(parts, sources), sources, _made_of(frames, parts))
 
 
-def _made_of(frames: Sequence[Placed], parts: Sequence[SubModel]) -> dict[NestedKey, NestedKey]:
+def _made_of(frames: Sequence[Placed], parts: Sequence[Update]) -> dict[NestedKey, NestedKey]:
     """The mask that each mask is made of, where a part reads one and writes another: hidden is what the first hides."""
     masks = {unravel_key(part.observed_key) for part in parts if part.observed_key is not None}
     found = {made: given for _, module in frames for made, given in marks_of(module).items()}
@@ -367,12 +368,12 @@ def _made_of(frames: Sequence[Placed], parts: Sequence[SubModel]) -> dict[Nested
     return found
 
 
-def _in_front(parts: Sequence[SubModel], sources: Mapping[NestedKey, Sequence[NestedKey]]) -> list[SubModel]:
+def _in_front(parts: Sequence[Update], sources: Mapping[NestedKey, Sequence[NestedKey]]) -> list[Update]:
     """The parts but for those whose mask another part makes, if others hide the same entries where they come in."""
     made = {key for part in parts for key in writes(part) if key != part.observed_key}
     first = [part for part in parts if part.observed_key not in made]
 
-    def hidden(some: Sequence[SubModel]) -> set[NestedKey]:
+    def hidden(some: Sequence[Update]) -> set[NestedKey]:
         keys = (unravel_key(key) for part in some for key in part.reading_keys)
         return {source for key in keys for source in sources[key]}
 
@@ -390,14 +391,14 @@ def _unmasked(steps: Sequence[Placed], carry: Sequence[NestedKey]) -> Iterator[P
         for part in in_sequences(module):
             must, may = reads(part)
             updates = not made.issuperset(must) and not set(carry).isdisjoint(writes(part))
-            if not may and (updates or declared(part).reading_keys):
+            if not may and (updates or role(part, Update).reading_keys):
                 yield place, part
 
 
 def _refuse_overwriting(modules: Sequence[Placed]) -> None:
     """Raises where all that a module writes is written again before anybody has read it."""
     for index, (place, module) in enumerate(modules):
-        info = declared(module).info_prefix
+        info = role(module, Update).info_prefix
         unread = {key for key in writes(module) if info is None or key[0] != info}
         used = False
         for other_place, other in modules[index + 1 :]:
@@ -416,7 +417,7 @@ def _refuse_unused(steps: Sequence[Placed], belief: Sequence[NestedKey]) -> None
     """Raises where nobody uses what an analysis writes: its reading would be lost."""
     used = set(belief)
     for place, module in reversed(steps[1:]):
-        info = declared(module).info_prefix
+        info = role(module, Update).info_prefix
         made = [key for key in writes(module) if info is None or key[0] != info]
         if made and takes_reading(module) and used.isdisjoint(made):
             raise ValueError(
@@ -442,7 +443,7 @@ def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey
     writers: dict[str, list[Placed]] = {}
     for place, module in steps:
         for part in in_sequences(module):
-            info = declared(part).info_prefix
+            info = role(part, Update).info_prefix
             if info is not None:
                 writers.setdefault(info, []).append((place, part))
     own_info: dict[str, dict[NestedKey, NestedKey]] = {}
@@ -471,6 +472,6 @@ def _likelihoods(steps: Sequence[Placed], own_info: Mapping, totals: Mapping) ->
     for place, module in steps:
         for part in in_sequences(module):
             for key in writes(part):
-                if key[0] == declared(part).info_prefix and key[-1] == "log_likelihood":
+                if key[0] == role(part, Update).info_prefix and key[-1] == "log_likelihood":
                     found.append(key if key in totals else own_info.get(place, {}).get(key, key))
     return list(dict.fromkeys(found))

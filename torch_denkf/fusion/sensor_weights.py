@@ -15,8 +15,8 @@ from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.fusion.parts import StateObservation
 from torch_denkf.modules._tensors import mean_of_members
+from torch_denkf.roles import Sensor
 from torch_denkf.running import reads
-from torch_denkf.submodel import SubModel
 
 __all__ = ["SensorAttention", "SensorWeights", "WeightedNoise"]
 
@@ -129,7 +129,7 @@ class SensorAttention(nn.Module):
         return self.floor + (1 - self.floor) * (score + 4).sigmoid()
 
 
-class SensorWeights(SubModel):
+class SensorWeights(Sensor):
     """The weights of all sensors in the forecast, before any of them corrects it.
 
     :class:`torch_denkf.fusion.FusedFilter` makes it.
@@ -206,7 +206,7 @@ class SensorWeights(SubModel):
         return self.by_key(self.module["network"](innovations, torch.stack(seen, -1), features).split(1, -1))
 
 
-class WeightedNoise(SubModel):
+class WeightedNoise(Sensor):
     """A sensor's noise, divided by the sensor's weight.
 
     Args:

@@ -15,7 +15,8 @@ from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._spaces import checked_spaces
 from torch_denkf.modules._tensors import check_dims
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.roles import Update
+from torch_denkf.submodel import Call, Entries
 
 __all__ = ["EnsembleAnalysisKeys", "EnsembleUpdate"]
 
@@ -46,7 +47,7 @@ class EnsembleAnalysisKeys(TypedDict, total=False):
     info_prefix: str
 
 
-class EnsembleUpdate(SubModel):
+class EnsembleUpdate(Update):
     """Reads a forecast ensemble, its predicted observations and a reading, writes the belief and the diagnostics.
 
     Args:

@@ -17,7 +17,8 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._spaces import checked_space, checked_spaces, without_hidden
 from torch_denkf.modules._tensors import check_dims
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
-from torch_denkf.running import check_module, reads, run_module
+from torch_denkf.roles import Transition, Update
+from torch_denkf.running import check_module, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, SubModel
 
 _DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
@@ -42,7 +43,7 @@ class GaussianTransitionKeys(TypedDict, total=False):
     space: Space | None
 
 
-class GaussianTransition(SubModel):
+class GaussianTransition(Transition):
     """Forecasts mean and covariance through a transition of ensembles; a subclass writes :meth:`_forecast`.
 
     Args:
@@ -144,7 +145,7 @@ class GaussianAnalysisOptions(TypedDict, total=False):
     predicted_key: NestedKey
 
 
-class GaussianAnalysis(SubModel):
+class GaussianAnalysis(Update):
     """Updates mean and covariance through an observation model of ensembles; a subclass writes :meth:`_update`.
 
     Args:
@@ -227,9 +228,13 @@ class GaussianAnalysis(SubModel):
         size = self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[0].shape[-1]
         return [size, size if self.reading_space is None else self.reading_space.tangent_dim]
 
-    def mask(self, entries: Entries, mean: torch.Tensor, call: Call) -> torch.Tensor | None:
-        """What is observed, ``[*B, 1]`` or ``[*B, O]``, as the model says that the analysis runs inside."""
-        return self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[1]
+    def with_mask(self, entries, call):
+        """Returns the entries with the mask, where the observation model makes it."""
+        if self.observed_key not in writes(self.module):
+            return entries
+        mean = self.required(entries, self.in_keys[0])
+        mask = self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[1]
+        return entries if mask is None else {**entries, self.observed_key: mask}
 
     def _update(
         self, entries: Entries, mean, cov, observation, noise, call: Call

@@ -11,8 +11,8 @@ from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules._spaces import moments_on
-from torch_denkf.running import declared
-from torch_denkf.submodel import Entries, SubModel
+from torch_denkf.roles import Initial, role
+from torch_denkf.submodel import Entries
 
 __all__ = ["summaries"]
 
@@ -37,14 +37,14 @@ def summaries(
     """
     out = dict(entries)
     missing = [key for key in belief if key not in out]
-    of_past = initial.of_carry(out) if missing and isinstance(initial, SubModel) else {}
+    derived = role(initial, Initial).derived(out) if missing else {}
     for key in missing:
         prefix, name = key[:-1], key[-1]
         ensemble, weights = out.get((*prefix, "ensemble")), out.get((*prefix, "log_weight"))
         cov = out.get((*prefix, "cov"))
-        space = declared(initial).space
-        if key in of_past:
-            out[key] = of_past[key]
+        space = role(initial, Initial).space
+        if key in derived:
+            out[key] = derived[key]
         elif ensemble is not None and space is not None and name in _OF_PARTICLES:
             out[key] = moments_on(space, ensemble, weights)[name == "var"]
         elif ensemble is not None and weights is not None and name in _OF_PARTICLES:

@@ -173,7 +173,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         return factor
 
     def move_past(self, past, predicted, observation, variance, observed=None, *, noise=None):
-        """See :meth:`SubModel.move_past`; neither inflation nor relaxation touches the past."""
+        """See :meth:`Update.move_past`; neither inflation nor relaxation touches the past."""
         if self.reading_space is not None:
             predicted, observation = reading_about(self.reading_space, predicted, observation, observed)
         center = None

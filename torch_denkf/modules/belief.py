@@ -20,12 +20,12 @@ from torch_denkf.modules._tensors import (
     mean_of_members,
     register_location,
 )
-from torch_denkf.submodel import SubModel
+from torch_denkf.roles import Initial, Update
 
 __all__ = ["AroundState", "FromSensor", "GaussianPrior"]
 
 
-class _InitialEnsemble(SubModel):
+class _InitialEnsemble(Initial):
     """Draws ``center + std * N(0, I)`` and writes ensemble, mean and variance of the belief."""
 
     def __init__(
@@ -146,7 +146,7 @@ class AroundState(_InitialEnsemble):
         return self._members(state.to(self.std.dtype), self.std, noise, batch_size)
 
 
-class FromSensor(_InitialEnsemble):
+class FromSensor(_InitialEnsemble, Update):
     """A belief from the first sensor reading: observed dimensions N(mean reading, R), the others a Gaussian prior.
 
     Where nothing is observed at reset, the prior alone is used, as with ``filter.initialise(..., without=[...])``.
@@ -190,7 +190,7 @@ class FromSensor(_InitialEnsemble):
         register_location(self, "mean", mean)
         check_dims("dims", dims, once=True, size=self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
-        self.observation_dim = self.input_dim = len(self.dims)
+        self.input_dim = len(self.dims)
         self.reading_keys, self.observed_key = self.in_keys, unravel_key(observed_key)
 
     def on_entries(self, entries, call):

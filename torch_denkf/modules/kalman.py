@@ -17,13 +17,14 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._gaussian import as_covariance, further_keys, updated
 from torch_denkf.modules._spaces import checked_space
 from torch_denkf.modules._tensors import as_standard_deviations, check_dims, register_constant
+from torch_denkf.roles import Initial, Transition, Update
 from torch_denkf.running import run_module
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.submodel import Call, Entries
 
 __all__ = ["GaussianAround", "KalmanAnalysis", "LinearTransition", "MomentPrior"]
 
 
-class MomentPrior(SubModel):
+class MomentPrior(Initial):
     """A Gaussian belief given by its moments, the same for every episode.
 
     Args:
@@ -62,7 +63,7 @@ class MomentPrior(SubModel):
         return tuple(value.expand(*batch_size, *value.shape) for value in values)
 
 
-class GaussianAround(SubModel):
+class GaussianAround(Initial):
     """A Gaussian belief around a state that is known at reset, e.g. the ground truth of a data set.
 
     Like :class:`~torch_denkf.modules.AroundState`, for filters with a mean and a covariance.
@@ -108,7 +109,7 @@ class GaussianAround(SubModel):
         return mean, variance.diag_embed(), variance
 
 
-class LinearTransition(SubModel):
+class LinearTransition(Transition):
     r"""Forecast of mean and covariance, :math:`F m + B a` and :math:`F P F^T + Q`.
 
     Args:
@@ -187,7 +188,7 @@ class LinearTransition(SubModel):
         return {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}, cross
 
 
-class KalmanAnalysis(SubModel):
+class KalmanAnalysis(Update):
     """The Kalman update of mean and covariance (Joseph form).
 
     Args:

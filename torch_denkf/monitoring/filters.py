@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters.base import Filter
 from torch_denkf.fusion.parts import StateObservation
-from torch_denkf.modules.carried import with_state
+from torch_denkf.modules.around import with_state
 from torch_denkf.monitoring.gate import GatedAnalysis, GateOptions, can_be_gated
 from torch_denkf.monitoring.monitor import InnovationMonitor
 from torch_denkf.running import check_module, is_sequence, named_modules_of
