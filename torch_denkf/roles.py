@@ -219,4 +219,4 @@ def role(module: object, kind: type[R]) -> R:
         >>> print(role(TensorDictModule(nn.Linear(2, 1), ["x"], ["y"]), Update).info_prefix)
         None
     """
-    return module if isinstance(module, kind) else _DEFAULTS[kind]  # type: ignore[return-value]
+    return module if isinstance(module, kind) else _DEFAULTS[kind]

@@ -51,7 +51,7 @@ from torch_denkf.filters.refusals import (
     refuse_unknown_readings,
 )
 from torch_denkf.filters.scan import Steps, where_rows
-from torch_denkf.filters.structure import KNOWN, Structure, previous_key, sequences_in, submodels
+from torch_denkf.filters.structure import KNOWN, Structure, in_role, previous_key, sequences_in
 from torch_denkf.modules._summaries import summaries
 from torch_denkf.roles import Initial, Transition, Update, role
 from torch_denkf.running import check_module, named_modules_of, reads, run_module
@@ -443,7 +443,7 @@ class Filter(Checked, TensorDictSequential):
         refuse_nameless_readings(self.structure)
         tensordict = self.of_one_robot(tensordict)
         hidden = tensordict.copy()
-        masks = (role(part, Transition).mask_key for part in submodels(self.module))
+        masks = (part.mask_key for part in in_role(self.module, Transition))
         for key in dict.fromkeys(mask for mask in masks if mask is not None):
             hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=tensordict.device))
         out = self.step(hidden, without=self.structure.readings)

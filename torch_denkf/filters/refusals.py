@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
-from torch_denkf.filters.structure import Placed, Structure, previous_key, submodels, takes_reading
+from torch_denkf.filters.structure import Placed, Structure, in_role, previous_key, takes_reading
 from torch_denkf.roles import Sensor, Update, role
 from torch_denkf.running import in_sequences, random_parts, writes
 from torch_denkf.submodel import Entries
@@ -137,7 +137,7 @@ def refuse_nameless_readings(structure: Structure) -> None:
 
 def refuse_single_readings(structure: Structure, without: Sequence[NestedKey]) -> None:
     """Raises a ``ValueError`` where some readings are to be left out, not all, of those that a module joins."""
-    joined = any(role(part, Sensor).joins_readings for _, module in structure.modules for part in submodels(module))
+    joined = any(part.joins_readings for _, module in structure.modules for part in in_role(module, Sensor))
     if joined and without and set(without) != set(structure.readings):
         raise ValueError(
             f"Where readings are looked at together, step(without={list(without)}) cannot leave out single ones: "

@@ -24,7 +24,7 @@ from torch_denkf.running import (
 )
 from torch_denkf.submodel import SubModel
 
-__all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "previous_key", "sequences_in", "submodels"]
+__all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "in_role", "previous_key", "sequences_in", "submodels"]
 
 #: A module and its place in the filter, which names its noise.
 Placed = tuple[str, TensorDictModuleBase]
@@ -42,8 +42,13 @@ def previous_key(key: NestedKey) -> tuple[str, ...]:
     return ("previous", key) if isinstance(key, str) else ("previous", *key)
 
 
-def submodels(module: torch.nn.Module, kind: type[R] = SubModel) -> list[R]:  # type: ignore[assignment]
-    """Returns the sub-models inside ``module`` in the role ``kind``, also those inside others."""
+def submodels(module: torch.nn.Module) -> list[SubModel]:
+    """Returns the sub-models inside ``module``, also those inside others."""
+    return in_role(module, SubModel)
+
+
+def in_role(module: torch.nn.Module, kind: type[R]) -> list[R]:
+    """Returns the sub-models of a role inside ``module``, also those inside others."""
     return [part for part in module.modules() if isinstance(part, kind)]
 
 
@@ -118,7 +123,7 @@ class Structure(NamedTuple):
 
     def readers(self, key: NestedKey) -> list[TensorDictModuleBase]:
         """The sub-models of the update that take in a reading that is made of the entry ``key``."""
-        parts = [part for _, module in self.update for part in submodels(module, Update)]
+        parts = [part for _, module in self.update for part in in_role(module, Update)]
         direct = [part for part in parts if key in map(unravel_key, part.reading_keys)]
         return direct or [part for part in parts if part.reading_keys]
 
@@ -313,7 +318,7 @@ def _observation_dims(modules: Sequence[Placed]) -> dict[NestedKey, int]:
     sizes: dict[NestedKey, set[int]] = {}
     for _, module in modules:
         for part in submodels(module):
-            own = [part] if role(part, Sensor).observation_dim is not None else submodels(part, Sensor)
+            own = [part] if role(part, Sensor).observation_dim is not None else in_role(part, Sensor)
             found = {inner.observation_dim for inner in own if inner.observation_dim is not None}
             for key in map(unravel_key, part.out_keys):
                 sizes.setdefault(key, set()).update(found)
@@ -324,7 +329,7 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
     """The entries from outside of which the analyses' readings are made, through whatever sensors."""
     found: dict[NestedKey, None] = {}
     for _, module in update:
-        for part in submodels(module, Update):
+        for part in in_role(module, Update):
             found.update(dict.fromkeys(map(unravel_key, part.reading_keys)))
     for _, module in reversed([*frames, *update]):
         if not found.keys().isdisjoint(writes(module)):
@@ -336,7 +341,7 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
 def _plain(update: Sequence[Placed], needed: Sequence[NestedKey]) -> Iterator[NestedKey]:
     """The readings that come from outside as they are; of an analysis they stand in front of their noise."""
     for _, module in update:
-        for part in submodels(module, Update):
+        for part in in_role(module, Update):
             first = [unravel_key(key) for key in part.reading_keys[:1]]
             yield from (key for key in first if key in needed)
 
@@ -345,7 +350,8 @@ def _guards(
     frames: Sequence[Placed], update: Sequence[Placed], needed: Sequence[NestedKey], initial: TensorDictModuleBase
 ) -> tuple[Guard, ...]:
     """What each mask hides, of the entries from outside that the readings are made of."""
-    parts = [part for module in (*(module for _, module in update), initial) for part in submodels(module, Update)]
+    every = [part for module in (*(module for _, module in update), initial) for part in submodels(module)]
+    parts = [part for part in every if isinstance(part, Update)]
     made_by_steps = {key for _, module in update for key in writes(module)}
     sources: dict[NestedKey, list[NestedKey]] = {}
     for key in {unravel_key(key) for part in parts for key in part.reading_keys}:
@@ -354,7 +360,7 @@ def _guards(
             if not found.keys().isdisjoint(writes(module)):
                 found.update(dict.fromkeys(getattr(module, "source_keys", None) or reads(module)[0]))
         sources[key] = [source for source in found if source in needed and source not in made_by_steps]
-    return guards_of(_in_front(parts, sources), sources, _made_of(frames, parts))
+    return guards_of(_in_front(every, parts, sources), sources, _made_of(frames, parts))
 
 
 def _made_of(frames: Sequence[Placed], parts: Sequence[Update]) -> dict[NestedKey, NestedKey]:
@@ -368,9 +374,11 @@ def _made_of(frames: Sequence[Placed], parts: Sequence[Update]) -> dict[NestedKe
     return found
 
 
-def _in_front(parts: Sequence[Update], sources: Mapping[NestedKey, Sequence[NestedKey]]) -> list[Update]:
+def _in_front(
+    every: Sequence[SubModel], parts: Sequence[Update], sources: Mapping[NestedKey, Sequence[NestedKey]]
+) -> list[Update]:
     """The parts but for those whose mask another part makes, if others hide the same entries where they come in."""
-    made = {key for part in parts for key in writes(part) if key != part.observed_key}
+    made = {key for part in every for key in writes(part) if key != role(part, Update).observed_key}
     first = [part for part in parts if part.observed_key not in made]
 
     def hidden(some: Sequence[Update]) -> set[NestedKey]:
