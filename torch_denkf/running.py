@@ -10,8 +10,7 @@ from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
-from torch_denkf.roles import Sensor, role
-from torch_denkf.submodel import EXPLAINED, Call, Entries, SubModel
+from torch_denkf.submodel import EXPLAINED, Call, Entries, Sensor, SubModel, role
 
 __all__ = [
     "check_module",

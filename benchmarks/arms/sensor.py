@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from benchmarks.arms.arms import SIDE, Arm
 from torch_denkf import modules as m
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.roles import Sensor
+from torch_denkf.submodel import Sensor
 
 PIXELS = 0.25, 0.1  # mean and standard deviation of a pixel
 CELLS = SIDE // 2  # of a map, along a side

@@ -15,7 +15,7 @@ from torch_denkf.functional.manifolds import SO3, Space, rotate
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select, SubModel
 from torch_denkf.motions import AttitudeMotion, Gravity, InertialMotion, Magnetic
 from torch_denkf.motions.motion import Motion
-from torch_denkf.roles import Sensor
+from torch_denkf.submodel import Sensor
 
 __all__ = ["GivenNoise", "VelocityInBody", "attitude_filter", "inertial_filter", "prepared"]
 

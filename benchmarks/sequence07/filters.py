@@ -24,7 +24,7 @@ from torch_denkf.modules import (
 )
 from torch_denkf.monitoring import Gated
 from torch_denkf.motions.motion import Motion
-from torch_denkf.roles import Sensor
+from torch_denkf.submodel import Sensor
 
 __all__ = ["DT", "POSE", "SPACE", "car_filter", "pose_of", "prepared"]
 

@@ -14,8 +14,8 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules import NoisyTransition, as_process_noise
-from torch_denkf.roles import Initial, role
 from torch_denkf.running import check_module
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["IEnKS"]
 

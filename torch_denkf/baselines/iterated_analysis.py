@@ -19,10 +19,9 @@ from torch_denkf.modules._gaussian import further_keys
 from torch_denkf.modules._spaces import checked_spaces, reading_about
 from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.motion_noise import NoisyTransition
-from torch_denkf.roles import Update
 from torch_denkf.running import check_module, random_parts, run_module
 from torch_denkf.smoothers.past import moments_of
-from torch_denkf.submodel import Call, Entries
+from torch_denkf.submodel import Call, Entries, Update
 
 __all__ = ["IteratedAnalysis", "with_smoothed"]
 

@@ -19,8 +19,7 @@ from torchrl.modules import LSTMCell
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.modules._tensors import as_vector, mean_of_members
 from torch_denkf.modules.around import AugmentedBelief
-from torch_denkf.roles import Transition, Update
-from torch_denkf.submodel import Entries
+from torch_denkf.submodel import Entries, Transition, Update
 
 __all__ = ["LSTMTransition", "LSTMUpdate", "with_memory"]
 

@@ -14,8 +14,8 @@ from torch_denkf.functional import ensemble_mean, kalman_update
 from torch_denkf.functional.gaussian import GaussianUpdate
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean
-from torch_denkf.roles import Update, role
 from torch_denkf.running import in_sequences, random_parts, reads
+from torch_denkf.submodel import Update, role
 
 __all__ = ["check_analysis"]
 

@@ -14,8 +14,8 @@ from torch_denkf.filters.options import FilterOptions
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.imperfect import Visibility
 from torch_denkf.imperfect.visible import heeding
-from torch_denkf.roles import Initial, role
 from torch_denkf.running import check_module
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]
 

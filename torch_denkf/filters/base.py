@@ -53,9 +53,8 @@ from torch_denkf.filters.refusals import (
 from torch_denkf.filters.scan import Steps, where_rows
 from torch_denkf.filters.structure import KNOWN, Structure, in_role, previous_key, sequences_in
 from torch_denkf.modules._summaries import summaries
-from torch_denkf.roles import Initial, Transition, Update, role
 from torch_denkf.running import check_module, named_modules_of, reads, run_module
-from torch_denkf.submodel import Call, Entries, flat_noise
+from torch_denkf.submodel import Call, Entries, Initial, Transition, Update, flat_noise, role
 
 __all__ = ["Filter"]
 

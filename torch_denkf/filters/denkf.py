@@ -29,8 +29,8 @@ from torch_denkf.modules import (
     StochasticMLP,
     as_process_noise,
 )
-from torch_denkf.roles import Initial, Update, role
 from torch_denkf.running import check_module, reading_of
+from torch_denkf.submodel import Initial, Update, role
 
 __all__ = ["DEnKF"]
 

@@ -10,9 +10,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_denkf.filters.structure import Placed, Structure
-from torch_denkf.roles import Initial, Update, role
 from torch_denkf.running import random_parts
-from torch_denkf.submodel import Entries, SubModel, flat_noise
+from torch_denkf.submodel import Entries, Initial, SubModel, Update, flat_noise, role
 
 __all__ = ["draw_noise"]
 

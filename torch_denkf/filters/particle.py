@@ -16,8 +16,8 @@ from torch_denkf.imperfect import Visibility
 from torch_denkf.imperfect.visible import heeding
 from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel, as_process_noise
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
-from torch_denkf.roles import Initial, role
 from torch_denkf.running import check_module, reading_of
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["DPF", "PFM", "MixtureParticleFilter", "ParticleFilter"]
 

@@ -8,9 +8,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
 from torch_denkf.filters.structure import Placed, Structure, in_role, previous_key, takes_reading
-from torch_denkf.roles import Sensor, Update, role
 from torch_denkf.running import in_sequences, random_parts, writes
-from torch_denkf.submodel import Entries
+from torch_denkf.submodel import Entries, Sensor, Update, role
 
 __all__ = [
     "check_inputs",
@@ -130,8 +129,9 @@ def refuse_nameless_readings(structure: Structure) -> None:
             if corrects and read and not takes_reading(part) and not role(part, Update).reading_keys:
                 raise KeyError(
                     f"{type(part).__name__} at place {place!r} corrects the belief by {read}, and does not say which "
-                    "are readings: predict() cannot leave them out. Let its constructor set self.reading_keys, the "
-                    "reading and its noise, and self.observed_key, the mask that it heeds; or call step() with a mask."
+                    "are readings: predict() cannot leave them out. Make it an Update whose constructor sets "
+                    "self.reading_keys, the reading and its noise, and self.observed_key, the mask that it heeds; or "
+                    "call step() with a mask."
                 )
 
 

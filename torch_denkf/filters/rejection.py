@@ -13,8 +13,7 @@ from tensordict import NestedKey, unravel_key
 from torch import Tensor
 
 from torch_denkf._checks import check_mask
-from torch_denkf.roles import Update
-from torch_denkf.submodel import Entries
+from torch_denkf.submodel import Entries, Update
 
 __all__ = ["LARGEST_READING", "REJECTED", "Guard", "guards_of", "rejected_keys", "usable"]
 

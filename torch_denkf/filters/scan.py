@@ -14,9 +14,8 @@ from torch import Tensor
 from torch_denkf.filters.rejection import REJECTED, usable
 from torch_denkf.filters.structure import RESUMES, Placed, Structure, previous_key, takes_reading
 from torch_denkf.modules._held import hold_variances
-from torch_denkf.roles import Transition, Update, role
 from torch_denkf.running import is_sequence, named_modules_of, run_module
-from torch_denkf.submodel import Call, Entries
+from torch_denkf.submodel import Call, Entries, Transition, Update, role
 
 __all__ = ["Steps", "where_rows"]
 

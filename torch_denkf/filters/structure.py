@@ -12,7 +12,6 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters.rejection import Guard, guards_of
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.roles import Initial, Sensor, Update, role
 from torch_denkf.running import (
     in_sequences,
     is_sequence,
@@ -22,7 +21,7 @@ from torch_denkf.running import (
     reads_of,
     writes,
 )
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import Initial, Sensor, SubModel, Update, role
 
 __all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "in_role", "previous_key", "sequences_in", "submodels"]
 

@@ -12,7 +12,7 @@ from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
 from torch_denkf.imperfect.bias import FadingBias, biased_parts
 from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
-from torch_denkf.roles import Initial, role
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["UKF"]
 

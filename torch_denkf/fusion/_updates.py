@@ -14,8 +14,8 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import JoinedObservation, JoinedReading, StateObservation
 from torch_denkf.fusion.sensor import FusedSensor, Wired, noise_key_of
 from torch_denkf.fusion.sensor_weights import SensorWeights, WeightedNoise
-from torch_denkf.roles import Update, role
 from torch_denkf.smoothers.past import lagged
+from torch_denkf.submodel import Update, role
 
 __all__ = ["Updates"]
 

@@ -31,10 +31,10 @@ from torch_denkf.modules import (
 )
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition
-from torch_denkf.roles import Initial, role
 from torch_denkf.running import check_module, writes
 from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, with_past
 from torch_denkf.smoothers.past_moments import CrossTransition
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["FusedFilter"]
 

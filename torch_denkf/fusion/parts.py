@@ -13,9 +13,8 @@ from torch.nn import functional as F
 from torch_denkf._checks import check_mask
 from torch_denkf.functional.angles import mean_observation
 from torch_denkf.modules.around import Wrapper
-from torch_denkf.roles import Sensor, Update
 from torch_denkf.running import check_module, marks_of, reads, run_module, writes
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.submodel import Call, Entries, Sensor, SubModel, Update
 
 __all__ = ["JoinedObservation", "JoinedReading", "OfOwnErrors", "Renamed", "StateObservation"]
 

@@ -33,8 +33,8 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._tensors import as_standard_deviations
 from torch_denkf.modules.around import AroundInitial, Wrapper
 from torch_denkf.modules.process_noise import as_process_noise
-from torch_denkf.roles import Initial, Transition, role
 from torch_denkf.running import check_module
+from torch_denkf.submodel import Initial, Transition, role
 
 __all__ = ["BiasedBelief", "BiasedNoise", "BiasedObservation", "BiasedTransition", "FadingBias", "biased_parts"]
 
@@ -285,6 +285,7 @@ class BiasedBelief(AroundInitial):
     """
 
     place = "initial"
+    derived = Initial.derived  # the module inside knows entries of another size
 
     def __init__(self, initial: TensorDictModuleBase, bias: FadingBias):
         check_module("initial", initial)

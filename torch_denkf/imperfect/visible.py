@@ -33,9 +33,8 @@ from torch_denkf.functional.weighted import scored_innovation
 from torch_denkf.modules._tensors import mean_of_members
 from torch_denkf.modules.around import Around
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.roles import Sensor, Update
 from torch_denkf.running import check_module
-from torch_denkf.submodel import Call, Entries
+from torch_denkf.submodel import Call, Entries, Sensor, Update
 
 __all__ = ["Visibility", "Visible", "heeding"]
 

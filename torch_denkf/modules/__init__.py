@@ -21,9 +21,8 @@ from torch_denkf.modules.sharded_analysis import ShardedEnsembleAnalysis
 from torch_denkf.modules.stochastic import StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
-from torch_denkf.roles import Initial, Transition, Update
 from torch_denkf.running import reads, run_module
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import Initial, SubModel, Transition, Update
 
 __all__ = [
     "SubModel",

@@ -17,9 +17,8 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._spaces import checked_space, checked_spaces, without_hidden
 from torch_denkf.modules._tensors import check_dims
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
-from torch_denkf.roles import Transition, Update
 from torch_denkf.running import check_module, reads, run_module, writes
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.submodel import Call, Entries, SubModel, Transition, Update
 
 _DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
 

@@ -11,8 +11,7 @@ from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules._spaces import moments_on
-from torch_denkf.roles import Initial, role
-from torch_denkf.submodel import Entries
+from torch_denkf.submodel import Entries, Initial, role
 
 __all__ = ["summaries"]
 

@@ -11,9 +11,8 @@ import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.roles import Initial, Update, role
 from torch_denkf.running import check_module, is_sequence, named_modules_of, reads, run_module, writes
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.submodel import Call, Entries, Initial, SubModel, Update, role
 
 __all__ = ["Around", "AroundInitial", "AugmentedBelief", "Stateful", "Wrapper", "with_state"]
 

@@ -20,7 +20,7 @@ from torch_denkf.modules._tensors import (
     mean_of_members,
     register_location,
 )
-from torch_denkf.roles import Initial, Update
+from torch_denkf.submodel import Initial, Update
 
 __all__ = ["AroundState", "FromSensor", "GaussianPrior"]
 

@@ -17,9 +17,8 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._gaussian import as_covariance, further_keys, updated
 from torch_denkf.modules._spaces import checked_space
 from torch_denkf.modules._tensors import as_standard_deviations, check_dims, register_constant
-from torch_denkf.roles import Initial, Transition, Update
 from torch_denkf.running import run_module
-from torch_denkf.submodel import Call, Entries
+from torch_denkf.submodel import Call, Entries, Initial, Transition, Update
 
 __all__ = ["GaussianAround", "KalmanAnalysis", "LinearTransition", "MomentPrior"]
 

@@ -17,7 +17,7 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._spaces import checked_spaces, without_hidden
 from torch_denkf.modules._tensors import as_vector, check_dims, mean_of_members
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.roles import Update
+from torch_denkf.submodel import Update
 
 __all__ = ["GaussianLikelihood", "LearnedLikelihood"]
 

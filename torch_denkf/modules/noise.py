@@ -18,9 +18,8 @@ from torch_denkf.modules._tensors import (
     variance_and_floor,
 )
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.roles import Sensor
 from torch_denkf.running import check_module, reads, run_module
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import Sensor, SubModel
 
 __all__ = ["ConstantNoise", "DiagonalNoise", "ScaledNoise", "MemberGain"]
 

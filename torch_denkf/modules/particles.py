@@ -29,9 +29,8 @@ from torch_denkf.functional.weighted import weighted_innovation, weighted_mean, 
 from torch_denkf.modules._spaces import checked_space, moments_on, reading_about
 from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.likelihood import GaussianLikelihood
-from torch_denkf.roles import Transition, Update
 from torch_denkf.running import check_module, reads, run_module
-from torch_denkf.submodel import Entries
+from torch_denkf.submodel import Entries, Transition, Update
 
 __all__ = ["ParticleAnalysis", "ResampledTransition", "with_weights"]
 

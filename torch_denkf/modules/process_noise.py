@@ -26,9 +26,8 @@ from torch_denkf.modules._tensors import (
 )
 from torch_denkf.modules.noise import ConstantNoise
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.roles import Initial, role
 from torch_denkf.running import check_module, reads, run_module
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import Initial, SubModel, role
 
 __all__ = ["CholeskyNoise", "MappedNoise", "NoiseThrough", "as_process_noise"]
 

@@ -10,9 +10,8 @@ from torch import nn
 
 from torch_denkf.modules._tensors import register_location, register_scale
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.roles import Transition
 from torch_denkf.running import check_network
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["LearnedTransition", "MemberNetwork"]
 

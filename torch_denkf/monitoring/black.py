@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_number
 from torch_denkf.modules._tensors import mask_of
-from torch_denkf.roles import Sensor
+from torch_denkf.submodel import Sensor
 
 __all__ = ["BlackIsMissing"]
 

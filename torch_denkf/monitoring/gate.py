@@ -17,9 +17,8 @@ from torch_denkf.monitoring._calibration import IDENTITY, check_observation_dim,
 from torch_denkf.monitoring.chi_square import chi_square_quantile
 from torch_denkf.monitoring.gating import adapt, disbelief, spread_about_mean
 from torch_denkf.monitoring.innovation_tests import interpolate
-from torch_denkf.roles import Update
 from torch_denkf.smoothers.past import LaggedAnalysis
-from torch_denkf.submodel import Call, Entries, flat_noise
+from torch_denkf.submodel import Call, Entries, Update, flat_noise
 
 __all__ = ["GateOptions", "GatedAnalysis"]
 

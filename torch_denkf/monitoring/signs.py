@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.modules._tensors import mask_of
 from torch_denkf.monitoring._calibration import sign_limits
-from torch_denkf.roles import Sensor
+from torch_denkf.submodel import Sensor
 
 __all__ = ["SignGate"]
 

@@ -13,8 +13,7 @@ from torch_denkf._checks import check_values
 from torch_denkf.functional.manifolds import Product
 from torch_denkf.modules._tensors import as_vector
 from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
-from torch_denkf.roles import Transition
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["Motion", "densities", "integrated", "walked"]
 

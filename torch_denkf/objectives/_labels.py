@@ -18,7 +18,7 @@ from torch import Tensor
 from torch_denkf._checks import check_mask
 from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.manifolds import Space, whole_parts
-from torch_denkf.roles import Initial, role
+from torch_denkf.submodel import Initial, role
 
 if TYPE_CHECKING:
     from torch_denkf.objectives.filter_loss import FilterLoss

@@ -23,9 +23,8 @@ from torch_denkf.modules._tensors import as_floating
 from torch_denkf.objectives import _terms
 from torch_denkf.objectives._labels import Keys, Truth
 from torch_denkf.objectives.filter_loss import FilterLoss, ReadingsOptions, StateOptions, Term
-from torch_denkf.roles import Initial, role
 from torch_denkf.running import reads, reads_of, run_module, run_modules
-from torch_denkf.submodel import Call, Entries
+from torch_denkf.submodel import Call, Entries, Initial, role
 
 __all__ = ["ObservationLoss", "SensorLoss", "TransitionLoss"]
 

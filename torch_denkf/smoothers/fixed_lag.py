@@ -9,10 +9,10 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters import Filter
 from torch_denkf.modules.particles import ResampledTransition
-from torch_denkf.roles import Update, role
 from torch_denkf.running import is_sequence, named_modules_of
 from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, lagged, with_past
 from torch_denkf.smoothers.past_moments import MOMENTS_PAST, CrossTransition, LaggedMoments, MomentsPast
+from torch_denkf.submodel import Update, role
 
 __all__ = ["FixedLag", "kind_of", "rebuilt"]
 

@@ -24,8 +24,7 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules._spaces import moments_on
 from torch_denkf.modules.around import Around, AugmentedBelief
-from torch_denkf.roles import Initial, Update, role
-from torch_denkf.submodel import Entries, SubModel
+from torch_denkf.submodel import Entries, Initial, SubModel, Update, role
 
 __all__ = ["ENSEMBLE_PAST", "EnsemblePast", "LaggedAnalysis", "LaggedBelief", "Past", "lagged", "with_past"]
 

@@ -19,9 +19,8 @@ from torch_denkf.functional.smoothing.rts import smoothing_gain
 from torch_denkf.modules._gaussian import GaussianTransition
 from torch_denkf.modules.around import Wrapper
 from torch_denkf.modules.kalman import LinearTransition
-from torch_denkf.roles import Transition
 from torch_denkf.smoothers.past import Past, check_age
-from torch_denkf.submodel import Entries, SubModel
+from torch_denkf.submodel import Entries, SubModel, Transition
 
 __all__ = ["MOMENTS_PAST", "CrossTransition", "LaggedMoments", "MomentsPast"]
 

@@ -16,7 +16,7 @@ from torch_denkf._checks import check_count, check_number
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.functional.manifolds import SO3, rotate
 from torch_denkf.modules import CholeskyNoise, StochasticMLP
-from torch_denkf.roles import Sensor
+from torch_denkf.submodel import Sensor
 
 __all__ = ["LearnedContacts", "last_rows", "with_last_rows"]
 

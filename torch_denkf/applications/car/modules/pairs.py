@@ -20,9 +20,8 @@ from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import ensemble_var
 from torch_denkf.modules._tensors import register_constant
 from torch_denkf.modules.around import AroundInitial, AugmentedBelief, Wrapper
-from torch_denkf.roles import Transition, Update
 from torch_denkf.running import check_module, reads
-from torch_denkf.submodel import Entries, SubModel
+from torch_denkf.submodel import Entries, Initial, SubModel, Transition, Update
 
 __all__ = ["ClonedPrior", "ClonedTransition", "PairObservation", "with_history"]
 
@@ -162,6 +161,7 @@ class ClonedPrior(AroundInitial):
     """
 
     place = "initial"
+    derived = Initial.derived  # the module inside knows entries of another size
 
     def __init__(self, initial: TensorDictModuleBase, lags: int):
         check_module("initial", initial)

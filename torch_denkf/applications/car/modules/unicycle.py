@@ -14,9 +14,8 @@ from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules._tensors import register_location, register_scale
 from torch_denkf.modules.transition import MemberNetwork
 from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
-from torch_denkf.roles import Transition
 from torch_denkf.running import check_network
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["UnicycleMotion", "UnicycleTransition"]
 
