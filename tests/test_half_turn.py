@@ -197,7 +197,7 @@ def heeding(make):
 
     def heeds(turn):
         filter = make(turn)
-        return filter.replace("analysis", Visible(filter["analysis"], visible_key="visible"))
+        return filter.with_modules(analysis=Visible(filter["analysis"], visible_key="visible"))
 
     return heeds
 

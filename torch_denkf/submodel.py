@@ -49,14 +49,14 @@ class Call(NamedTuple):
         place: where the module stands in the filter, e.g. ``"transition"``; its noise is ``("noise", place)``.
         sample: whether random modules draw; if not, they run their deterministic forward.
         time: whether the last dimension of ``batch_size`` is time.
-        missing: entries that an initial belief must do without.
+        drawn: collects, in a trial step, the modules that draw noise and the sizes they ask for.
     """
 
     batch_size: torch.Size
     place: str = "self"
     sample: bool = True
     time: bool = False
-    missing: frozenset[NestedKey] = frozenset()
+    drawn: dict | None = None
 
     def part(self, name: str) -> Call:
         """The call of a part of the module."""
@@ -307,7 +307,10 @@ class SubModel(Checked, TensorDictModule):
                 if value is not None and value.is_floating_point():
                     where = {"device": value.device, "dtype": value.dtype}
                     break
-            where.update(self.noise_sizes(*values))
+            sizes = self.noise_sizes(*values)
+            if call.drawn is not None:
+                call.drawn[call.place] = self, sizes
+            where.update(sizes)
             given = self.draw_noise(call.batch_size, time=call.time, **where)
             if given is None:  # it would run as if no noise were wanted
                 raise ValueError(
@@ -407,12 +410,10 @@ class Update(SubModel):
         reading_keys: the entries of the reading: the reading itself, and behind it its noise.
         observed_key: the mask that hides them, ``[*B, 1]`` or ``[*B, O]``.
         predicted_key: the predicted reading, ``[*B, E, O]``.
-        noise_variance_key: the variances of the reading; they tell :meth:`draw_noise` how many components it has.
         info_prefix: prefix of the diagnostics.
         space: in which the states live; ``None`` for plain numbers.
         reading_space: in which the reading lives; ``None`` for plain numbers.
         observation_dim: O of the reading, where it is known beforehand.
-        reads_components: whether each component of a reading counts, and is hidden, by itself.
 
     Example:
         >>> from tensordict import TensorDict
@@ -433,12 +434,10 @@ class Update(SubModel):
     reading_keys: Sequence[NestedKey] = ()
     observed_key: NestedKey | None = None
     predicted_key: NestedKey = ("forecast", "observation")
-    noise_variance_key: NestedKey | None = None
     info_prefix: str | None = None
     space: Space | None = None
     reading_space: Space | None = None
     observation_dim: int | None = None
-    reads_components: bool = False
 
     def reading_dims(self, entries: Entries, call: Call) -> Sequence[int]:
         """Returns how many numbers each of ``reading_keys`` has, to put zeros behind a mask where it is missing.

@@ -53,7 +53,7 @@ class Unsaid(FixedEnsemble):
 def foreign_noise(filter):
     """The noise from a module that does not say how many readings it is for."""
     _, _, _, R = linear_system()
-    filter.replace("noise", TensorDictModule(nn.Linear(2, 2), ["observation"], [("sensor", "noise")]))
+    filter = filter.with_modules(noise=TensorDictModule(nn.Linear(2, 2), ["observation"], [("sensor", "noise")]))
     with torch.no_grad():
         filter["noise"].module.weight.zero_()
         filter["noise"].module.bias.copy_(R)
@@ -65,7 +65,7 @@ def test_sizes_that_only_the_entries_tell_are_enough_to_draw_in_bulk(case):
     told = linear_denkf("perturbed", noisy=True)
     filter = linear_denkf("perturbed", noisy=True)
     if case == "initial":
-        filter.replace("initial", Unsaid(filter.initial.members))
+        filter = filter.with_modules(initial=Unsaid(filter.initial.members))
     else:
         foreign_noise(filter)
     frames, outs = readings(3, 5), []
@@ -90,7 +90,7 @@ class SizeAtTheStep(NoisyLinear):
 def test_a_noise_of_unknown_size_leaves_steps_and_sequences_eager():
     F, Q, _, _ = linear_system()
     filter, frames, outs = linear_denkf("perturbed", noisy=True), readings(3, 5), []
-    filter.replace("transition", SizeAtTheStep(F, torch.linalg.cholesky(Q)))
+    filter = filter.with_modules(transition=SizeAtTheStep(F, torch.linalg.cholesky(Q)))
     for chunk in (0, 2):
         filter.compile(chunk=chunk, backend="eager")
         torch.manual_seed(1)
@@ -132,9 +132,10 @@ def test_parts_of_different_sizes_say_nothing_of_the_whole():
     _, _, H, R = linear_system()
     sd = torch.cat([R, R[:1]]).sqrt()
     for filter in (plain, other):
-        filter.replace("observation", LinearObservation(torch.cat([H, H[:1]])))
-    plain.replace("noise", ConstantNoise(sd, in_key="observation"))
-    other.replace("noise", SideBySide(*(ConstantNoise(part, in_key="observation") for part in (sd[:1], sd[1:]))))
+        filter = filter.with_modules(observation=LinearObservation(torch.cat([H, H[:1]])))
+    plain = plain.with_modules(noise=ConstantNoise(sd, in_key="observation"))
+    parts = (ConstantNoise(part, in_key="observation") for part in (sd[:1], sd[1:]))
+    other = other.with_modules(noise=SideBySide(*parts))
     frames, outs = TensorDict({"observation": torch.randn(2, 5, 3)}, [2, 5]), []
     assert set(other.draw_noise(frames.copy())["noise"].keys()) == {"transition"}
     for filter in (plain, other):

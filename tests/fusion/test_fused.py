@@ -11,11 +11,11 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torch.testing import assert_close
+from torch_denkf.filters.rejection import REJECTED
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check
 from torch_denkf.filters import EKF, DEnKF, Filter, KalmanFilter
-from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.functional import wrap_angles
 from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
 from torch_denkf.fusion.parts import JoinedReading
@@ -354,7 +354,7 @@ def test_an_update_at_reset_sees_the_first_frame_and_no_late_one(float64, kind):
     late, order = arriving(frames, PATTERNS["three steps late"]), frames.copy()
     order["second_observed"] = order["second_observed"].clone()
     order["second_observed"][:, -DELAY:] = False
-    plain.update_at_reset = True
+    plain = plain.with_options(update_at_reset=True)
     expected = plain.sequence(order)
     F, Q, _, _ = linear_system()
     motion = LinearTransition(F, Q) if kind == "Kalman" else NoisyLinear(F)

@@ -49,7 +49,7 @@ CERTAIN = [name for name in MAKERS if name != "particles"]  # these resample whe
 
 def heeds(filter):
     """The filter, whose update heeds p from the data."""
-    return filter.replace("analysis", Visible(filter["analysis"], visible_key="visible"))
+    return filter.with_modules(analysis=Visible(filter["analysis"], visible_key="visible"))
 
 
 def frames(*batch):

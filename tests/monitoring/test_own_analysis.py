@@ -81,7 +81,7 @@ def data(float64):
 def test_it_gives_what_ours_gives(data, way):
     if way == "rejected":
         data["observation"][1, 4] = torch.nan
-    ours, own = (WAYS[way](linear_denkf(ensemble_size=8).replace("analysis", part)) for part in both())
+    ours, own = (WAYS[way](linear_denkf(ensemble_size=8).with_modules(analysis=part)) for part in both())
     expected, out = ours(data.clone()), own(data.clone())
     keys = [key for key in expected.keys(True, True) if expected[key].is_floating_point()]
     assert ("belief", "mean") in keys

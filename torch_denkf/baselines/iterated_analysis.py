@@ -83,8 +83,6 @@ class IteratedAnalysis(Update):
         KeyError: if an entry is missing.
     """
 
-    reads_components = True
-
     def __init__(
         self,
         transition: TensorDictModuleBase,
@@ -122,7 +120,6 @@ class IteratedAnalysis(Update):
         self.iterations, self.inflation, self.rotate = iterations, inflation, rotate
         self.space, self.reading_space = checked_spaces(space, reading_space, ())
         self.info_prefix, self.observed_key = info_prefix, unravel_key(observed_key)
-        self.noise_variance_key = unravel_key(noise_variance_key)
         self.reading_keys = self.in_keys[1:3]
 
     @property

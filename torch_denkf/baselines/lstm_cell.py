@@ -188,7 +188,6 @@ class LSTMUpdate(Update):
         self.in_size, self.num_layers, self.hidden_size = in_size, num_layers, hidden_size
         self.floor, self.inflation, self.observation_dim = floor, inflation, observation_dim or None
         self.reading_keys, self.observed_key = inputs, unravel_key(observed_key)
-        self.reads_components = encoding_key is None
         for name, value, size, default in (
             ("loc", loc, state_dim, 0.0),
             ("scale", scale, state_dim, 1.0),

@@ -12,13 +12,14 @@ from torch.nn import functional as F
 
 from torch_denkf._checks import check_mask
 from torch_denkf.functional.angles import mean_observation
-from torch_denkf.modules.around import Wrapper
+from torch_denkf.modules.around import Wrapper, passes_on
 from torch_denkf.running import check_module, marks_of, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, Sensor, SubModel, Update
 
 __all__ = ["JoinedObservation", "JoinedReading", "OfOwnErrors", "Renamed", "StateObservation"]
 
 
+@passes_on(Sensor)
 class Renamed(Wrapper, Sensor):
     """A module that reads and writes under other keys, so that two of a kind fit into one filter.
 
@@ -131,8 +132,7 @@ class StateObservation(Wrapper, Update):
         self.ensemble_key, self.predicted_key, self.observed_key, self.age_key = map(unravel_key, keys)
         self.late_key = None if late_key is None else unravel_key(late_key)
         self.past_key = None if past_key is None else unravel_key(past_key)
-        # For readings that are rejected: what the mask hides.
-        self.reading_keys, self.reads_components = list(map(unravel_key, reading_keys)), True
+        self.reading_keys = list(map(unravel_key, reading_keys))
 
     def on_entries(self, entries, call):
         """The predicted observations, and the mask."""

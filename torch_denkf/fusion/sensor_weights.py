@@ -227,7 +227,6 @@ class WeightedNoise(Sensor):
     ):
         super().__init__(nn.Identity(), [noise_key, weight_key], [out_key])
         self.observation_dim = observation_dim
-        self.source_keys = self.in_keys[:1]  # the sensor's own: its weight heeds the masks of all sensors
 
     def compute(self, variance, weight):
         """The larger noise."""

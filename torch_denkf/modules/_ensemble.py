@@ -66,8 +66,6 @@ class EnsembleUpdate(Update):
             ``localisation`` is not known.
     """
 
-    reads_components = True
-
     def __init__(
         self,
         *,

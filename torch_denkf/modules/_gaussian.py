@@ -157,8 +157,6 @@ class GaussianAnalysis(Update):
         KeyError: if an entry is missing.
     """
 
-    reads_components = True
-
     def __init__(
         self,
         observation: TensorDictModuleBase,

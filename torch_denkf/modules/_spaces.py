@@ -7,11 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torch_denkf.functional import ensemble_var
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.functional.weighted import weighted_var
 
-__all__ = ["checked_space", "checked_spaces", "mean_and_tangents", "moments_on", "reading_about", "without_hidden"]
+__all__ = ["checked_space", "checked_spaces", "mean_and_tangents", "reading_about", "without_hidden"]
 
 
 def checked_space(name: str, space: Space | None) -> Space | None:
@@ -37,13 +35,6 @@ def checked_spaces(
     if reading_space is not None and angles:
         raise ValueError(f"reading_space={reading_space} says what is an angle: leave angles={list(angles)} away.")
     return checked_space("space", space), checked_space("reading_space", reading_space)
-
-
-def moments_on(space: Space, ensemble: Tensor, log_weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """The mean ``[*B, P]`` of members ``[*B, E, P]``, and the variances ``[*B, D]`` of the tangents from it to them."""
-    mean = space.mean(ensemble, None if log_weights is None else log_weights.exp())
-    away = space.minus(ensemble, mean.unsqueeze(-2))
-    return mean, ensemble_var(away) if log_weights is None else weighted_var(away, log_weights)
 
 
 def mean_and_tangents(space: Space, ensemble: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:

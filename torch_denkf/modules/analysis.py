@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal, Unpack
 
 import torch
-from tensordict import unravel_key
 
 from torch_denkf._checks import check_values
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
@@ -106,7 +105,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         )
         check_dims("inflated", inflated or [])
         self.inflated = None if inflated is None else list(inflated)
-        self.scheme, self.covariance, self.noise_variance_key = scheme, covariance, unravel_key(self.in_keys[3])
+        self.scheme, self.covariance = scheme, covariance
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
             if factors is not None:
                 check_values(name.replace("_", "'s "), factors)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import Protocol, Self
+from typing import Protocol, Self, TypeVar
 
 import torch
 from tensordict import NestedKey, unravel_key
@@ -14,7 +14,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf.running import check_module, is_sequence, named_modules_of, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, Initial, SubModel, Update, role
 
-__all__ = ["Around", "AroundInitial", "AugmentedBelief", "Stateful", "Wrapper", "with_state"]
+__all__ = ["Around", "AroundInitial", "AugmentedBelief", "Stateful", "Wrapper", "passes_on", "with_state"]
+
+W = TypeVar("W", bound="Wrapper")
 
 
 class _Inside:
@@ -86,13 +88,19 @@ class Wrapper(SubModel):
         return self.run_inside(entries, call)
 
 
-def _passing_on(wrapper: type, kind: type[SubModel]) -> None:
-    """Lets a class of wrappers pass on all that ``kind`` declares, but for what the class defines itself."""
-    for name in vars(kind):
-        if not name.startswith("_") and name not in vars(wrapper):
-            setattr(wrapper, name, _Inside(kind, name))
+def passes_on(kind: type[SubModel]) -> Callable[[type[W]], type[W]]:
+    """Lets a class of wrappers pass on all that a role declares, but for what the class defines itself."""
+
+    def passing(wrapper: type[W]) -> type[W]:
+        for name in vars(kind):
+            if not name.startswith("_") and name not in vars(wrapper):
+                setattr(wrapper, name, _Inside(kind, name))
+        return wrapper
+
+    return passing
 
 
+@passes_on(Update)
 class Around(Wrapper, Update):
     """Goes around an update, and passes on all that the update declares: a wrapper overrides what it changes.
 
@@ -145,14 +153,9 @@ class Around(Wrapper, Update):
         return other
 
 
-_passing_on(Around, Update)
-
-
+@passes_on(Initial)
 class AroundInitial(Wrapper, Initial):
     """Goes around an initial belief, and passes on all that it declares."""
-
-
-_passing_on(AroundInitial, Initial)
 
 
 class Stateful(Protocol):

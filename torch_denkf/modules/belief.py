@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from typing import cast
 
 import torch
-from tensordict import NestedKey, unravel_key
+from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf._checks import check_count, check_values
+from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._spaces import checked_space, moments_on
+from torch_denkf.modules._spaces import checked_space
 from torch_denkf.modules._tensors import (
     as_floating,
     as_standard_deviations,
@@ -20,7 +21,7 @@ from torch_denkf.modules._tensors import (
     mean_of_members,
     register_location,
 )
-from torch_denkf.submodel import Initial, Update
+from torch_denkf.submodel import Initial
 
 __all__ = ["AroundState", "FromSensor", "GaussianPrior"]
 
@@ -146,7 +147,7 @@ class AroundState(_InitialEnsemble):
         return self._members(state.to(self.std.dtype), self.std, noise, batch_size)
 
 
-class FromSensor(_InitialEnsemble, Update):
+class FromSensor(_InitialEnsemble):
     """A belief from the first sensor reading: observed dimensions N(mean reading, R), the others a Gaussian prior.
 
     Where nothing is observed at reset, the prior alone is used, as with ``filter.initialise(..., without=[...])``.
@@ -172,8 +173,6 @@ class FromSensor(_InitialEnsemble, Update):
         tensor([5., 0.])
     """
 
-    reads_components = True
-
     def __init__(
         self,
         dims: Sequence[int],
@@ -191,11 +190,10 @@ class FromSensor(_InitialEnsemble, Update):
         check_dims("dims", dims, once=True, size=self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
         self.input_dim = len(self.dims)
-        self.reading_keys, self.observed_key = self.in_keys, unravel_key(observed_key)
 
     def on_entries(self, entries, call):
         """The belief; without its reading the prior."""
-        if call.missing.isdisjoint(self.in_keys):
+        if all(key in entries for key in self.in_keys):
             return super().on_entries(entries, call)
         mean, std = (part.expand(*call.batch_size, -1) for part in (self.mean, self.std))
         noise = cast("torch.Tensor | None", self._noise(entries, [], call))

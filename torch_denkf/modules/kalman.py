@@ -219,7 +219,6 @@ class KalmanAnalysis(Update):
         tensor([0.5000])
     """
 
-    reads_components = True
     info_prefix: str
 
     def __init__(

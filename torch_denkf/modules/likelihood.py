@@ -55,8 +55,6 @@ class GaussianLikelihood(Update):
         tensor([-1.4189, -0.9189])
     """
 
-    reads_components = True
-
     def __init__(
         self,
         *,

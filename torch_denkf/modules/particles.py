@@ -21,12 +21,13 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number
+from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
 from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.resampling import effective_sample_size, jitter_copies
 from torch_denkf.functional.weighted import weighted_innovation, weighted_mean, weighted_var
-from torch_denkf.modules._spaces import checked_space, moments_on, reading_about
+from torch_denkf.modules._spaces import checked_space, reading_about
 from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.likelihood import GaussianLikelihood
 from torch_denkf.running import check_module, reads, run_module
@@ -323,7 +324,7 @@ class ParticleAnalysis(Update):
         self.reading_space = None if likelihood is None else likelihood.reading_space
         if likelihood is not None:
             self.reading_keys, self.predicted_key = likelihood.reading_keys, likelihood.predicted_key
-            self.observed_key, self.reads_components = likelihood.observed_key, True
+            self.observed_key = likelihood.observed_key
 
     def compute(self, particles, prior, log_likelihood, *of_reading):
         """The belief and the diagnostics."""

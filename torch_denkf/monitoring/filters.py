@@ -15,8 +15,8 @@ from torch_denkf.fusion.parts import StateObservation
 from torch_denkf.modules.around import with_state
 from torch_denkf.monitoring.gate import GatedAnalysis, GateOptions, can_be_gated
 from torch_denkf.monitoring.monitor import InnovationMonitor
-from torch_denkf.running import check_module, is_sequence, named_modules_of
-from torch_denkf.submodel import Call, SubModel
+from torch_denkf.running import check_module, in_sequences, is_sequence, named_modules_of, writes
+from torch_denkf.submodel import Call, Sensor, SubModel, Update, role
 
 __all__ = ["Gated", "Monitored"]
 
@@ -201,13 +201,9 @@ def _check_filter(name: str, filter: object) -> None:
         )
 
 
-def _analyses(module: TensorDictModuleBase) -> Iterator[SubModel]:
+def _analyses(module: TensorDictModuleBase) -> Iterator[Update]:
     """The analyses of a module of a filter that can be gated."""
-    if is_sequence(module):
-        for _, part in named_modules_of(module):
-            yield from _analyses(part)
-    elif can_be_gated(module):
-        yield module
+    yield from filter(can_be_gated, in_sequences(module))
 
 
 def _with(module: TensorDictModuleBase, old: SubModel, new: SubModel) -> TensorDictModuleBase:
@@ -217,11 +213,13 @@ def _with(module: TensorDictModuleBase, old: SubModel, new: SubModel) -> TensorD
     return TensorDictSequential(OrderedDict((name, _with(part, old, new)) for name, part in named_modules_of(module)))
 
 
-def _dim(filter: Filter, analysis: SubModel) -> int:
+def _dim(filter: Filter, analysis: Update) -> int:
     """How many components an analysis' reading has."""
-    known = [filter.structure.observation_dims.get(unravel_key(key)) for key in analysis.reading_keys[1:]]
-    if known and known[0] is not None:
-        return known[0]
+    noise = set(map(unravel_key, analysis.reading_keys[1:]))
+    for part in (part for _, module in filter.structure.modules for part in in_sequences(module)):
+        dim = role(part, Sensor).observation_dim
+        if dim is not None and not noise.isdisjoint(writes(part)):
+            return dim
     try:
         return analysis.reading_dims({}, Call(torch.Size()))[0]
     except KeyError:

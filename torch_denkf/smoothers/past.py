@@ -19,10 +19,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_shape
+from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
-from torch_denkf.modules._spaces import moments_on
 from torch_denkf.modules.around import Around, AugmentedBelief
 from torch_denkf.submodel import Entries, Initial, SubModel, Update, role
 

@@ -11,7 +11,6 @@ import torch
 from tensordict import TensorDictBase
 from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 
-from torch_denkf.filters.finish import AbsurdReading
 from torch_denkf.training.distributed import Processes
 from torch_denkf.training.stage import Stage
 
@@ -75,7 +74,7 @@ class Updates:
         self._lr, self.refused = 0.0, ""
 
     def step(self, batch: TensorDictBase) -> bool:
-        """Makes one optimiser step, unless the loss, its gradient or a reading is not finite.
+        """Makes one optimiser step, unless the loss or its gradient is not finite.
 
         A step left out leaves parameters, optimiser and schedule as they are. Whether a step is finite is the only
         number that is read back from the device.
@@ -83,14 +82,7 @@ class Updates:
         Returns:
             whether the step was made; the same in all processes.
         """
-        terms: dict[str, torch.Tensor] = {}
-        broken = False
-        try:
-            terms = self._terms(batch)
-        except AbsurdReading as error:  # one row of a recording is not to end a long training
-            broken, self.refused = True, str(error)
-        if self.processes.any(broken):
-            return self._skip()
+        terms = self._terms(batch)
         first, *others = [value for name, value in terms.items() if name.startswith("loss")]
         total = sum(others, first)
         if not total.requires_grad:
@@ -102,7 +94,7 @@ class Updates:
         values = self.processes.average_(self.parameters, values)
         norm = get_total_norm([p.grad for p in self.parameters if p.grad is not None])
         if not bool(torch.isfinite(values[-1] + norm)):
-            return self._skip()
+            return self._skip(batch)
         self.in_a_row = 0
         if self.stage.clip is not None:
             clip_grads_with_norm_(self.parameters, self.stage.clip, norm)
@@ -114,7 +106,12 @@ class Updates:
         self._count += 1
         return True
 
-    def _skip(self) -> bool:
+    def _skip(self, batch: TensorDictBase) -> bool:
+        """Leaves the step out, and says which entries of the batch are not finite."""
+        floats = batch.items(True, True)
+        bad = [key for key, value in floats if value.is_floating_point() and not value.isfinite().all()]
+        if bad:
+            self.refused = f"There is NaN or infinity in {bad}: RejectReadings masks it."
         self.skipped, self.in_a_row = self.skipped + 1, self.in_a_row + 1
         self.optimiser.zero_grad()
         return False

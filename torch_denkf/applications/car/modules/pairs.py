@@ -21,7 +21,7 @@ from torch_denkf.functional import ensemble_var
 from torch_denkf.modules._tensors import register_constant
 from torch_denkf.modules.around import AroundInitial, AugmentedBelief, Wrapper
 from torch_denkf.running import check_module, reads
-from torch_denkf.submodel import Entries, Initial, SubModel, Transition, Update
+from torch_denkf.submodel import Entries, Initial, SubModel, Transition
 
 __all__ = ["ClonedPrior", "ClonedTransition", "PairObservation", "with_history"]
 
@@ -61,7 +61,7 @@ def _same_velocities(ensemble_key: NestedKey, lags: int, belief: Entries, _: tor
     return [belief[ensemble_key][..., 3:].unsqueeze(-2).repeat_interleave(lags, -2)]
 
 
-class PairObservation(Update):
+class PairObservation(SubModel):
     r"""What a sensor reads from a pair of frames that are n steps apart: the velocities of all n, added up.
 
     .. math:: H x^i_t = h\Big(\sum_{k=0}^{n-1} (v, \dot\theta)^i_{t-k}\Big)
@@ -120,7 +120,6 @@ class PairObservation(Update):
         reach = [torch.inf, torch.inf] if reach is None else reach
         register_constant(self, "reach", reach)
         check_values("reach", self.reach, above=0, infinite=True)
-        self.observation_dim, self.observed_key = 2, unravel_key(observed_key)
 
     def compute(self, forecast, *rest):
         """The predicted observations, the ensemble that the analysis is to update, and the mask."""
