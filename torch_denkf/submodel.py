@@ -19,19 +19,7 @@ from torch import Tensor, nn
 from torch_denkf._arguments import Checked
 from torch_denkf.functional.manifolds import Space
 
-__all__ = [
-    "EXPLAINED",
-    "Call",
-    "Entries",
-    "Initial",
-    "Noise",
-    "Sensor",
-    "SubModel",
-    "Transition",
-    "Update",
-    "flat_noise",
-    "role",
-]
+__all__ = ["Call", "Entries", "Initial", "Noise", "Sensor", "SubModel", "Transition", "Update", "in_role", "role"]
 
 R = TypeVar("R", bound="SubModel")
 
@@ -540,6 +528,11 @@ def role(module: object, kind: type[R]) -> R:
         None
     """
     return module if isinstance(module, kind) else _DEFAULTS[kind]
+
+
+def in_role(module: nn.Module, kind: type[R]) -> list[R]:
+    """Returns the sub-models inside ``module`` that have a role, also those inside others; all for ``SubModel``."""
+    return [part for part in module.modules() if isinstance(part, kind)]
 
 
 #: Errors that can be raised again with more words.

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch_denkf.beliefs import Ensemble, Particles, is_samples
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.finish import Record
-from torch_denkf.filters.structure import Structure, in_role
-from torch_denkf.submodel import Update
+from torch_denkf.filters.structure import Structure
+from torch_denkf.submodel import Update, in_role
 
 __all__ = ["ReadingRanks"]
 

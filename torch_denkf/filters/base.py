@@ -43,10 +43,10 @@ from torch_denkf.filters.refusals import (
     refuse_unknown_readings,
 )
 from torch_denkf.filters.scan import Steps, where_rows
-from torch_denkf.filters.structure import KNOWN, Structure, in_role, previous_key
+from torch_denkf.filters.structure import KNOWN, Structure, previous_key
 from torch_denkf.modules.variance_ceiling import VarianceCeiling
 from torch_denkf.running import check_module, named_modules_of, random_parts, reads, run_module
-from torch_denkf.submodel import Call, Entries, Initial, Transition, flat_noise, role
+from torch_denkf.submodel import Call, Entries, Initial, Transition, flat_noise, in_role, role
 
 __all__ = ["Filter"]
 
@@ -446,8 +446,7 @@ class Filter(Checked, TensorDictSequential):
         refuse_nameless_readings(self.structure)
         tensordict = self.of_one_robot(tensordict)
         hidden = tensordict.copy()
-        masks = (part.mask_key for part in in_role(self.module, Transition))
-        for key in dict.fromkeys(mask for mask in masks if mask is not None):
+        for key in {part.mask_key for part in in_role(self.module, Transition)} - {None}:
             hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=tensordict.device))
         out = self.step(hidden, without=self.structure.readings)
         written = [key for key in self.out_keys if out.get(key, None) is not None]

@@ -7,9 +7,9 @@ from collections.abc import Collection, Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
-from torch_denkf.filters.structure import Structure, in_role, previous_key, takes_reading
+from torch_denkf.filters.structure import Structure, previous_key, takes_reading
 from torch_denkf.running import in_sequences, writes
-from torch_denkf.submodel import Entries, Sensor, Update, role
+from torch_denkf.submodel import Entries, Sensor, Update, in_role, role
 
 __all__ = [
     "check_inputs",

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
-from typing import NamedTuple, TypeGuard, TypeVar
+from typing import NamedTuple, TypeGuard
 
-import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
@@ -20,9 +19,9 @@ from torch_denkf.running import (
     reads_of,
     writes,
 )
-from torch_denkf.submodel import Entries, Initial, SubModel, Update, role
+from torch_denkf.submodel import Entries, Initial, Update, in_role, role
 
-__all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "in_role", "previous_key", "sequences_in", "submodels"]
+__all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "previous_key", "sequences_in"]
 
 #: A module and its place in the filter, which names its noise.
 Placed = tuple[str, TensorDictModuleBase]
@@ -33,22 +32,9 @@ KNOWN = ("previous", "known")
 RESUMES = ("previous", "resumes")
 
 
-R = TypeVar("R", bound=SubModel)
-
-
 def previous_key(key: NestedKey) -> tuple[str, ...]:
     """Where a policy's filter finds what was ``key`` one step before."""
     return ("previous", key) if isinstance(key, str) else ("previous", *key)
-
-
-def submodels(module: torch.nn.Module) -> list[SubModel]:
-    """Returns the sub-models inside ``module``, also those inside others."""
-    return in_role(module, SubModel)
-
-
-def in_role(module: torch.nn.Module, kind: type[R]) -> list[R]:
-    """Returns the sub-models of a role inside ``module``, also those inside others."""
-    return [part for part in module.modules() if isinstance(part, kind)]
 
 
 def takes_reading(module: TensorDictModuleBase) -> TypeGuard[Update]:
