@@ -11,8 +11,8 @@ from torch import nn
 
 from torch_denkf._checks import check_covariance, check_one_dtype, check_shape, check_square, check_values
 from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
-from torch_denkf.modules._tensors import as_floating
 from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition
+from torch_denkf.modules.tensors import as_floating
 from torch_denkf.submodel import Initial, role
 
 __all__ = ["BackpropKF"]

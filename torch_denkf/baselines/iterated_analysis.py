@@ -15,9 +15,9 @@ from torch_denkf.functional import analyse
 from torch_denkf.functional.inflation import inflate, random_rotation
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing.iterated import iterated_smoothing
-from torch_denkf.modules._gaussian import further_keys
 from torch_denkf.modules._spaces import checked_spaces, reading_about
 from torch_denkf.modules.around import AugmentedBelief
+from torch_denkf.modules.gaussian import further_keys
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.running import check_module, random_parts, run_module
 from torch_denkf.smoothers.past import moments_of

@@ -17,8 +17,8 @@ from torch.nn import functional as F
 from torchrl.modules import LSTMCell
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.modules._tensors import as_vector, mean_of_members
 from torch_denkf.modules.around import AugmentedBelief
+from torch_denkf.modules.tensors import as_vector, mean_of_members
 from torch_denkf.submodel import Entries, Transition, Update
 
 __all__ = ["LSTMTransition", "LSTMUpdate", "with_memory"]

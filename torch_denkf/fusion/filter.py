@@ -29,8 +29,8 @@ from torch_denkf.modules import (
     UKFTransition,
     as_process_noise,
 )
-from torch_denkf.modules._ensemble import EnsembleUpdate
-from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition
+from torch_denkf.modules.ensemble import EnsembleUpdate
+from torch_denkf.modules.gaussian import GaussianAnalysis, GaussianTransition
 from torch_denkf.running import check_module, writes
 from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, with_past
 from torch_denkf.smoothers.past_moments import CrossTransition

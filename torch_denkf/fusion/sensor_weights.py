@@ -14,7 +14,7 @@ from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.fusion.parts import StateObservation
-from torch_denkf.modules._tensors import mean_of_members
+from torch_denkf.modules.tensors import mean_of_members
 from torch_denkf.running import reads
 from torch_denkf.submodel import Sensor
 

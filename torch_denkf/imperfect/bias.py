@@ -31,9 +31,9 @@ from torch_denkf._checks import check_values
 from torch_denkf.beliefs import is_samples
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._tensors import as_standard_deviations
 from torch_denkf.modules.around import AroundInitial, Wrapper
 from torch_denkf.modules.process_noise import as_process_noise
+from torch_denkf.modules.tensors import as_standard_deviations
 from torch_denkf.running import check_module
 from torch_denkf.submodel import Initial, Transition, role
 

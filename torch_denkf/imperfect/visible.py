@@ -29,9 +29,9 @@ from torch_denkf.beliefs import Ensemble, complete
 from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.mixture import log_mixture, mix_members, mix_moments, responsibility
 from torch_denkf.functional.weighted import scored_innovation
-from torch_denkf.modules._tensors import mean_of_members
 from torch_denkf.modules.around import Around
 from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.modules.tensors import mean_of_members
 from torch_denkf.running import check_module
 from torch_denkf.submodel import Call, Entries, Sensor, Update
 

@@ -12,9 +12,9 @@ from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_cov
-from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
 from torch_denkf.modules._spaces import mean_and_tangents, reading_about
-from torch_denkf.modules._tensors import as_floating, check_dims
+from torch_denkf.modules.ensemble import EnsembleAnalysisKeys, EnsembleUpdate
+from torch_denkf.modules.tensors import as_floating, check_dims
 
 __all__ = ["EnsembleAnalysis"]
 
@@ -45,7 +45,7 @@ class EnsembleAnalysis(EnsembleUpdate):
             :mod:`torch_denkf.functional.manifolds`.
         reading_space: in which the reading lives; innovation and R are tangents. In the place of ``angles``.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
-        **keys: see :class:`~torch_denkf.modules._ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs
+        **keys: see :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs
             learned observations, not one reading.
 
     Raises:

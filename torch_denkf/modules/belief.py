@@ -14,7 +14,7 @@ from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._spaces import checked_space
-from torch_denkf.modules._tensors import (
+from torch_denkf.modules.tensors import (
     as_floating,
     as_standard_deviations,
     check_dims,

@@ -9,7 +9,7 @@ from torch import nn
 
 from torch_denkf._checks import check_covariance, check_square, check_values
 from torch_denkf.functional.continuous import discretise
-from torch_denkf.modules._tensors import as_floating, register_constant
+from torch_denkf.modules.tensors import as_floating, register_constant
 from torch_denkf.running import check_module, reads, run_module
 from torch_denkf.submodel import SubModel, Transition
 

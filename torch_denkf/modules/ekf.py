@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_denkf.functional import kalman_update
 from torch_denkf.functional.manifolds import Euclidean, Space
-from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
+from torch_denkf.modules.gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
 from torch_denkf.running import reads
 from torch_denkf.submodel import Call, Entries, Update, role
 

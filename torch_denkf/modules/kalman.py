@@ -14,9 +14,9 @@ from torch_denkf.functional import kalman_predict, kalman_update, wrap_angles
 from torch_denkf.functional.angles import mean_observation
 from torch_denkf.functional.linalg import product_of_known
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._gaussian import as_covariance, further_keys, updated
 from torch_denkf.modules._spaces import checked_space
-from torch_denkf.modules._tensors import as_standard_deviations, check_dims, register_constant
+from torch_denkf.modules.gaussian import as_covariance, further_keys, updated
+from torch_denkf.modules.tensors import as_standard_deviations, check_dims, register_constant
 from torch_denkf.running import run_module
 from torch_denkf.submodel import Call, Entries, Initial, Transition, Update
 

@@ -15,8 +15,8 @@ from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.angles import mean_observation
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._spaces import checked_spaces, without_hidden
-from torch_denkf.modules._tensors import as_vector, check_dims, mean_of_members
 from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.modules.tensors import as_vector, check_dims, mean_of_members
 from torch_denkf.submodel import Update
 
 __all__ = ["GaussianLikelihood", "LearnedLikelihood"]

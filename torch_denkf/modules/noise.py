@@ -10,14 +10,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number, check_values
-from torch_denkf.modules._tensors import (
+from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.modules.tensors import (
     as_standard_deviations,
     mean_of_members,
     register_location,
     register_scale,
     variance_and_floor,
 )
-from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.running import check_module, reads, run_module
 from torch_denkf.submodel import Sensor, SubModel
 

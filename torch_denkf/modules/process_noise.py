@@ -16,7 +16,9 @@ from torch import nn
 from torch.nn import functional as F
 
 from torch_denkf._checks import check_count, check_values
-from torch_denkf.modules._tensors import (
+from torch_denkf.modules.noise import ConstantNoise
+from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.modules.tensors import (
     as_floating,
     mean_of_members,
     register_constant,
@@ -24,8 +26,6 @@ from torch_denkf.modules._tensors import (
     register_scale,
     variance_and_floor,
 )
-from torch_denkf.modules.noise import ConstantNoise
-from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.running import check_module, reads, run_module
 from torch_denkf.submodel import Initial, SubModel, role
 

@@ -11,9 +11,9 @@ from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf._checks import check_count, has_values
-from torch_denkf.modules._tensors import as_vector, register_location, register_scale
 from torch_denkf.modules._trunk import activation_bytes, couples_frames, in_chunks, reduced_precision
 from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.modules.tensors import as_vector, register_location, register_scale
 from torch_denkf.submodel import Sensor
 
 __all__ = ["ImageSensor", "VectorSensor", "convolutional_trunk"]

@@ -8,8 +8,8 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf.modules._tensors import register_location, register_scale
 from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.modules.tensors import register_location, register_scale
 from torch_denkf.running import check_network
 from torch_denkf.submodel import SubModel, Transition
 

@@ -6,7 +6,7 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_number
-from torch_denkf.modules._tensors import mask_of
+from torch_denkf.modules.tensors import mask_of
 from torch_denkf.submodel import Sensor
 
 __all__ = ["BlackIsMissing"]

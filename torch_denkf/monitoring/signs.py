@@ -9,7 +9,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.modules._tensors import mask_of
+from torch_denkf.modules.tensors import mask_of
 from torch_denkf.monitoring._calibration import sign_limits
 from torch_denkf.submodel import Sensor
 

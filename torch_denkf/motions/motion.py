@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_values
 from torch_denkf.functional.manifolds import Product
-from torch_denkf.modules._tensors import as_vector
+from torch_denkf.modules.tensors import as_vector
 from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
 from torch_denkf.submodel import SubModel, Transition
 

@@ -19,7 +19,7 @@ from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
 from torch_denkf.filters.structure import previous_key
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._tensors import as_floating
+from torch_denkf.modules.tensors import as_floating
 from torch_denkf.objectives import _terms
 from torch_denkf.objectives._labels import Keys, Truth
 from torch_denkf.objectives.filter_loss import FilterLoss, ReadingsOptions, StateOptions, Term

@@ -16,8 +16,8 @@ from torch import nn
 
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing.rts import smoothing_gain
-from torch_denkf.modules._gaussian import GaussianTransition
 from torch_denkf.modules.around import Wrapper
+from torch_denkf.modules.gaussian import GaussianTransition
 from torch_denkf.modules.kalman import LinearTransition
 from torch_denkf.smoothers.past import Past, check_age
 from torch_denkf.submodel import Entries, SubModel, Transition

@@ -14,7 +14,7 @@ from torch_denkf._checks import check_number, check_values
 from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._spaces import checked_spaces
-from torch_denkf.modules._tensors import check_dims
+from torch_denkf.modules.tensors import check_dims
 from torch_denkf.submodel import Call, Entries, Update
 
 __all__ = ["EnsembleAnalysisKeys", "EnsembleUpdate"]

@@ -15,8 +15,8 @@ from torch_denkf.functional.angles import mean_observation, wrap_angles
 from torch_denkf.functional.gaussian import GaussianUpdate
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._spaces import checked_space, checked_spaces, without_hidden
-from torch_denkf.modules._tensors import check_dims
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
+from torch_denkf.modules.tensors import check_dims
 from torch_denkf.running import check_module, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, SubModel, Transition, Update
 
