@@ -184,17 +184,25 @@ class Particles(Belief):
         return {**out, "mean": mean, "ensemble": points}
 
 
-def kinds_of(keys: Iterable[NestedKey], space: Space | None = None) -> tuple[Belief, ...]:
-    """Returns the kinds of the beliefs that keys are entries of, one for each prefix."""
-    groups: dict[tuple[str, ...], list[str]] = {}
+def kinds_of(
+    keys: Iterable[NestedKey], space: Space | None = None, carry: Collection[NestedKey] = ()
+) -> tuple[Belief, ...]:
+    """Returns the kinds of the beliefs that keys are entries of, one for each prefix.
+
+    Args:
+        keys: of entries of beliefs.
+        space: in which the state lives; ``None`` for plain numbers.
+        carry: those that go on from step to step, which alone tell the kind where a prefix has any.
+    """
+    groups: dict[tuple[str, ...], list[NestedKey]] = {}
     for key in keys:
-        *prefix, name = (key,) if isinstance(key, str) else key
-        groups.setdefault(tuple(prefix), []).append(name)
+        if not isinstance(key, str):
+            groups.setdefault(key[:-1], []).append(key)
     found = []
-    for prefix, names in groups.items():
-        if prefix:
-            kind = next((kind for kind in Belief._kinds if {*kind.carried} <= {*names}), Belief)
-            found.append(kind(prefix, space))
+    for prefix, group in groups.items():
+        names = {key[-1] for key in [key for key in group if key in carry] or group}
+        kind = next((kind for kind in Belief._kinds if names.issuperset(kind.carried)), Belief)
+        found.append(kind(prefix, space))
     return tuple(found)
 
 

@@ -37,14 +37,12 @@ class Call(NamedTuple):
         place: where the module stands in the filter, e.g. ``"transition"``; its noise is ``("noise", place)``.
         sample: whether random modules draw; if not, they run their deterministic forward.
         time: whether the last dimension of ``batch_size`` is time.
-        drawn: collects, in a trial step, the modules that draw noise and the sizes they ask for.
     """
 
     batch_size: torch.Size
     place: str = "self"
     sample: bool = True
     time: bool = False
-    drawn: dict | None = None
 
     def part(self, name: str) -> Call:
         """The call of a part of the module."""
@@ -295,10 +293,7 @@ class SubModel(Checked, TensorDictModule):
                 if value is not None and value.is_floating_point():
                     where = {"device": value.device, "dtype": value.dtype}
                     break
-            sizes = self.noise_sizes(*values)
-            if call.drawn is not None:
-                call.drawn[call.place] = self, sizes
-            where.update(sizes)
+            where.update(self.noise_sizes(*values))
             given = self.draw_noise(call.batch_size, time=call.time, **where)
             if given is None:  # it would run as if no noise were wanted
                 raise ValueError(

@@ -165,7 +165,7 @@ def test_guards_that_are_left_out_are_not_about_what_users_change():
 
 
 def test_other_versions_of_torch_get_plain_inductor(monkeypatch, caplog):
-    from torch_denkf import inductor
+    from torch_denkf.compilation import options as inductor
 
     monkeypatch.setattr(torch, "__version__", "3.1.0")
     monkeypatch.setattr(inductor, "_said", False)

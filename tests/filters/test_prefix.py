@@ -23,7 +23,6 @@ def named(name, prefix="imu"):
     """A filter of the contract's table, twice: without and with a prefix, under one noise."""
     plain, other = FILTERS[name](), FILTERS[name]()
     other = other.with_options(prefix=prefix)
-    other._sort()  # as its constructor would
     frames = plain.draw_noise(readings(3, 6))
     return plain, other, frames
 

@@ -70,7 +70,7 @@ _CLOSED_OVER = ("writes", "batch", "cuts", "first", "keep", "keys", "start_keys"
 #: Attributes that hold the names of entries.
 _KEYS = frozenset({"in_keys", "_in_keys", "out_keys", "_out_keys_apparent", "optional_keys", "reading_keys", "_wants"})
 #: Where a filter's structure holds modules; all else in it are names.
-_MODULES = (["frames"], ["transition"], ["update"])
+_MODULES = (["frames"], ["transition"], ["update"], ["posterior"])
 #: What is looked up in classes.
 _OF_CLASSES = ("dict(type(", "dict(G[", "type(")
 

@@ -65,8 +65,8 @@ def export_step(
     ONNX lacks factors of matrices. Small systems are written out: readings of up to 4 numbers, and covariances of up to
     6 x 6. What remains is refused by the name of its operator.
 
-    A package cannot raise. That of a filter with ``reject=True`` counts readings that are not finite as missing, and
-    returns their number, ``"info.rejected"``; that of another one has a belief of NaN from then on.
+    A package cannot raise: after a reading that is not finite its belief is NaN from then on. Put a mask into
+    ``example``, and set it to ``False`` for such readings.
 
     What the package returns for the example is compared with the eager step, see
     :meth:`~torch_denkf.filters.Filter.compile`; with noise in the example number by number, otherwise within what the

@@ -7,6 +7,7 @@ from torch_denkf.beliefs import Belief, Particles
 from torch_denkf.diagnosis.once import Once
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.finish import Record
+from torch_denkf.modules.variance_ceiling import VarianceCeiling
 
 __all__ = ["CeilingReached"]
 
@@ -16,15 +17,14 @@ class CeilingReached(Once):
 
     def __call__(self, filter: Filter, record: Record) -> None:
         """Looks at the variances that a filter wrote."""
-        if self.said or filter.variance_ceiling is None:
-            return
-        if filter.compiled is None and not filter.structure.update[-1][1].reached:
+        ceiling = filter.structure.posterior[-1][1] if filter.structure.posterior else None
+        if self.said or not isinstance(ceiling, VarianceCeiling) or not (ceiling.reached or filter.compiled):
             return
         for kind in filter.structure.kinds:
             value = record.written.get(kind.key("var"))
             if value is None or value.is_cuda:
                 continue
-            if flag_value((value >= 0.999 * filter.variance_ceiling).any()):
+            if flag_value((value >= 0.999 * ceiling.ceiling).any()):
                 self._say(filter, kind)
 
     def _say(self, filter: Filter, kind: Belief) -> None:

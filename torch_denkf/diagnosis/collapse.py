@@ -26,9 +26,11 @@ class NarrowEnsemble(Once):
     steps, when a wrong start is over.
     """
 
+    ways = ("sequence",)
+
     def __call__(self, filter: Filter, record: Record) -> None:
         """Looks at innovations; updates whose diagnostics are not kept are not looked at."""
-        if record.way != "sequence" or torch.is_grad_enabled():
+        if torch.is_grad_enabled():
             return
         structure, outputs = filter.structure, record.written
         for place, module in structure.update:

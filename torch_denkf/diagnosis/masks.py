@@ -47,7 +47,10 @@ class UnreadMasks(Once):
         _, unmasked, readings = self._known
         if unmasked:
             self._unread(structure, tensordict, unmasked)
-        self._misspelt(structure, tensordict, name)
+        present = tuple(tensordict.keys())
+        if present not in self._seen:
+            self._seen.add(present)
+            self._misspelt(structure, tensordict, name, present)
         for key, own in readings:
             mask = tensordict.get(own, None)
             if mask is not None:
@@ -77,12 +80,8 @@ class UnreadMasks(Once):
                         "in compute(). Where its reading is never missing, there is nothing to do.",
                     )
 
-    def _misspelt(self, structure: Structure, tensordict: TensorDictBase, name: str) -> None:
+    def _misspelt(self, structure: Structure, tensordict: TensorDictBase, name: str, present: tuple) -> None:
         """Warns of a boolean entry that nothing reads, named nearly like a mask that is read and is not there."""
-        present = tuple(tensordict.keys())
-        if present in self._seen:
-            return
-        self._seen.add(present)
         read = {*structure.optional, *structure.needed}
         # What is the mask of another entry that is there belongs to that entry.
         others = {f"{key}{_OWN_MASK}" for key in present}

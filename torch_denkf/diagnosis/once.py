@@ -20,6 +20,9 @@ class Once:
         ...             self.warn("variance", f"{type(filter).__name__} knows nothing of its state.")
     """
 
+    #: The ways to run that it looks at.
+    ways: tuple[str, ...] = ("step", "sequence", "policy", "environment")
+
     def __init__(self) -> None:
         self.said: set[str] = set()
 

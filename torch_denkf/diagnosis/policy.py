@@ -25,12 +25,13 @@ class PolicyStart(Once):
     It is noticed where the environment runs in the same process and nothing copies the belief on its way.
     """
 
+    ways = ("policy", "environment")
+
     def __call__(self, filter: Filter, record: Record) -> None:
         """Looks at the belief that a step of a policy starts from, and remembers the one that it leads to."""
         carry = filter.structure.carry[0]
         if record.way == "environment":
             _UP_TO_DATE[record.written[carry]] = None
-        if record.way != "policy":
             return
         belief = record.entries.get(previous_key(carry))
         writer = None if belief is None else _CARRIED.get(belief)

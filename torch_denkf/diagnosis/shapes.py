@@ -8,6 +8,7 @@ from tensordict import NestedKey, unravel_key
 from torch import Tensor
 
 from torch_denkf.beliefs import Ensemble, Particles, is_samples
+from torch_denkf.diagnosis.once import Once
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.finish import Record
 from torch_denkf.filters.structure import Structure
@@ -16,10 +17,11 @@ from torch_denkf.submodel import Update, in_role
 __all__ = ["ReadingRanks"]
 
 
-class ReadingRanks:
+class ReadingRanks(Once):
     """Raises where an observation of several robots would be broadcast against the belief of one."""
 
     def __init__(self) -> None:
+        super().__init__()
         self._known: tuple[Structure | None, list[NestedKey]] = (None, [])
 
     def __call__(self, filter: Filter, record: Record) -> None:

@@ -29,9 +29,9 @@ from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_count
 from torch_denkf._registered import compiler, diagnosis, primers
 from torch_denkf._slices import as_rows, starts_of
-from torch_denkf.filters.finish import Record, check_belief, own, write
+from torch_denkf.filters.finish import Record, check_belief, own
 from torch_denkf.filters.gather import gather_rows, of_one_robot
-from torch_denkf.filters.noise import Drawn, draw_noise
+from torch_denkf.filters.noise import Drawn, draw_noise, recorded_draws
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.filters.refusals import (
     check_inputs,
@@ -163,11 +163,11 @@ class Filter(Checked, TensorDictSequential):
         diagnosis().check_composition(modules, structure)
         if self.variance_ceiling is not None:
             ceiling = VarianceCeiling(structure.kinds, structure.belief, self.variance_ceiling)
-            structure = structure._replace(update=(*structure.update, ("variance_ceiling", ceiling)))
+            structure = structure._replace(posterior=(*structure.update, ("variance_ceiling", ceiling)))
         self.structure, self.steps = structure, Steps(structure, self.update_at_reset)
         self._drawn: dict[tuple, Drawn] = {}
         placed = (*modules, ("initial", self.initial))
-        self._places = {found for place, module in placed for found, _ in random_parts(module, place)}
+        self._random = [found for place, module in placed for found in random_parts(module, place)]
         written = structure.out_keys
         self._own_keys = {*written, *map(unravel_key, self.initial.out_keys)}
         self.in_keys = [self.outer(key) for key in structure.in_keys(self.init_key)]
@@ -433,8 +433,12 @@ class Filter(Checked, TensorDictSequential):
             without = refuse_unknown_readings(self.structure, without)
             refuse_single_readings(self.structure, without)
             entries = {key: value for key, value in entries.items() if key not in without}
-        check_inputs(self.structure, type(self).__name__, entries, tensordict, without)
-        written = self.steps.step(entries, Call(size), partial=True) if without else self.take_step(entries, size)
+        if not entries.keys() >= self.structure.must:
+            check_inputs(self.structure, type(self).__name__, entries, tensordict, without)
+        if without:
+            written = self.steps.step(entries, Call(size), partial=True)
+        else:
+            written = (self.steps if self.compiled is None else self.compiled.of(self)).step(entries, Call(size))
         return self.write(tensordict, self.finished(Record("step", tensordict, entries, written)))
 
     def predict(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
@@ -477,7 +481,8 @@ class Filter(Checked, TensorDictSequential):
             check_belief(self.structure, record.entries, record.written)
         record = record._replace(written=own(record.written, record.entries.values() if given is None else given))
         for observe in self.observers:
-            observe(self, record)
+            if record.way in getattr(observe, "ways", (record.way,)):
+                observe(self, record)
         return record.written
 
     def initialise(
@@ -628,7 +633,7 @@ class Filter(Checked, TensorDictSequential):
         given = tensordict.get(self._noise_key, None)
         if given is not None:
             noise = flat_noise(given)
-            refuse_unknown_noise(self._places, type(self).__name__, noise)
+            refuse_unknown_noise({place for place, _ in self._random}, type(self).__name__, noise)
             entries.update(noise)
         return entries
 
@@ -640,10 +645,21 @@ class Filter(Checked, TensorDictSequential):
         return own(structure.completed(start), entries.values())
 
     def write(self, tensordict: TensorDictBase, written: Entries) -> TensorDictBase:
-        """Sets entries, under the names that they have outside of the filter, and returns the tensordict."""
-        if self._options["prefix"] is not None:
-            written = {self.outer(key): value for key, value in written.items()}
-        return write(tensordict, written)
+        """Sets entries, under their names outside of the filter; looks each nested tensordict up once."""
+        owners: dict[tuple, Any] = {}
+        for key, value in written.items():
+            if self._options["prefix"] is not None:
+                key = self.outer(key)
+            prefix = () if isinstance(key, str) else key[:-1]
+            owner = tensordict if not prefix else owners.get(prefix)
+            if owner is None:
+                owner = tensordict.get(prefix, None) if type(tensordict) is TensorDict else None
+            if isinstance(owner, TensorDictBase):
+                owners[prefix] = owner
+                owner.set(key[-1] if prefix else key, value)
+            else:  # not there yet
+                tensordict.set(key, value)
+        return tensordict
 
     def options(self) -> FilterOptions:
         """Returns the options that the filter was made with."""
@@ -663,7 +679,7 @@ class Filter(Checked, TensorDictSequential):
         generator: torch.Generator | None = None,
     ) -> Entries:
         """Draws the noise of some modules, or all, that is not among the entries; one trial step tells the sizes."""
-        if not self._places:
+        if not self._random:
             return {}
         shapes = {
             key: value.shape[len(size) :] for key, value in entries.items() if key[0] not in ("noise", "previous")
@@ -682,11 +698,11 @@ class Filter(Checked, TensorDictSequential):
             row = {key: value.flatten(0, len(size) - 1)[:1] if size else value for key, value in row.items()}
         else:
             row = {key: value.new_zeros(1, *value.shape[len(size) :]) for key, value in row.items()}
-        call = Call(torch.Size([1] if size else []), drawn={})
-        with torch.random.fork_rng(devices=[]), set_recurrent_mode(False):
+        call = Call(torch.Size([1] if size else []))
+        with torch.random.fork_rng(devices=[]), set_recurrent_mode(False), recorded_draws(self, self._random) as drawn:
             start = run_module(self.initial, dict(row), call.part("initial"))
             self.steps.step({**start, **row}, call)
-        return call.drawn or {}
+        return drawn
 
 
 def _shallow(module: torch.nn.Module) -> Any:

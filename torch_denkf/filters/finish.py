@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from torch_denkf._checks import flag_value
@@ -17,7 +17,7 @@ from torch_denkf.submodel import Entries
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
-__all__ = ["Record", "check_belief", "own", "write"]
+__all__ = ["Record", "check_belief", "own"]
 
 
 class Record(NamedTuple):
@@ -49,22 +49,6 @@ def own(written: Entries, given: Iterable[Tensor] = ()) -> Entries:
     return out
 
 
-def write(tensordict: TensorDictBase, written: Entries) -> TensorDictBase:
-    """Sets entries, looking up each nested tensordict once, and returns the tensordict."""
-    owners: dict[tuple, Any] = {}
-    for key, value in written.items():
-        prefix = () if isinstance(key, str) else key[:-1]
-        owner = tensordict if not prefix else owners.get(prefix)
-        if owner is None:
-            owner = tensordict.get(prefix, None) if type(tensordict) is TensorDict else None
-        if isinstance(owner, TensorDictBase):
-            owners[prefix] = owner
-            owner.set(key[-1] if prefix else key, value)
-        else:  # not there yet
-            tensordict.set(key, value)
-    return tensordict
-
-
 def check_belief(structure: Structure, entries: Entries, written: Entries) -> None:
     """Raises where the new belief is not finite.
 
@@ -80,12 +64,12 @@ def check_belief(structure: Structure, entries: Entries, written: Entries) -> No
     for key, kind in structure.carried:
         value = written[key]
         if value.is_floating_point():
-            sound = kind.finite(key[-1], value)
+            sound = value.isfinite().all() if kind is None else kind.finite(key[-1], value)
             finite = sound if finite is None else finite & sound
     if finite is None or flag_value(finite) is not False:
         return
     kinds, given = dict(structure.carried), {key: value for key, value in entries.items() if value.is_floating_point()}
-    bad = [key for key, value in given.items() if not kinds.get(key, Belief()).finite(key[-1], value)]
+    bad = [key for key, value in given.items() if not (kinds.get(key) or Belief()).finite(key[-1], value)]
     why = f"NaN or infinity in {bad}" if bad else "its motion: all inputs are finite, and the filter diverged"
     raise ValueError(
         f"The new belief is not finite, because of {why}. The tensordict was left as it is. "

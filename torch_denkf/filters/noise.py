@@ -1,19 +1,51 @@
-"""The noise of all modules of a filter, drawn in bulk. One trial step tells which module draws what."""
+"""Draws the noise of all modules of a filter in bulk; one trial step tells which module draws what."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torch_denkf.submodel import Entries, SubModel, flat_noise
 
-__all__ = ["Drawn", "draw_noise"]
+__all__ = ["Drawn", "draw_noise", "recorded_draws"]
 
 #: The sub-models that draw noise, by place, and the sizes that they asked for.
 Drawn = dict[str, tuple[SubModel, dict[str, Any]]]
+
+
+@contextmanager
+def recorded_draws(filter: nn.Module, parts: Sequence[tuple[str, SubModel]]) -> Iterator[Drawn]:
+    """Records the sizes that sub-models ask for when they draw noise; forward hooks are not called meanwhile.
+
+    Args:
+        filter: whose modules they are.
+        parts: sub-models that draw noise, and their places.
+    """
+    drawn: Drawn = {}
+    hooked = [(part, part._forward_hooks, part._forward_pre_hooks) for part in filter.modules()]
+    try:
+        for part, *_ in hooked:
+            part._forward_hooks, part._forward_pre_hooks = OrderedDict(), OrderedDict()
+        for _, part in parts:
+            part.draw_noise = partial(_record, drawn, parts, part)
+        yield drawn
+    finally:
+        for _, part in parts:
+            part.__dict__.pop("draw_noise", None)
+        for part, hooks, pre_hooks in hooked:
+            part._forward_hooks, part._forward_pre_hooks = hooks, pre_hooks
+
+
+def _record(drawn: Drawn, parts: Sequence[tuple[str, SubModel]], part: SubModel, batch_size, **options) -> Any:
+    sizes = {name: value for name, value in options.items() if name not in ("time", "device", "dtype", "generator")}
+    drawn.update({place: (part, sizes) for place, other in parts if other is part})
+    return type(part).draw_noise(part, batch_size, **options)
 
 
 def draw_noise(
@@ -26,7 +58,17 @@ def draw_noise(
     time: bool = False,
     generator: torch.Generator | None = None,
 ) -> Entries:
-    """The noise that is not among what is given, of ``batch_size`` elements; of some modules, or of all."""
+    """Draws the noise that is not among what is given, of ``batch_size`` elements; of some modules, or of all.
+
+    Args:
+        drawn: which module draws what.
+        given: entries, some of which may be noise.
+        batch_size: ``[*B]``, or ``[*B, T]``.
+        places: of the modules in the filter.
+        like: has the precision and device of the noise.
+        time: whether the last of ``batch_size`` is time.
+        generator: source of randomness; torch's global one by default.
+    """
     out: Entries = {}
     where = {} if like is None else {"device": like.device, "dtype": like.dtype}
     chosen = None if places is None else tuple(places)

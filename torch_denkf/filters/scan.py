@@ -86,19 +86,20 @@ class Steps(NamedTuple):
             KeyError: if no module writes the belief where observations are missing.
         """
         structure, entries = self.structure, dict(entries)
-        written = self.run(structure.frames, entries, call, partial) if frames else {}
-        begin = (start(entries) if callable(start) else start) or {}
+        written = self.run(structure.frames, entries, call, partial) if frames and structure.frames else {}
+        begin = start or {} if start is None or isinstance(start, dict) else start(entries)
         if forecast is None:
             if reset is not None:
                 # Before the transition, too: its gradient would be NaN where the episode before diverged.
                 entries.update({key: where_rows(reset, begin[key], entries[key]) for key in structure.carry})
-            forecast = self.run((structure.transition,), entries, call)
+            place, transition = structure.transition
+            forecast = run_module(transition, entries, call._replace(place=place))
             if reset is not None:
                 for key, name in structure.forecast_of.items():
                     forecast[name] = where_rows(reset, begin[key], forecast[name])
         entries.update(forecast)
         written.update(forecast)
-        written.update(self.run(structure.update, entries, call, partial))
+        written.update(self.run(structure.posterior, entries, call, partial))
         for key, parts in structure.totals.items():
             if not partial or written.keys() >= {*parts}:
                 written[key] = sum((written[part] for part in parts[1:]), written[parts[0]])

@@ -58,12 +58,14 @@ class Structure(NamedTuple):
         frames: modules that read frames alone, and not the belief.
         transition: the module that forecasts the carry: the first that depends on the belief.
         update: the modules between the forecast and the belief, and those that depend on the action alone.
-        needed: keys that must be there beside the carry and the controls.
+        posterior: the same, and the ceiling of variances.
+        needed: keys that must be there in addition to the carry and the controls.
+        must: all keys without which there is no step.
         optional: keys that are used where they are there.
         controls: keys that drive the transition.
         required_controls: those of them that must be there.
         carry: keys of the belief that go on from step to step.
-        carried: the same, each with the kind of belief that it is of.
+        carried: the same, each with the kind of belief that knows what finite means there; ``None`` for all others.
         belief: keys of the belief; the carry, and what follows from it.
         forecast_of: the forecast of each carried entry, as far as the transition writes one.
         beside: what else the transition writes.
@@ -81,12 +83,14 @@ class Structure(NamedTuple):
     frames: tuple[Placed, ...]
     transition: Placed
     update: tuple[Placed, ...]
+    posterior: tuple[Placed, ...]
     needed: tuple[NestedKey, ...]
+    must: frozenset[NestedKey]
     optional: tuple[NestedKey, ...]
     controls: tuple[NestedKey, ...]
     required_controls: tuple[NestedKey, ...]
     carry: tuple[NestedKey, ...]
-    carried: tuple[tuple[NestedKey, Belief], ...]
+    carried: tuple[tuple[NestedKey, Belief | None], ...]
     belief: tuple[NestedKey, ...]
     forecast_of: dict[NestedKey, NestedKey]
     beside: tuple[NestedKey, ...]
@@ -156,19 +160,21 @@ class Structure(NamedTuple):
             )
         belief = list(dict.fromkeys([*(key for key in provided if key in step_keys), *summary_keys(carry, step_keys)]))
         space = role(initial, Initial).space
-        kinds = kinds_of(belief, space)
+        kinds = kinds_of(belief, space, carry)
         forecast_of = _forecasts(carry, writes(steps[0][1]), forecast_keys)
         return cls(
             initial=initial,
             frames=tuple(frames),
             transition=steps[0],
             update=tuple(steps[1:]),
+            posterior=tuple(steps[1:]),
             needed=tuple(key for key in needed if key not in carry and key not in control_keys),
+            must=frozenset([*needed, *carry]),
             optional=tuple(key for key in optional if key not in carry and key not in control_keys),
             controls=tuple(key for key in (*needed, *optional) if key in control_keys),
             required_controls=tuple(key for key in needed if key in control_keys),
             carry=tuple(carry),
-            carried=tuple((key, next((kind for kind in kinds if key in kind.carry), Belief())) for key in carry),
+            carried=tuple((key, _judge_of(key, kinds)) for key in carry),
             belief=tuple(belief),
             forecast_of=forecast_of,
             beside=tuple(key for key in writes(steps[0][1]) if key not in forecast_of.values()),
@@ -181,6 +187,12 @@ class Structure(NamedTuple):
             frame_keys=tuple(dict.fromkeys(key for _, module in frames for key in writes(module))),
             step_keys=step_keys,
         )
+
+
+def _judge_of(key: NestedKey, kinds: Sequence[Belief]) -> Belief | None:
+    """Returns the kind of belief that has its own ``finite`` for an entry."""
+    own = (kind for kind in kinds if key in kind.carry and type(kind).finite is not Belief.finite)
+    return next(own, None)
 
 
 def _sorted(

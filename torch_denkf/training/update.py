@@ -52,9 +52,9 @@ class Updates:
         processes: with which the gradient is averaged.
 
     Attributes:
-        skipped: updates of the stage that were left out because the loss, its gradient or a reading was not finite.
+        skipped: updates of the stage that were left out because the loss or its gradient was not finite.
         in_a_row: those of them that were the last ones.
-        refused: what a filter said of the last batch whose readings it refused.
+        cause: names the entries that were not finite in the batch of the last of them; empty where all were finite.
 
     Example:
         >>> net = torch.nn.Linear(1, 1, bias=False)
@@ -71,7 +71,7 @@ class Updates:
         self.parameters = [parameter for group in groups for parameter in group["params"]]
         self.skipped = self.in_a_row = self._count = 0
         self._sums: dict[str, torch.Tensor] = {}
-        self._lr, self.refused = 0.0, ""
+        self._lr, self.cause = 0.0, ""
 
     def step(self, batch: TensorDictBase) -> bool:
         """Makes one optimiser step, unless the loss or its gradient is not finite.
@@ -108,11 +108,10 @@ class Updates:
 
     def _skip(self, batch: TensorDictBase) -> bool:
         """Leaves the step out, and says which entries of the batch are not finite."""
-        floats = batch.items(True, True)
-        bad = [key for key, value in floats if value.is_floating_point() and not value.isfinite().all()]
-        if bad:
-            self.refused = f"There is NaN or infinity in {bad}: RejectReadings masks it."
         self.skipped, self.in_a_row = self.skipped + 1, self.in_a_row + 1
+        values = batch.items(True, True) if isinstance(batch, TensorDictBase) else batch.items()
+        keys = [key for key, value in values if value.is_floating_point() and not bool(value.isfinite().all())]
+        self.cause = f"{keys} of its batch hold NaN or infinity: RejectReadings hides such readings." if keys else ""
         self.optimiser.zero_grad()
         return False
 
