@@ -170,4 +170,4 @@ def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str
     else:
         parts = named_modules_of(module) if is_sequence(module) else ()
     for name, part in parts:
-        yield from random_parts(part, name if place == "self" else f"{place}.{name}")
+        yield from random_parts(part, name if name and place == "self" else f"{place}.{name}" if name else place)

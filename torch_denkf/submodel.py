@@ -167,7 +167,7 @@ class SubModel(Checked, TensorDictModule):
         return {}
 
     def parts(self) -> dict[str, TensorDictModuleBase]:
-        """The modules inside that may draw noise of their own, by name."""
+        """Returns the modules inside that may draw noise of their own, by name; ``""`` for its own place."""
         return {}
 
     @property

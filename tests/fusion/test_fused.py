@@ -11,7 +11,6 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torch.testing import assert_close
-from torch_denkf.filters.rejection import REJECTED
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check

@@ -11,7 +11,7 @@ import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.running import check_module, is_sequence, named_modules_of, reads, run_module, writes
+from torch_denkf.running import check_module, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, Initial, SubModel, Update, role
 
 __all__ = ["Around", "AroundInitial", "AugmentedBelief", "Stateful", "Wrapper", "passes_on", "with_state"]
@@ -65,19 +65,9 @@ class Wrapper(SubModel):
             optional_keys=optional if optional_keys is None else optional_keys,
         )
 
-    draw_noise = _Inside(SubModel, "draw_noise")
-    noise_sizes = _Inside(SubModel, "noise_sizes")
-
-    @property
-    def noise_names(self) -> tuple[str, ...]:
-        """Those of the module inside, unless that has a place of its own."""
-        return role(self.module, SubModel).noise_names if self.place is None else ()
-
     def parts(self):
-        """Returns the module inside, or where that has no place of its own, its parts."""
-        if self.place is not None:
-            return {self.place: self.module}
-        return dict(named_modules_of(self.module)) if is_sequence(self.module) else role(self.module, SubModel).parts()
+        """Returns the module inside, under the empty name where its noise has the wrapper's place."""
+        return {self.place or "": self.module}
 
     def run_inside(self, entries: Entries, call: Call) -> Entries:
         """Returns what the module inside writes."""

@@ -17,6 +17,7 @@ from torch_denkf.monitoring._calibration import IDENTITY, check_observation_dim,
 from torch_denkf.monitoring.chi_square import chi_square_quantile
 from torch_denkf.monitoring.gating import adapt, disbelief, spread_about_mean
 from torch_denkf.monitoring.innovation_tests import interpolate
+from torch_denkf.running import random_parts
 from torch_denkf.smoothers.past import LaggedAnalysis
 from torch_denkf.submodel import Call, Entries, Update, flat_noise
 
@@ -269,9 +270,9 @@ class GatedAnalysis(Around):
         if self.claimed is not None:
             mean = self.required(entries, self.in_keys[0])
             entries[self.noise_variance_key] = self.claimed.expand(*mean.shape[:-1], *self.claimed.shape)
-        if self.noise_names and call.sample:
-            values = [self.required(entries, key) for key in self.module.in_keys]
-            entries.update(flat_noise(self.module._noise(entries, values, call), call.place))
+        for place, part in random_parts(self.module, call.place) if call.sample else ():
+            values = [self.required(entries, key) for key in part.in_keys]
+            entries.update(flat_noise(part._noise(entries, values, call._replace(place=place)), place))
         return entries
 
     def _parts(self, entries: Entries, nis: Tensor, innovation: Tensor) -> tuple[Tensor, Tensor]:

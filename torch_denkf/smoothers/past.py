@@ -180,13 +180,11 @@ class LaggedAnalysis(Around):
 
     def on_aligned(self, entries, call):
         """See :meth:`EnsembleAnalysis.on_aligned`."""
-        return Update.on_entries(self, entries, call)
-
-    def compute(self, forecast, predicted, observation, variance, past, observed=None, *, noise):
-        """The belief, the diagnostics, and the past."""
-        read, analysis = (predicted, observation, variance, observed), self.module
-        out = analysis.by_key(analysis.compute(forecast, *read, **({"noise": noise} if analysis.draws else {})))
-        return *out.values(), analysis.move_past(past, *read, noise=noise)
+        analysis = self.module
+        values, past = analysis.values(entries), self.required(entries, self.out_keys[-1])
+        noise = analysis._noise(entries, values, call) if analysis.draws else None
+        out = analysis.by_key(analysis.compute(*values, **({"noise": noise} if analysis.draws else {})))
+        return {**out, self.out_keys[-1]: analysis.move_past(past, *values[1:], noise=noise)}
 
 
 def lagged(analysis: Update) -> Update:
