@@ -5,7 +5,8 @@ A kind is one class. A new one is a sub-class of :class:`Belief`, which is found
     class Mixture(Belief):
         carried = ("means", "covs", "log_weights")
 
-        def derived(self, name, means, covs, log_weights):
+        def derived(self, name, *carried):
+            means, covs, log_weights = carried
             ...
 """
 
@@ -120,8 +121,9 @@ class Moments(Belief):
 
     carried = ("mean", "cov")
 
-    def derived(self, name, mean, cov):
+    def derived(self, name, *carried):
         """Computes the variances."""
+        _, cov = carried
         return cov.diagonal(dim1=-2, dim2=-1) if name == "var" else None
 
 
@@ -130,8 +132,9 @@ class Ensemble(Belief):
 
     carried = ("ensemble",)
 
-    def derived(self, name, ensemble):
+    def derived(self, name, *carried):
         """Computes mean, variances and covariance of the sample."""
+        (ensemble,) = carried
         if self.space is not None and name in _SUMMARIES:
             return moments_on(self.space, ensemble)[_SUMMARIES.index(name)]
         sample = {"mean": ensemble_mean, "var": ensemble_var, "cov": ensemble_cov}.get(name)
@@ -155,8 +158,9 @@ class Particles(Belief):
 
     carried = ("ensemble", "log_weight")
 
-    def derived(self, name, ensemble, log_weight):
+    def derived(self, name, *carried):
         """Computes the weighted mean and variances."""
+        ensemble, log_weight = carried
         if name not in _SUMMARIES:
             return None
         if self.space is not None:

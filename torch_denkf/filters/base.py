@@ -147,7 +147,11 @@ class Filter(Checked, TensorDictSequential):
         self.init_key = unravel_key(init_key)
         self.control_keys = [unravel_key(key) for key in control_keys]
         self.forecast_keys, self.check_finite = dict(forecast_keys or {}), check_finite
-        self._options = {"update_at_reset": update_at_reset, "variance_ceiling": variance_ceiling, "prefix": prefix}
+        self._options: dict[str, Any] = {
+            "update_at_reset": update_at_reset,
+            "variance_ceiling": variance_ceiling,
+            "prefix": prefix,
+        }
         if prefix == "next":
             raise ValueError('prefix="next" is where torchrl keeps the next step: give the filter another name')
         self.compiled: Any = None
@@ -328,18 +332,14 @@ class Filter(Checked, TensorDictSequential):
         Like :meth:`torchrl.modules.LSTMModule.make_tensordict_primer`; where actions drive the filter, it also brings
         the last action (:class:`torch_denkf.transforms.LastAction`).
         """
-        told, like = role(self.initial, Initial), self.like()
-        like = torch.zeros(()) if like is None else like
-        size = told.input_dim or told.state_dim or 1
-        zeros = torch.zeros(size, dtype=like.dtype, device=like.device)
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
-            belief = self.initial(TensorDict({key: zeros.clone() for key in self.initial.in_keys}))
+            belief = run_module(self.initial, self._nothing(()), Call(torch.Size(), "initial"))
         found = Composite()
         for key in self.structure.carry:
-            value = belief.get(key)
+            value = belief[key]
             kept = self.outer(previous_key(key))
             found[kept] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
-        found[self.outer(KNOWN)] = Unbounded(shape=(1,), dtype=torch.bool, device=like.device)
+        found[self.outer(KNOWN)] = Unbounded(shape=(1,), dtype=torch.bool, device=value.device)
         return primers().LastAction(
             {key: self.outer(previous_key(key)) for key in self.structure.controls}, primers=found
         )
@@ -690,6 +690,13 @@ class Filter(Checked, TensorDictSequential):
         drawn = self._drawn[kind]
         return draw_noise(drawn, entries, size, places=places, like=self.like(), time=time, generator=generator)
 
+    def _nothing(self, batch_size: Sequence[int]) -> Entries:
+        """Returns zeros for what the initial belief reads, where its shape alone counts."""
+        told, like = role(self.initial, Initial), self.like()
+        like = torch.zeros(()) if like is None else like
+        zeros = like.new_zeros(*batch_size, told.input_dim or told.state_dim or 1)
+        return {key: zeros.clone() for key in reads(self.initial)[0]}
+
     @torch.no_grad()
     def _trial(self, entries: Entries, size: torch.Size) -> Drawn:
         """Finds which modules draw noise in a step, and of what sizes, by one step of the first element."""
@@ -700,7 +707,7 @@ class Filter(Checked, TensorDictSequential):
             row = {key: value.new_zeros(1, *value.shape[len(size) :]) for key, value in row.items()}
         call = Call(torch.Size([1] if size else []))
         with torch.random.fork_rng(devices=[]), set_recurrent_mode(False), recorded_draws(self, self._random) as drawn:
-            start = run_module(self.initial, dict(row), call.part("initial"))
+            start = run_module(self.initial, {**self._nothing(call.batch_size), **row}, call.part("initial"))
             self.steps.step({**start, **row}, call)
         return drawn
 

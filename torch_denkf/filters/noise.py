@@ -33,7 +33,7 @@ def recorded_draws(filter: nn.Module, parts: Sequence[tuple[str, SubModel]]) -> 
         for part, *_ in hooked:
             part._forward_hooks, part._forward_pre_hooks = OrderedDict(), OrderedDict()
         for _, part in parts:
-            part.draw_noise = partial(_record, drawn, parts, part)
+            part.__dict__["draw_noise"] = partial(_record, drawn, parts, part)
         yield drawn
     finally:
         for _, part in parts:
@@ -70,7 +70,7 @@ def draw_noise(
         generator: source of randomness; torch's global one by default.
     """
     out: Entries = {}
-    where = {} if like is None else {"device": like.device, "dtype": like.dtype}
+    where: dict[str, Any] = {} if like is None else {"device": like.device, "dtype": like.dtype}
     chosen = None if places is None else tuple(places)
     for place, (part, sizes) in drawn.items():
         if chosen is None or place.split(".")[0] in chosen:
