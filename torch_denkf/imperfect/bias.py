@@ -316,7 +316,8 @@ class BiasedBelief(AroundInitial):
             ensemble = written[names["ensemble"]]
             noise = entries.get(("noise", call.place))
             if noise is None:
-                noise = torch.randn((*ensemble.shape[:-1], len(std)), dtype=ensemble.dtype, device=ensemble.device)
+                sizes = {"members": ensemble.shape[-2], "dtype": ensemble.dtype, "device": ensemble.device}
+                noise = self.draw_noise(ensemble.shape[:-2], **sizes)
             ensemble = torch.cat([ensemble, std.to(ensemble.dtype) * noise.to(ensemble.dtype)], -1)
             mean = ensemble_mean(ensemble)
             now = {"ensemble": ensemble, "mean": mean, "var": ensemble_var(ensemble, mean)}

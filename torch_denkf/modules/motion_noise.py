@@ -143,7 +143,8 @@ class NoisyTransition(Transition):
             return ensemble
         normal = entries.get(("noise", call.place))
         if normal is None:
-            normal = torch.randn((*ensemble.shape[:-1], size), device=ensemble.device, dtype=ensemble.dtype)
+            sizes = {"members": ensemble.shape[-2], "state_dim": size}
+            normal = self.draw_noise(ensemble.shape[:-2], **sizes, device=ensemble.device, dtype=ensemble.dtype)
         normal = normal[..., :size]  # drawn for a state that has more dimensions than this transition's part of it
         if covariance.ndim == len(call.batch_size) + 1:
             noise = covariance.sqrt().unsqueeze(-2) * normal
