@@ -7,7 +7,7 @@ Each part is a :class:`SubModel`. What a filter must know of it in its role it d
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
@@ -293,7 +293,10 @@ class SubModel(Checked, TensorDictModule):
                 if value is not None and value.is_floating_point():
                     where = {"device": value.device, "dtype": value.dtype}
                     break
-            where.update(self.noise_sizes(*values))
+            sizes = self.noise_sizes(*values)
+            for record in RECORDERS:
+                record(call.place, self, sizes)
+            where.update(sizes)
             given = self.draw_noise(call.batch_size, time=call.time, **where)
             if given is None:  # it would run as if no noise were wanted
                 raise ValueError(
@@ -530,6 +533,8 @@ def in_role(module: nn.Module, kind: type[R]) -> list[R]:
     return [part for part in module.modules() if isinstance(part, kind)]
 
 
+#: Told, in a trial step, the place of each sub-model that draws noise, the sub-model, and the sizes it asks for.
+RECORDERS: list[Callable[[str, SubModel, dict[str, int]], None]] = []
 #: Errors that can be raised again with more words.
 EXPLAINED = (RuntimeError, TypeError, ValueError, IndexError)
 
