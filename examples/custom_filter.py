@@ -27,7 +27,7 @@ from torch_denkf.modules import (
     EnsembleAnalysis,
     GaussianPrior,
     Select,
-    SubModel,
+    Transition,
     VectorSensor,
 )
 
@@ -35,7 +35,7 @@ DT, ENSEMBLE = 0.5, 32
 BEACONS = torch.tensor([[30.0, 0.0], [-20.0, 25.0], [-20.0, -25.0]])  # m
 
 
-class GustyDrift(SubModel):
+class GustyDrift(Transition):
     """Our motion model: position moves with the velocity, gusts N(0, gust^2) change the velocity."""
 
     def __init__(self):

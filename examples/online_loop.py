@@ -16,12 +16,12 @@ import torch
 from torch import Tensor, nn
 
 from torch_denkf import Filter
-from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, Select, SubModel
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, Select, Transition
 
 PUSH = 0.8  # m/s^2: how the speed walks at random, a standard deviation after a second
 
 
-class Coasting(SubModel):
+class Coasting(Transition):
     """A cart [position m, speed m/s] whose speed walks at random, over as many seconds as have passed."""
 
     def __init__(self):

@@ -31,13 +31,13 @@ from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
 from torch_denkf import DEnKF, DEnKFLoss, DEnKFTransform, NoisyPendulumEnv
-from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, NoisyTransition, Select, SubModel
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, NoisyTransition, Select, Transition
 from torch_denkf.training import RunLogs
 
 COUNT, STEPS, NOISE = 16, 200, 0.1  # pendulums side by side; steps of an episode; of the cosine and sine that are read
 
 
-class Swing(SubModel):
+class Swing(Transition):
     """The filter's motion: what pulls and how strong the motor is, in 1/s^2 (per Nm), is learned from nothing."""
 
     def __init__(self):

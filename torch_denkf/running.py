@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any, TypeGuard, cast
+from typing import Any, TypeGuard
 
 import torch
 from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
-from torch_denkf.submodel import EXPLAINED, Call, Entries, SubModel
+from torch_denkf.submodel import EXPLAINED, Call, Entries, Sensor, SubModel, role
 
 __all__ = [
     "check_module",
     "check_network",
-    "declared",
     "in_sequences",
     "is_sequence",
     "marks_of",
@@ -152,19 +151,13 @@ def in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]
 
 def reading_of(sensor: TensorDictModuleBase) -> NestedKey:
     """Where a sensor writes its reading: first what the last of its modules writes that makes one."""
-    *_, last = (part for part in in_sequences(sensor) if not declared(part).judges_reading)
+    *_, last = (part for part in in_sequences(sensor) if not role(part, Sensor).judges_reading)
     return writes(last)[0]
 
 
 def marks_of(module: TensorDictModuleBase) -> dict[NestedKey, NestedKey]:
     """The masks that a module makes where it finds readings that are missing, and of which masks it makes them."""
-    parts = [part for part in in_sequences(module) if isinstance(part, SubModel)]
-    return {made: given for part in parts for made, given in part.marks.items()}
-
-
-def declared(module: nn.Module) -> SubModel:
-    """What a module says about itself: a sub-model what it declares, any other module what is declared by default."""
-    return module if isinstance(module, SubModel) else cast(SubModel, SubModel)  # the class holds the defaults
+    return {made: given for part in in_sequences(module) for made, given in role(part, Sensor).marks.items()}
 
 
 def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str, SubModel]]:
@@ -177,4 +170,4 @@ def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str
     else:
         parts = named_modules_of(module) if is_sequence(module) else ()
     for name, part in parts:
-        yield from random_parts(part, name if place == "self" else f"{place}.{name}")
+        yield from random_parts(part, name if name and place == "self" else f"{place}.{name}" if name else place)

@@ -1,11 +1,15 @@
-"""What every sub-model is: a function of tensors, with names for what it reads and what it writes."""
+"""A filter's parts, functions of tensors with names for what they read and write, and the roles that they have.
+
+Each part is a :class:`SubModel`. What a filter must know of it in its role it declares as a :class:`Sensor`, an
+:class:`Initial` belief, a :class:`Transition` or an :class:`Update`.
+"""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -15,7 +19,9 @@ from torch import Tensor, nn
 from torch_denkf._arguments import Checked
 from torch_denkf.functional.manifolds import Space
 
-__all__ = ["EXPLAINED", "RECORDERS", "Call", "Entries", "Noise", "SubModel", "flat_noise"]
+__all__ = ["Call", "Entries", "Initial", "Noise", "Sensor", "SubModel", "Transition", "Update", "in_role", "role"]
+
+R = TypeVar("R", bound="SubModel")
 
 #: Tensors by unravelled key: what a step of a filter works on.
 Entries: TypeAlias = dict[NestedKey, Tensor]
@@ -72,23 +78,6 @@ class SubModel(Checked, TensorDictModule):
     Attributes:
         noise_names: names of the tensors that :meth:`draw_noise` draws: ``()`` for a deterministic sub-model, ``("",)``
             for one tensor without a name of its own.
-        marks: masks that the sub-model makes where it finds readings that are missing, and the masks it makes them of.
-        reading_keys: the entries that it takes a reading from: the reading, and behind it its noise.
-        observed_key: the mask that hides them, ``[*B, 1]`` or ``[*B, O]``.
-        source_keys: of what it reads, that of which it makes a reading, where the rest only informs it.
-        reads_components: whether each component of a reading counts, and is hidden, by itself.
-        joins_readings: whether it looks at several readings together, and has nothing to say without one of them.
-        judges_reading: whether it writes no reading, but what that of the module before it is worth.
-        predicted_key: what predicts that reading, ``[*B, E, O]``, which tells how many components it has.
-        noise_variance_key: the variances of its reading, which tell how many components that has.
-        mask_key: a mask that says whether the frame is observed, of one that takes in no reading itself.
-        info_prefix: prefix of its diagnostics.
-        observation_dim: O of what it writes, where it is known beforehand.
-        state_dim: S of an initial belief; on a space, the numbers of a tangent.
-        space: in which the states of an initial belief or of an analysis live; ``None`` for plain numbers.
-        reading_space: in which the reading of an analysis lives.
-        ensemble_size: E of an initial belief.
-        input_dim: size of what an initial belief reads, where that is not S.
 
     Example:
         >>> from tensordict import TensorDict
@@ -111,23 +100,6 @@ class SubModel(Checked, TensorDictModule):
 
     else:
         noise_names = ()
-    marks: Mapping[NestedKey, NestedKey] = MappingProxyType({})
-    reading_keys: Sequence[NestedKey] = ()
-    observed_key: NestedKey | None = None
-    source_keys: Sequence[NestedKey] = ()
-    reads_components: bool = False
-    joins_readings: bool = False
-    judges_reading: bool = False
-    predicted_key: NestedKey = ("forecast", "observation")
-    noise_variance_key: NestedKey | None = None
-    mask_key: NestedKey | None = None
-    info_prefix: str | None = None
-    observation_dim: int | None = None
-    state_dim: int | None = None
-    space: Space | None = None
-    reading_space: Space | None = None
-    ensemble_size: int | None = None
-    input_dim: int | None = None
     _wants: frozenset[str] = frozenset()
 
     def __init_subclass__(cls, **kwargs):
@@ -195,100 +167,13 @@ class SubModel(Checked, TensorDictModule):
         return {}
 
     def parts(self) -> dict[str, TensorDictModuleBase]:
-        """The modules inside that may draw noise of their own, by name."""
+        """Returns the modules inside that may draw noise of their own, by name; ``""`` for its own place."""
         return {}
-
-    def reading_dims(self, entries: Entries, call: Call) -> Sequence[int]:
-        """How many numbers each of ``reading_keys`` has, where it is missing and zeros behind a mask stand for it.
-
-        By default O: ``observation_dim``, or what :attr:`predicted_key` holds. On a space the noise is of tangents.
-
-        Raises:
-            KeyError: if that is not known.
-        """
-        if self.reading_space is not None:
-            others = [self.reading_space.tangent_dim] * (len(self.reading_keys) - 1)
-            return [self.reading_space.point_dim, *others]
-        dim, predicted = self.observation_dim, entries.get(self.predicted_key)
-        if predicted is not None:
-            dim = predicted.shape[-1]
-        if dim is None:
-            raise KeyError(
-                f"{type(self).__name__} does not know how many numbers {list(self.reading_keys)} have, so that they "
-                f"cannot be left out. Hide them with their mask, {self.observed_key!r}; or let reading_dims() of "
-                f"{type(self).__name__} say it."
-            )
-        return [dim] * len(self.reading_keys)
 
     @property
     def draws(self) -> bool:
         """Whether :meth:`compute` asks for noise."""
         return "noise" in self._wants
-
-    @property
-    def updates_ensemble(self) -> bool:
-        """Whether it reads an ensemble, what its members predict of a reading, the reading, and its noise; and a mask.
-
-        Such an analysis can be given a past to correct (:meth:`move_past`).
-        """
-        keys = [unravel_key(key) for key in self.in_keys]
-        read = [unravel_key(key) for key in (self.predicted_key, *self.reading_keys)]
-        return keys[1:] == read and self.optional_keys == [self.observed_key]
-
-    def move_past(
-        self,
-        past: Tensor,
-        predicted: Tensor,
-        observation: Tensor,
-        variance: Tensor,
-        observed: Tensor | None = None,
-        *,
-        noise: Noise = None,
-    ) -> Tensor:
-        """Of an analysis of an ensemble: what a reading says of earlier states of the same members.
-
-        By default what :meth:`compute` would do to them if they were one state of L times S components, inflation and
-        the like included. Where :meth:`compute` holds anything of S components, write this method, too.
-
-        Args:
-            past: ``[*B, E, L, S]``.
-            predicted: predicted observations ``[*B, E, O]``.
-            observation: learned observations ``[*B, E, O]``, or one reading ``[*B, O]``.
-            variance: of the reading, ``[*B, O]``.
-            observed: mask ``[*B, 1]`` or ``[*B, O]``; ``None`` where all is observed.
-            noise: what :meth:`compute` was given: the same draws.
-
-        Returns:
-            The updated past, ``[*B, E, L, S]``.
-
-        Raises:
-            RuntimeError: if :meth:`compute` does not take so many components.
-        """
-        extra = {"noise": noise} if self.draws else {}
-        try:
-            out = self.by_key(self.compute(past.flatten(-2), predicted, observation, variance, observed, **extra))
-        except RuntimeError as error:
-            raise RuntimeError(
-                f"{type(self).__name__} is to correct earlier states, and its compute() fails on their "
-                f"{past.shape[-2]} times {past.shape[-1]} components: write {type(self).__name__}.move_past()."
-            ) from error
-        return out[self.out_keys[0]].unflatten(-1, past.shape[-2:])
-
-    def aligned(self, entries: Entries) -> Entries:
-        """Of an analysis: the entries with all angles on one turn, so that they can be averaged like other numbers."""
-        return entries
-
-    def on_aligned(self, entries: Entries, call: Call) -> Entries:
-        """What :meth:`on_entries` gives of entries that are :meth:`aligned` already."""
-        return self.on_entries(entries, call)
-
-    def without_step(self, entries: Entries) -> Entries:
-        """Of a transition: what it writes beside the forecast where an episode begins, and no step leads there."""
-        return {}
-
-    def of_carry(self, entries: Entries) -> Entries:
-        """Of an initial belief: what else of the belief follows from the entries that are carried on, by key."""
-        return {}
 
     def on_entries(self, entries: Entries, call: Call) -> Entries:
         """What the sub-model writes where ``entries`` are; changes nothing.
@@ -440,6 +325,212 @@ class SubModel(Checked, TensorDictModule):
                 + ". Convert the data (torchrl's DoubleToFloat(), or tensordict.float()) or the filter "
                 "(filter.double())."
             ) from error
+
+
+class Sensor(SubModel):
+    """Makes a reading, its noise, or a mask of it.
+
+    Attributes:
+        observation_dim: O of what it writes, where it is known beforehand.
+        judges_reading: whether it writes no reading, but judges that of the module before it.
+        joins_readings: whether it looks at several readings together, and cannot do without one of them.
+        marks: masks that it derives where it finds missing readings, and the masks that they are derived from.
+    """
+
+    observation_dim: int | None = None
+    judges_reading: bool = False
+    joins_readings: bool = False
+    marks: Mapping[NestedKey, NestedKey] = MappingProxyType({})
+
+
+class Initial(SubModel):
+    """Writes the initial belief of an episode.
+
+    Attributes:
+        state_dim: S; on a space, the numbers of a tangent.
+        ensemble_size: E; ``None`` for a belief without members.
+        space: in which the states live; ``None`` for plain numbers.
+        input_dim: size of what it reads, where that is not S.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> class Around(Initial):
+        ...     def __init__(self, size):
+        ...         super().__init__(nn.Identity(), ["start"], [("belief", "ensemble")])
+        ...         self.ensemble_size, self.state_dim = size, 2
+        ...
+        ...     def compute(self, start):  # [*B, S]
+        ...         return start.unsqueeze(-2).expand(*start.shape[:-1], self.ensemble_size, 2).clone()
+        >>> Around(4)(TensorDict({"start": torch.zeros(3, 2)}, [3]))["belief", "ensemble"].shape
+        torch.Size([3, 4, 2])
+    """
+
+    state_dim: int | None = None
+    ensemble_size: int | None = None
+    space: Space | None = None
+    input_dim: int | None = None
+
+    def derived(self, carried: Entries) -> Entries:
+        """Returns further entries of the belief that follow from those that are carried on, by key."""
+        return {}
+
+
+class Transition(SubModel):
+    """Forecasts the belief of the next time.
+
+    Attributes:
+        mask_key: a mask that says whether the frame of the next time is observed, where the forecast depends on it.
+    """
+
+    mask_key: NestedKey | None = None
+
+    def without_step(self, entries: Entries) -> Entries:
+        """Returns what it writes in addition to the forecast where an episode begins and no step leads there."""
+        return {}
+
+
+class Update(SubModel):
+    """Takes in a reading: an analysis, or the likelihood of particles.
+
+    Attributes:
+        reading_keys: the entries of the reading: the reading itself, and behind it its noise.
+        observed_key: the mask that hides them, ``[*B, 1]`` or ``[*B, O]``.
+        predicted_key: the predicted reading, ``[*B, E, O]``.
+        info_prefix: prefix of the diagnostics.
+        space: in which the states live; ``None`` for plain numbers.
+        reading_space: in which the reading lives; ``None`` for plain numbers.
+        observation_dim: O of the reading, where it is known beforehand.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> class Halfway(Update):
+        ...     def __init__(self):
+        ...         in_keys = [("forecast", "mean"), "reading"]
+        ...         super().__init__(nn.Identity(), in_keys, [("belief", "mean")], optional_keys=["observed"])
+        ...         self.reading_keys, self.observed_key = ["reading"], "observed"
+        ...
+        ...     def compute(self, mean, reading, observed=None):  # [*B, S], [*B, S]
+        ...         both = (mean + reading) / 2
+        ...         return both if observed is None else torch.where(observed, both, mean)
+        >>> td = TensorDict({"forecast": {"mean": torch.zeros(1)}, "reading": torch.ones(1)})
+        >>> Halfway()(td)["belief", "mean"]
+        tensor([0.5000])
+    """
+
+    reading_keys: Sequence[NestedKey] = ()
+    observed_key: NestedKey | None = None
+    predicted_key: NestedKey = ("forecast", "observation")
+    info_prefix: str | None = None
+    space: Space | None = None
+    reading_space: Space | None = None
+    observation_dim: int | None = None
+
+    def reading_dims(self, entries: Entries, call: Call) -> Sequence[int]:
+        """Returns how many numbers each of ``reading_keys`` has, to put zeros behind a mask where it is missing.
+
+        By default O: ``observation_dim``, or what :attr:`predicted_key` holds. On a space the noise is of tangents.
+
+        Raises:
+            KeyError: if that is not known.
+        """
+        if self.reading_space is not None:
+            others = [self.reading_space.tangent_dim] * (len(self.reading_keys) - 1)
+            return [self.reading_space.point_dim, *others]
+        dim, predicted = self.observation_dim, entries.get(self.predicted_key)
+        if predicted is not None:
+            dim = predicted.shape[-1]
+        if dim is None:
+            raise KeyError(
+                f"{type(self).__name__} does not know how many numbers {list(self.reading_keys)} have, so that they "
+                f"cannot be left out. Hide them with their mask, {self.observed_key!r}; or let reading_dims() of "
+                f"{type(self).__name__} say it."
+            )
+        return [dim] * len(self.reading_keys)
+
+    def with_mask(self, entries: Entries, call: Call) -> Entries:
+        """Returns the entries with the mask of the reading, where a module inside makes it."""
+        return entries
+
+    @property
+    def updates_ensemble(self) -> bool:
+        """Whether it reads an ensemble, what its members predict of a reading, the reading, and its noise; and a mask.
+
+        Such an analysis can be given a past to correct (:meth:`move_past`).
+        """
+        keys = [unravel_key(key) for key in self.in_keys]
+        read = [unravel_key(key) for key in (self.predicted_key, *self.reading_keys)]
+        return keys[1:] == read and self.optional_keys == [self.observed_key]
+
+    def move_past(
+        self,
+        past: Tensor,
+        predicted: Tensor,
+        observation: Tensor,
+        variance: Tensor,
+        observed: Tensor | None = None,
+        *,
+        noise: Noise = None,
+    ) -> Tensor:
+        """Updates earlier states of the members of an ensemble with the same reading.
+
+        By default as :meth:`compute` would if they were one state of L times S components, inflation and the like
+        included. Where :meth:`compute` holds anything of S components, write this method, too.
+
+        Args:
+            past: ``[*B, E, L, S]``.
+            predicted: predicted observations ``[*B, E, O]``.
+            observation: learned observations ``[*B, E, O]``, or one reading ``[*B, O]``.
+            variance: of the reading, ``[*B, O]``.
+            observed: mask ``[*B, 1]`` or ``[*B, O]``; ``None`` where all is observed.
+            noise: what :meth:`compute` was given: the same draws.
+
+        Returns:
+            The updated past, ``[*B, E, L, S]``.
+
+        Raises:
+            RuntimeError: if :meth:`compute` does not take so many components.
+        """
+        extra = {"noise": noise} if self.draws else {}
+        try:
+            out = self.by_key(self.compute(past.flatten(-2), predicted, observation, variance, observed, **extra))
+        except RuntimeError as error:
+            raise RuntimeError(
+                f"{type(self).__name__} is to correct earlier states, and its compute() fails on their "
+                f"{past.shape[-2]} times {past.shape[-1]} components: write {type(self).__name__}.move_past()."
+            ) from error
+        return out[self.out_keys[0]].unflatten(-1, past.shape[-2:])
+
+    def aligned(self, entries: Entries) -> Entries:
+        """Returns the entries with all angles on one turn, so that they can be averaged like other numbers."""
+        return entries
+
+    def on_aligned(self, entries: Entries, call: Call) -> Entries:
+        """Does what :meth:`on_entries` does, on entries that are :meth:`aligned` already."""
+        return self.on_entries(entries, call)
+
+
+#: A part that does not have a role declares what the role does by default.
+_DEFAULTS = {kind: kind(nn.Identity(), [], []) for kind in (SubModel, Sensor, Initial, Transition, Update)}
+
+
+def role(module: object, kind: type[R]) -> R:
+    """Returns a module in its role; one that does not have it, as any TensorDict module may, with the role's defaults.
+
+    Args:
+        module: of a filter.
+        kind: :class:`Sensor`, :class:`Initial`, :class:`Transition`, :class:`Update`, or any :class:`SubModel`.
+
+    Example:
+        >>> from tensordict.nn import TensorDictModule
+        >>> print(role(TensorDictModule(nn.Linear(2, 1), ["x"], ["y"]), Update).info_prefix)
+        None
+    """
+    return module if isinstance(module, kind) else _DEFAULTS[kind]
+
+
+def in_role(module: nn.Module, kind: type[R]) -> list[R]:
+    """Returns the sub-models inside ``module`` that have a role, also those inside others; all for ``SubModel``."""
+    return [part for part in module.modules() if isinstance(part, kind)]
 
 
 #: Told, in a trial step, the place of each sub-model that draws noise, the sub-model, and the sizes it asks for.

@@ -22,7 +22,7 @@ LENGTH = 0.3  # rad: a motion after which a picture is read with other errors
 FASTER = 1.25  # than any joint was seen to turn: no member is
 
 
-class ArmTransition(m.SubModel):
+class ArmTransition(m.Transition):
     """Learned accelerations and their noise; old and new velocity turn the angle, whose cosine and sine are the state.
 
     An arm at rest that is held against gravity stays where it is: what the network says of it is taken away.

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from benchmarks.arms.arms import SIDE, Arm
 from torch_denkf import modules as m
 from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.submodel import Sensor
 
 PIXELS = 0.25, 0.1  # mean and standard deviation of a pixel
 CELLS = SIDE // 2  # of a map, along a side
@@ -48,7 +49,7 @@ class Maps(nn.Module):
         return self.out(self.mix_fine(fine + self.up_to_fine(middle)))
 
 
-class JointSensor(m.SubModel):
+class JointSensor(Sensor):
     """Reads where an arm's links end, m ``[*B, 2 J]``, from pictures ``[*B, 1, H, W]``.
 
     A map for each joint says where in the picture it is; its mean is the joint's place.
@@ -85,7 +86,7 @@ class JointSensor(m.SubModel):
         }
 
 
-class JointPlaces(m.SubModel):
+class JointPlaces(Sensor):
     """Where the links of members ``[*B, E, 3 J + 2 J]`` end, and what the sensor adds to it: its biases."""
 
     def __init__(self, arm: Arm):

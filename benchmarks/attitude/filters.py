@@ -15,6 +15,7 @@ from torch_denkf.functional.manifolds import SO3, Space, rotate
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select, SubModel
 from torch_denkf.motions import AttitudeMotion, Gravity, InertialMotion, Magnetic
 from torch_denkf.motions.motion import Motion
+from torch_denkf.submodel import Sensor
 
 __all__ = ["GivenNoise", "VelocityInBody", "attitude_filter", "inertial_filter", "prepared"]
 
@@ -25,7 +26,7 @@ _UNREST = 1.0  # s
 _START = (0.05, 0.3, 0.1, 0.01, 0.1)  # standard deviations: rad, m/s, m, rad/s, m/s^2
 
 
-class GivenNoise(SubModel):
+class GivenNoise(Sensor):
     """Variances ``[*B, 3]`` of an entry ``[*B, 1]`` with the standard deviation, so that a batch tries several."""
 
     def __init__(self, in_key: str = "std"):

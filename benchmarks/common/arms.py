@@ -11,7 +11,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from benchmarks.common.recipes import Recipe
-from torch_denkf.modules import LearnedTransition, ScaledNoise, SubModel, run_module
+from torch_denkf.modules import LearnedTransition, ScaledNoise, SubModel
+from torch_denkf.modules.around import AroundInitial
 
 
 class StateMotion(Protocol):
@@ -56,7 +57,7 @@ class WithBias(nn.Module):
         return torch.cat([moved, self.fading.sigmoid() * features[..., size:whole]], -1)
 
 
-class AtRest(SubModel):
+class AtRest(AroundInitial):
     """An initial belief around the numbers that a sensor reads, of something that does not move.
 
     Args:
@@ -66,23 +67,19 @@ class AtRest(SubModel):
         state_key: ``[*B, D]``, or the filters' state.
     """
 
+    place = "initial"
+
     def __init__(self, initial: TensorDictModuleBase, size: int, input_dim: int, state_key: NestedKey = "state"):
-        super().__init__(initial, [state_key], initial.out_keys)
+        super().__init__(initial, [state_key], optional_keys=())
         self.size = self.state_dim = size
         self.input_dim = input_dim
-        if hasattr(initial, "ensemble_size"):
-            self.ensemble_size = initial.ensemble_size
-
-    def parts(self):
-        """The belief around the filters' state."""
-        return {"initial": self.module}
 
     def on_entries(self, entries, call):
         """The belief."""
         (key,) = self.in_keys
         state = self.required(entries, key)
         state = nn.functional.pad(state, (0, self.size - state.shape[-1]))
-        return run_module(self.module, {**entries, key: state}, call.part("initial"))
+        return self.run_inside({**entries, key: state}, call)
 
 
 class ArmRecipe(Recipe):

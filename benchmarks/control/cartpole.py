@@ -138,7 +138,7 @@ class Push(m.SubModel):
         return torch.cat([ahead, angle.cos(), angle.sin(), velocities], -1)
 
 
-class Physics(m.SubModel):
+class Physics(m.Transition):
     """The world's own motion, with the motor's own noise: what no filter can learn better."""
 
     def __init__(self):

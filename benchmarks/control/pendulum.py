@@ -17,7 +17,7 @@ def world(count: int, noise: float, missing: float, seed: int) -> NoisyPendulumE
     return NoisyPendulumEnv(noise, missing=missing, max_steps=STEPS, batch_size=[count], seed=seed)
 
 
-class Swing(m.SubModel):
+class Swing(m.Transition):
     """The filter's motion: a network says how the velocity changes, the velocity turns the angle."""
 
     def __init__(self):

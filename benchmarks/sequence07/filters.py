@@ -24,6 +24,7 @@ from torch_denkf.modules import (
 )
 from torch_denkf.monitoring import Gated
 from torch_denkf.motions.motion import Motion
+from torch_denkf.submodel import Sensor
 
 __all__ = ["DT", "POSE", "SPACE", "car_filter", "pose_of", "prepared"]
 
@@ -104,7 +105,7 @@ class TurnRate(SubModel):
         return ensemble[..., TWIST][..., :3] + ensemble[..., BIAS]
 
 
-class Given(SubModel):
+class Given(Sensor):
     """Hands an entry on, under another key."""
 
     def __init__(self, in_key, out_key, size: int):

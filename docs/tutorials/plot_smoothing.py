@@ -25,7 +25,7 @@ from tensordict import TensorDict
 
 from torch_denkf import DEnKF, EnKS, EnRTS, FixedLag
 from torch_denkf.metrics import interval_coverage
-from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, Select, SubModel
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, Select, Transition
 from torch_denkf.plots import plot_path
 
 torch.manual_seed(0)
@@ -69,7 +69,7 @@ drives = drive(40)
 # ``control_keys`` says that ``"wheels"`` is an action: what is in row t moves the state of t to that of t + 1.
 
 
-class Wheels(SubModel):
+class Wheels(Transition):
     """Moves each member by what the wheels counted, and by a slip of its own."""
 
     noise_names = ("",)

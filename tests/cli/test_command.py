@@ -9,7 +9,7 @@ from pkgutil import resolve_name
 import pytest
 
 import torch_denkf
-from torch_denkf.cli._command import Command
+from torch_denkf.cli.command import Command
 from torch_denkf.cli.main import commands, main
 
 

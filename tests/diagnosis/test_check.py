@@ -14,8 +14,8 @@ from torch_denkf.modules import (
     KalmanAnalysis,
     LinearObservation,
     LocalEnsembleAnalysis,
-    SubModel,
     UKFAnalysis,
+    Update,
 )
 from torch_denkf.modules.particles import ParticleAnalysis
 
@@ -54,7 +54,7 @@ def test_particles_pass():
     assert {"mean", "nis", "gain", "covariance of the ensemble"} <= off.keys()
 
 
-class Own(SubModel):
+class Own(Update):
     """A right analysis, as the how-to has it, and what can go wrong in it."""
 
     noise_names = ("",)

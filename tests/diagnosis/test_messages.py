@@ -16,14 +16,14 @@ from tests.filters.test_noise_sizes import SizeAtTheStep
 from torch_denkf.envs import LinearGaussianEnv, MissingFrames
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
-from torch_denkf.modules import ConstantNoise, LinearObservation, SubModel
+from torch_denkf.modules import ConstantNoise, LinearObservation, Update
 from torch_denkf.transforms import DEnKFTransform
 
 MEAN = ("belief", "mean")
 _DIAGNOSTICS = ("innovation", "nis", "log_likelihood")
 
 
-class Perturbed(SubModel):
+class Perturbed(Update):
     """A stochastic analysis as a user writes it, with or without a mask; it names no ``noise_variance_key``."""
 
     noise_names = ("",)

@@ -7,7 +7,7 @@ from torch import nn
 from torch_denkf.compilation import need_compiler
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.modules import EnsembleAnalysis, GaussianPrior, StochasticMLP, SubModel
+from torch_denkf.modules import EnsembleAnalysis, GaussianPrior, Initial, StochasticMLP, Transition
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation
 from torch_denkf.modules.sensor import VectorSensor
@@ -48,7 +48,7 @@ def toy_frames(batch, *, masks=1, resets=True):
     return frames
 
 
-class NoisyLinear(SubModel):
+class NoisyLinear(Transition):
     """x' = F x + B a + N(0, Q) for every member; without ``root`` deterministic."""
 
     def __init__(self, matrix, root=None, control=None):
@@ -75,7 +75,7 @@ class NoisyLinear(SubModel):
         return out if noise is None else out + noise @ self.root.mT
 
 
-class FixedEnsemble(SubModel):
+class FixedEnsemble(Initial):
     """An initial belief without randomness: always the same members."""
 
     def __init__(self, members):

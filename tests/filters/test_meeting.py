@@ -23,7 +23,7 @@ from tests.filters.factories import (
 from torch_denkf.filters import Filter
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.imperfect import RejectReadings
-from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LinearObservation, SubModel
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LinearObservation, SubModel, Update
 from torch_denkf.transforms import DEnKFTransform, LastAction
 
 MEAN = ("belief", "mean")
@@ -177,7 +177,7 @@ def test_readings_of_several_robots_are_not_averaged(make, way):
 # ------------------------------------------------------------------------------------- an analysis of a user's own
 
 
-class Robust(SubModel):
+class Robust(Update):
     """An ensemble update that trusts a reading the less, the further it is from what was predicted."""
 
     def __init__(self):

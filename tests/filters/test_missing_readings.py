@@ -20,7 +20,7 @@ from tests.filters.particle_for_tests import bootstrap
 from tests.filters.test_several_analyses import reads
 from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter
-from torch_denkf.modules import ConstantNoise, FromSensor, GaussianPrior, LinearObservation, SubModel
+from torch_denkf.modules import ConstantNoise, FromSensor, GaussianPrior, LinearObservation, Update
 from torch_denkf.modules.particles import with_weights
 from torch_denkf.smoothers import FixedLag
 
@@ -98,7 +98,7 @@ def test_only_readings_are_left_out_of_a_prediction(float64):
         filter.step(td, without="observation")
 
 
-class Halfway(SubModel):
+class Halfway(Update):
     """An analysis that goes halfway to the reading, and holds a weight for each of two components."""
 
     def __init__(self, named):

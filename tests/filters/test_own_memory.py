@@ -17,12 +17,12 @@ from torch_denkf.modules import (
     FromSensor,
     GaussianAround,
     GaussianPrior,
+    Initial,
     LearnedObservation,
     LearnedTransition,
     LinearObservation,
     LinearTransition,
     MomentPrior,
-    SubModel,
 )
 from torch_denkf.transforms import DEnKFTransform
 
@@ -171,7 +171,7 @@ def test_a_parameter_that_would_not_be_trained_is_refused():
     assert transition.matrix is not learned
 
 
-class Foreign(SubModel):
+class Foreign(Initial):
     """An initial belief of a user's own that hands out its constants."""
 
     def __init__(self):

@@ -95,7 +95,7 @@ def every_class(kind=SubModel):
 def test_the_modules_that_make_masks_are_known():
     ours = {kind for kind in every_class() if kind.__module__.startswith("torch_denkf.")}
     makers = {kind.__name__ for kind in ours if re.search(r"\bmarks\b", inspect.getsource(kind))}
-    assert makers == {"BlackIsMissing", "Renamed", "SignGate", "SubModel"}
+    assert makers == {"BlackIsMissing", "Renamed", "Sensor", "SignGate"}
 
 
 @pytest.mark.parametrize("way", ["loop", "dictionary", "policy", "sequence"])

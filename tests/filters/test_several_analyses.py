@@ -10,7 +10,7 @@ from tests.filters.beliefs_for_tests import ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import linear_denkf, linear_system, linear_with
 from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.filters import Filter
-from torch_denkf.modules import SubModel
+from torch_denkf.modules import SubModel, Update
 
 TOTALS = [("info", "nis"), ("info", "log_likelihood")]
 
@@ -59,7 +59,7 @@ def test_analyses_side_by_side_may_be_put_together():
     close(filter.step(td), {ENSEMBLE: (single[0][ENSEMBLE] + single[1][ENSEMBLE]) / 2}, [ENSEMBLE])
 
 
-class Scaled(SubModel):
+class Scaled(Update):
     """An update that cannot do without its reading, and writes diagnostics."""
 
     def __init__(self):

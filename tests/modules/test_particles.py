@@ -55,8 +55,8 @@ def test_initial_weights_are_equal(batch):
 
 def test_initial_weights_keep_what_the_belief_reads():
     assert with_weights(AroundState(torch.zeros(S), state_key="truth")).in_keys == ["truth"]
-    assert with_weights(FromSensor([0, 1], torch.zeros(S), torch.ones(S))).observation_dim == 2
-    assert with_weights(AroundState(torch.zeros(S))).observation_dim is None
+    assert with_weights(FromSensor([0, 1], torch.zeros(S), torch.ones(S))).input_dim == 2
+    assert with_weights(AroundState(torch.zeros(S))).input_dim is None
 
 
 # ------------------------------------------------------------------------------------------------ motion noise

@@ -11,12 +11,12 @@ from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import RejectReadings
-from torch_denkf.modules import EnsembleAnalysis, LinearObservation, SubModel
+from torch_denkf.modules import EnsembleAnalysis, LinearObservation, Update
 from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import EnRTS, FixedLag
 
 
-class Own(SubModel):
+class Own(Update):
     def __init__(
         self,
         observation_key="observation",

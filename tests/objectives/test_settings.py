@@ -20,7 +20,7 @@ from tests.filters.particle_for_tests import toy_filter
 from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, TERMS, score_by_hand
 from tests.objectives.problem_for_tests import only, problem, stepped
 from torch_denkf.filters import Filter
-from torch_denkf.modules import SubModel
+from torch_denkf.modules import Initial, SubModel
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 
 SCORES = ["crps", "energy", "mse"]
@@ -134,7 +134,7 @@ def test_a_missing_target_names_the_cures():
 # --------------------------------------------------------------------------------------------------- one member
 
 
-class Point(SubModel):
+class Point(Initial):
     """An initial belief of one member; it has no variance."""
 
     def __init__(self):

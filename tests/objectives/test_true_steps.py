@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from torch_denkf.filters import Filter
-from torch_denkf.modules import SubModel
+from torch_denkf.modules import Initial, SubModel
 from torch_denkf.objectives.parts import forecasts_from_truth
 
 NAMES = ("ensemble", "log_weight", "mean", "var", "bias")
@@ -30,7 +30,7 @@ class Repeats(SubModel):
         return values
 
 
-class Start(SubModel):
+class Start(Initial):
     """A belief of zeros, whose bias is one more than a mean that is there."""
 
     ensemble_size, state_dim = E, S

@@ -11,9 +11,9 @@ from torch import nn
 
 from torch_denkf._checks import check_covariance, check_one_dtype, check_shape, check_square, check_values
 from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
-from torch_denkf.modules._tensors import as_floating
 from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition
-from torch_denkf.running import declared
+from torch_denkf.modules.tensors import as_floating
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["BackpropKF"]
 
@@ -78,7 +78,7 @@ class BackpropKF(GaussianFilter):
         check_square("transition", a)
         check_shape("observation", c, (len(c) if c.ndim else 0, len(a)), "[O, S]")
         check_one_dtype(transition=a, observation=c)
-        spaces = [one for one in (declared(initial).space, options.get("reading_space")) if one is not None]
+        spaces = [one for one in (role(initial, Initial).space, options.get("reading_space")) if one is not None]
         if spaces:
             raise ValueError(
                 f"BackpropKF moves and observes plain numbers by matrices, and there are points of {spaces[0]}. Give "

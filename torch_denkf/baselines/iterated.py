@@ -14,7 +14,8 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules import NoisyTransition, as_process_noise
-from torch_denkf.running import check_module, declared
+from torch_denkf.running import check_module
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["IEnKS"]
 
@@ -92,7 +93,7 @@ class IEnKS(Filter):
         check_module("noise", noise)
         if sensor is not None:
             check_module("sensor", sensor)
-        space = declared(initial).space
+        space = role(initial, Initial).space
         if process_noise is not None:
             transition = NoisyTransition(transition, as_process_noise(process_noise, initial), space=space)
         reading = sensor.out_keys[0] if sensor is not None and observation_key is None else observation_key

@@ -15,13 +15,13 @@ from torch_denkf.functional import analyse
 from torch_denkf.functional.inflation import inflate, random_rotation
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing.iterated import iterated_smoothing
-from torch_denkf.modules._gaussian import further_keys
 from torch_denkf.modules._spaces import checked_spaces, reading_about
-from torch_denkf.modules.carried import Beside
+from torch_denkf.modules.around import AugmentedBelief
+from torch_denkf.modules.gaussian import further_keys
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.running import check_module, random_parts, run_module
 from torch_denkf.smoothers.past import moments_of
-from torch_denkf.submodel import Call, Entries, SubModel, flat_noise
+from torch_denkf.submodel import Call, Entries, Update, flat_noise
 
 __all__ = ["IteratedAnalysis", "with_smoothed"]
 
@@ -30,7 +30,7 @@ _SMOOTHED = ("ensemble", "mean", "var", "age")
 
 def with_smoothed(
     initial: TensorDictModuleBase, *, belief_prefix: str = "belief", smoothed_prefix: str = "smoothed"
-) -> Beside:
+) -> AugmentedBelief:
     """An initial belief that is also what is believed of the state before it.
 
     Args:
@@ -45,7 +45,7 @@ def with_smoothed(
         >>> start(TensorDict({}))["smoothed", "age"]
         tensor([0])
     """
-    return Beside(initial, [(smoothed_prefix, name) for name in _SMOOTHED], partial(_twice, belief_prefix))
+    return AugmentedBelief(initial, [(smoothed_prefix, name) for name in _SMOOTHED], partial(_twice, belief_prefix))
 
 
 def _twice(prefix: str, belief: Entries, batch_size: torch.Size) -> list[torch.Tensor]:
@@ -53,7 +53,7 @@ def _twice(prefix: str, belief: Entries, batch_size: torch.Size) -> list[torch.T
     return [*same, torch.zeros(*batch_size, 1, dtype=torch.int64, device=same[0].device)]
 
 
-class IteratedAnalysis(SubModel):
+class IteratedAnalysis(Update):
     r"""Finds from where the reading says that the last step began, and makes the step anew from there.
 
     Gauss-Newton steps in the space of the members, each with a run of transition and observation; see
@@ -82,8 +82,6 @@ class IteratedAnalysis(SubModel):
         ValueError: if transition or observation draw other noise.
         KeyError: if an entry is missing.
     """
-
-    reads_components = True
 
     def __init__(
         self,
@@ -122,7 +120,6 @@ class IteratedAnalysis(SubModel):
         self.iterations, self.inflation, self.rotate = iterations, inflation, rotate
         self.space, self.reading_space = checked_spaces(space, reading_space, ())
         self.info_prefix, self.observed_key = info_prefix, unravel_key(observed_key)
-        self.noise_variance_key = unravel_key(noise_variance_key)
         self.reading_keys = self.in_keys[1:3]
 
     @property

@@ -17,9 +17,9 @@ from torch.nn import functional as F
 from torchrl.modules import LSTMCell
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.modules._tensors import as_vector, mean_of_members
-from torch_denkf.modules.carried import Beside
-from torch_denkf.submodel import Entries, SubModel
+from torch_denkf.modules.around import AugmentedBelief
+from torch_denkf.modules.tensors import as_vector, mean_of_members
+from torch_denkf.submodel import Entries, Transition, Update
 
 __all__ = ["LSTMTransition", "LSTMUpdate", "with_memory"]
 
@@ -30,7 +30,7 @@ _MOST_LAYERS = 1000  # more are a slip, and would be built one by one until memo
 
 def with_memory(
     initial: TensorDictModuleBase, hidden_size: int, *, num_layers: int = 1, belief_prefix: str = "belief"
-) -> Beside:
+) -> AugmentedBelief:
     """An initial belief with an empty memory: hidden and cell states of zero, as in ``torch.nn.LSTM``.
 
     Args:
@@ -49,14 +49,14 @@ def with_memory(
     check_count("hidden_size", hidden_size)
     check_count("num_layers", num_layers)
     begin = partial(_empty, (belief_prefix, "mean"), (num_layers, hidden_size))
-    return Beside(initial, [(belief_prefix, name) for name in _MEMORY], begin, nested=True)
+    return AugmentedBelief(initial, [(belief_prefix, name) for name in _MEMORY], begin, nested=True)
 
 
 def _empty(key: NestedKey, shape: tuple[int, int], belief: Entries, batch_size: torch.Size) -> list[torch.Tensor]:
     return [belief[key].new_zeros(*batch_size, *shape)] * len(_MEMORY)
 
 
-class LSTMTransition(SubModel):
+class LSTMTransition(Transition):
     """Hands memory, mean and covariance of the last belief on: an LSTM has no forecast before it sees its input.
 
     Args:
@@ -81,7 +81,7 @@ class LSTMTransition(SubModel):
         return values
 
 
-class LSTMUpdate(SubModel):
+class LSTMUpdate(Update):
     r"""Remembers the frame, and believes :math:`N(m + s \circ W h_t, s^2 \circ (\mathrm{softplus}(U h_t) + c))`.
 
     The LSTM reads, in this order: the sensor's encoding, its reading in units of ``observation_scale``, a flag for
@@ -188,7 +188,6 @@ class LSTMUpdate(SubModel):
         self.in_size, self.num_layers, self.hidden_size = in_size, num_layers, hidden_size
         self.floor, self.inflation, self.observation_dim = floor, inflation, observation_dim or None
         self.reading_keys, self.observed_key = inputs, unravel_key(observed_key)
-        self.reads_components = encoding_key is None
         for name, value, size, default in (
             ("loc", loc, state_dim, 0.0),
             ("scale", scale, state_dim, 1.0),

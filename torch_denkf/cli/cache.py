@@ -24,7 +24,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from torch_denkf.cli._command import Command, say
+from torch_denkf.cli.command import Command, say
 
 __all__ = ["Cache"]
 

@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
-from torch_denkf.cli._command import Command, say
+from torch_denkf.cli.command import Command, say
 
 __all__ = ["Info"]
 

@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.write(f"denkf {torch_denkf.__version__}\n")
         return 0
     if words[0] not in known:
-        from torch_denkf.cli._command import meant  # here: `denkf --help` does not need it
+        from torch_denkf.cli.command import meant  # here: `denkf --help` does not need it
 
         sys.stderr.write(f"error: unknown command {words[0]!r}{meant(words[0], list(known))}\n")
         return 2

@@ -14,7 +14,8 @@ from torch_denkf.functional import ensemble_mean, kalman_update
 from torch_denkf.functional.gaussian import GaussianUpdate
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean
-from torch_denkf.running import declared, in_sequences, random_parts, reads
+from torch_denkf.running import in_sequences, random_parts, reads
+from torch_denkf.submodel import Update, role
 
 __all__ = ["check_analysis"]
 
@@ -184,7 +185,7 @@ def _checks(analysis: TensorDictModuleBase, case: _Case, tolerance: float) -> It
     yield from _noise(analysis, case)
     if keys.observed is not None:
         read = {key for some in reads(analysis) for key in some}
-        named = [key for part in in_sequences(analysis) for key in map(unravel_key, declared(part).reading_keys)]
+        named = [key for part in in_sequences(analysis) for key in map(unravel_key, role(part, Update).reading_keys)]
         yield f"the reading {keys.reading!r}, named in reading_keys", float(unravel_key(keys.reading) not in named), 0
         yield f"the mask {keys.observed!r}, read", float(unravel_key(keys.observed) not in read), 0
         width, nothing = case.observation_dim, torch.zeros(2, 1, dtype=torch.bool)

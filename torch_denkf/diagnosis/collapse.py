@@ -9,7 +9,7 @@ from torch_denkf._checks import flag_value
 from torch_denkf.diagnosis.once import Once
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.finish import Record
-from torch_denkf.modules._ensemble import EnsembleUpdate
+from torch_denkf.modules.ensemble import EnsembleUpdate
 from torch_denkf.running import in_sequences
 from torch_denkf.submodel import Entries
 

@@ -8,7 +8,8 @@ from itertools import chain
 from tensordict import NestedKey
 
 from torch_denkf.filters.structure import Placed, Structure, takes_reading
-from torch_denkf.running import declared, marks_of, reads, reads_of, writes
+from torch_denkf.running import marks_of, reads, reads_of, writes
+from torch_denkf.submodel import Update, role
 
 __all__ = ["check_composition"]
 
@@ -59,7 +60,7 @@ def _check_unread_masks(modules: Sequence[Placed]) -> None:
 def _check_overwriting(modules: Sequence[Placed]) -> None:
     """Raises where all that a module writes is written again before anybody has read it."""
     for index, (place, module) in enumerate(modules):
-        info = declared(module).info_prefix
+        info = role(module, Update).info_prefix
         unread = {key for key in writes(module) if info is None or key[0] != info}
         used = False
         for other_place, other in modules[index + 1 :]:
@@ -78,7 +79,7 @@ def _check_unused(update: Sequence[Placed], belief: Sequence[NestedKey]) -> None
     """Raises where nobody uses what an analysis writes: its reading would be lost."""
     used = set(belief)
     for place, module in reversed(update):
-        info = declared(module).info_prefix
+        info = role(module, Update).info_prefix
         made = [key for key in writes(module) if info is None or key[0] != info]
         if made and takes_reading(module) and used.isdisjoint(made):
             raise ValueError(

@@ -16,7 +16,8 @@ from torch_denkf.diagnosis.once import Once
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.finish import Record
 from torch_denkf.filters.structure import Structure
-from torch_denkf.running import declared, in_sequences, reads, writes
+from torch_denkf.running import in_sequences, reads, writes
+from torch_denkf.submodel import Update, role
 
 __all__ = ["UnreadMasks"]
 
@@ -156,7 +157,7 @@ def _unmasked(structure: Structure) -> Iterator[tuple[str, TensorDictModuleBase]
         for part in in_sequences(module):
             must, may = reads(part)
             updates = not made.issuperset(must) and not set(carry).isdisjoint(writes(part))
-            if not may and (updates or declared(part).reading_keys):
+            if not may and (updates or role(part, Update).reading_keys):
                 yield place, part
 
 

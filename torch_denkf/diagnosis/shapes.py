@@ -11,7 +11,8 @@ from torch_denkf.beliefs import Ensemble, Particles, is_samples
 from torch_denkf.diagnosis.once import Once
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.finish import Record
-from torch_denkf.filters.structure import Structure, submodels
+from torch_denkf.filters.structure import Structure
+from torch_denkf.submodel import Update, in_role
 
 __all__ = ["ReadingRanks"]
 
@@ -55,5 +56,5 @@ class ReadingRanks(Once):
 def _read_as_they_are(structure: Structure) -> Iterator[NestedKey]:
     """The observations that come from outside and no sensor changes; their noise may be a matrix."""
     for _, module in structure.update:
-        for part in submodels(module):
+        for part in in_role(module, Update):
             yield from (key for key in map(unravel_key, part.reading_keys[:1]) if key in structure.needed)

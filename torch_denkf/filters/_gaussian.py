@@ -14,7 +14,8 @@ from torch_denkf.filters.options import FilterOptions
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.imperfect import Visibility
 from torch_denkf.imperfect.visible import heeding
-from torch_denkf.running import check_module, declared
+from torch_denkf.running import check_module
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]
 
@@ -81,7 +82,7 @@ class GaussianFilter(Filter):
         check_module("noise", noise)
         check_module("initial", initial)
         refuse_other_beliefs(type(self).__name__, initial, transition.in_keys[:2])
-        space = declared(initial).space
+        space = role(initial, Initial).space
         spaces = {} if space is None and reading_space is None else {"space": space, "reading_space": reading_space}
         update = analysis(
             **spaces,

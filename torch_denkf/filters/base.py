@@ -44,10 +44,10 @@ from torch_denkf.filters.refusals import (
     refuse_unknown_readings,
 )
 from torch_denkf.filters.scan import Steps, where_rows
-from torch_denkf.filters.structure import KNOWN, Structure, previous_key, submodels
+from torch_denkf.filters.structure import KNOWN, Structure, previous_key
 from torch_denkf.modules.variance_ceiling import VarianceCeiling
-from torch_denkf.running import check_module, declared, named_modules_of, random_parts, reads, run_module
-from torch_denkf.submodel import EXPLAINED, Call, Entries, flat_noise
+from torch_denkf.running import check_module, named_modules_of, random_parts, reads, run_module
+from torch_denkf.submodel import EXPLAINED, Call, Entries, Initial, Transition, flat_noise, in_role, role
 
 __all__ = ["Filter"]
 
@@ -452,7 +452,7 @@ class Filter(Checked, TensorDictSequential):
         refuse_nameless_readings(self.structure)
         tensordict = self.of_one_robot(tensordict)
         hidden = tensordict.copy()
-        for key in dict.fromkeys(part.mask_key for part in submodels(self.module) if part.mask_key is not None):
+        for key in {part.mask_key for part in in_role(self.module, Transition)} - {None}:
             hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=tensordict.device))
         out = self.step(hidden, without=self.structure.readings)
         written = [key for key in self.out_keys if out.get(key, None) is not None]
@@ -694,7 +694,7 @@ class Filter(Checked, TensorDictSequential):
 
     def _nothing(self, batch_size: Sequence[int]) -> Entries:
         """Returns zeros for what the initial belief reads, where its shape alone counts."""
-        told, like = declared(self.initial), self.like()
+        told, like = role(self.initial, Initial), self.like()
         like = torch.zeros(()) if like is None else like
         zeros = like.new_zeros(*batch_size, told.input_dim or told.state_dim or 1)
         return {key: zeros.clone() for key in reads(self.initial)[0]}

@@ -29,7 +29,8 @@ from torch_denkf.modules import (
     StochasticMLP,
     as_process_noise,
 )
-from torch_denkf.running import check_module, declared, reading_of
+from torch_denkf.running import check_module, reading_of
+from torch_denkf.submodel import Initial, Update, role
 
 __all__ = ["DEnKF"]
 
@@ -107,12 +108,12 @@ class DEnKF(Filter):
         check_module("noise", noise)
         check_module("initial", initial)
         if sensor_error is not None:
-            of_reading = reading_space if analysis is None else declared(analysis).reading_space
+            of_reading = reading_space if analysis is None else role(analysis, Update).reading_space
             biased = biased_parts(sensor_error, transition, observation, process_noise, initial, of_reading)
             transition, observation, process_noise, initial = biased
         if process_noise is not None:
             q = as_process_noise(process_noise, initial)
-            transition = NoisyTransition(transition, q, space=declared(initial).space)
+            transition = NoisyTransition(transition, q, space=role(initial, Initial).space)
         told = angles or reading_space is not None or observation_key is not None or observed_key is not None
         if analysis is not None and told:
             raise ValueError(
@@ -128,7 +129,7 @@ class DEnKF(Filter):
             analysis = EnsembleAnalysis(
                 "perturbed" if sensor is None else "sensor",
                 angles=angles,
-                space=declared(initial).space,
+                space=role(initial, Initial).space,
                 reading_space=reading_space,
                 **keys,
             )

@@ -12,7 +12,7 @@ from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
 from torch_denkf.imperfect.bias import FadingBias, biased_parts
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.process_noise import as_process_noise
-from torch_denkf.running import declared
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["EKF"]
 
@@ -82,6 +82,6 @@ class EKF(GaussianFilter):
         if sensor_error is not None:
             parts = biased_parts(sensor_error, transition, observation, q, initial, options.get("reading_space"))
             transition, observation, q, initial = parts
-        space = declared(initial).space
+        space = role(initial, Initial).space
         forecast = EKFTransition(transition, q, stop_jacobian_gradient=stop_jacobian_gradient, space=space)
         super().__init__(sensor, noise, forecast, partial(EKFAnalysis, observation), initial=initial, **options)

@@ -15,7 +15,7 @@ from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import KalmanAnalysis, LinearTransition, MomentPrior
-from torch_denkf.modules._tensors import as_floating, check_dims
+from torch_denkf.modules.tensors import as_floating, check_dims
 
 __all__ = ["KalmanFilter"]
 

@@ -16,7 +16,8 @@ from torch_denkf.imperfect import Visibility
 from torch_denkf.imperfect.visible import heeding
 from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel, as_process_noise
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
-from torch_denkf.running import check_module, declared, reading_of
+from torch_denkf.running import check_module, reading_of
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["DPF", "PFM", "MixtureParticleFilter", "ParticleFilter"]
 
@@ -115,7 +116,7 @@ class ParticleFilter(Filter):
             if isinstance(transition, ResampledTransition):
                 raise ValueError("A ResampledTransition holds its motion: put the process noise into that.")
             q = as_process_noise(process_noise, initial)
-            transition = NoisyTransition(transition, q, space=declared(initial).space)
+            transition = NoisyTransition(transition, q, space=role(initial, Initial).space)
         if likelihood is None:
             if observation_key is None and sensor is None:
                 raise ValueError("Without a sensor, say where the reading is: observation_key=..., or a likelihood.")
@@ -132,7 +133,7 @@ class ParticleFilter(Filter):
             )
         if analysis is None:
             of_reading = likelihood if isinstance(likelihood, GaussianLikelihood) else None
-            analysis = ParticleAnalysis(of_reading, space=declared(initial).space)
+            analysis = ParticleAnalysis(of_reading, space=role(initial, Initial).space)
         if not isinstance(transition, ResampledTransition):
             transition = ResampledTransition(
                 transition,

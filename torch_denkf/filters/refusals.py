@@ -7,9 +7,9 @@ from collections.abc import Collection, Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
-from torch_denkf.filters.structure import Structure, previous_key, submodels, takes_reading
-from torch_denkf.running import declared, in_sequences, writes
-from torch_denkf.submodel import Entries
+from torch_denkf.filters.structure import Structure, previous_key, takes_reading
+from torch_denkf.running import in_sequences, writes
+from torch_denkf.submodel import Entries, Sensor, Update, in_role, role
 
 __all__ = [
     "check_inputs",
@@ -106,7 +106,7 @@ def refuse_nameless_readings(structure: Structure) -> None:
         for part in in_sequences(module):
             read = [key for key in part.in_keys if unravel_key(key) in frames]
             corrects = not set(structure.carry).isdisjoint(writes(part))
-            if corrects and read and not takes_reading(part) and not declared(part).reading_keys:
+            if corrects and read and not takes_reading(part) and not role(part, Update).reading_keys:
                 raise KeyError(
                     f"{type(part).__name__} at place {place!r} corrects the belief by {read}, and does not say which "
                     "are readings: predict() cannot leave them out. Let its constructor set self.reading_keys, the "
@@ -116,7 +116,7 @@ def refuse_nameless_readings(structure: Structure) -> None:
 
 def refuse_single_readings(structure: Structure, without: Sequence[NestedKey]) -> None:
     """Raises a ``ValueError`` where some readings are to be left out, not all, of those that a module joins."""
-    joined = any(part.joins_readings for _, module in structure.modules for part in submodels(module))
+    joined = any(part.joins_readings for _, module in structure.modules for part in in_role(module, Sensor))
     if joined and without and set(without) != set(structure.readings):
         raise ValueError(
             f"Where readings are looked at together, step(without={list(without)}) cannot leave out single ones: "

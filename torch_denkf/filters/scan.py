@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torch_denkf.filters.structure import RESUMES, Placed, Structure, previous_key, takes_reading
 from torch_denkf.running import is_sequence, named_modules_of, reads, run_module
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.submodel import Call, Entries, Transition, Update, role
 
 __all__ = ["Steps", "where_rows"]
 
@@ -118,8 +118,7 @@ class Steps(NamedTuple):
         structure, transition = self.structure, self.structure.transition[1]
         entries = {**entries, **{key: start[key] for key in structure.carry}}
         forecast = {name: start[key] for key, name in structure.forecast_of.items()}
-        if isinstance(transition, SubModel):
-            forecast |= transition.without_step(entries)
+        forecast |= role(transition, Transition).without_step(entries)
         every = torch.ones(*call.batch_size, 1, dtype=torch.bool, device=next(iter(start.values())).device)
         return self.step(entries, call, frames=False, reset=every, start=start, forecast=forecast, partial=partial)
 
@@ -185,7 +184,7 @@ def _unbound(entries: Entries, time: int, count: int) -> list[Entries]:
     return [{key: column[t] for key, column in columns.items()} for t in range(count)]
 
 
-def _masked(module: SubModel, entries: Entries, call: Call) -> Entries:
+def _masked(module: Update, entries: Entries, call: Call) -> Entries:
     """Returns the entries with ones in the place of missing observations, and a mask that says so."""
     like = next(entries[key] for key in module.in_keys if key in entries)
     dims = zip(module.reading_keys, module.reading_dims(entries, call), strict=True)

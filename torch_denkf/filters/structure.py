@@ -6,14 +6,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from typing import NamedTuple, TypeGuard
 
-import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.beliefs import Belief, complete, kinds_of, summary_keys
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.running import (
-    declared,
     in_sequences,
     is_sequence,
     named_modules_of,
@@ -21,9 +19,9 @@ from torch_denkf.running import (
     reads_of,
     writes,
 )
-from torch_denkf.submodel import Entries, SubModel
+from torch_denkf.submodel import Entries, Initial, Update, in_role, role
 
-__all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "previous_key", "sequences_in", "submodels"]
+__all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "previous_key", "sequences_in"]
 
 #: A module and its place in the filter, which names its noise.
 Placed = tuple[str, TensorDictModuleBase]
@@ -39,14 +37,9 @@ def previous_key(key: NestedKey) -> tuple[str, ...]:
     return ("previous", key) if isinstance(key, str) else ("previous", *key)
 
 
-def submodels(module: torch.nn.Module) -> list[SubModel]:
-    """Returns the sub-models inside ``module``, also those inside others."""
-    return [part for part in module.modules() if isinstance(part, SubModel)]
-
-
-def takes_reading(module: TensorDictModuleBase) -> TypeGuard[SubModel]:
+def takes_reading(module: TensorDictModuleBase) -> TypeGuard[Update]:
     """Whether a module takes in a reading, and heeds a mask that hides it."""
-    return isinstance(module, SubModel) and bool(module.reading_keys) and module.observed_key is not None
+    return isinstance(module, Update) and bool(module.reading_keys) and module.observed_key is not None
 
 
 def sequences_in(sequence: TensorDictSequential) -> Iterator[TensorDictSequential]:
@@ -129,7 +122,7 @@ class Structure(NamedTuple):
     def completed(self, entries: Entries, stored: Entries | None = None) -> Entries:
         """Returns entries of a belief with those that follow from them, see :func:`torch_denkf.beliefs.complete`."""
         lacking = any(key not in entries for key in self.belief)
-        further = self.initial.of_carry(entries) if lacking and isinstance(self.initial, SubModel) else {}
+        further = role(self.initial, Initial).derived(entries) if lacking else {}
         return complete({**further, **entries}, self.belief, self.kinds, stored)
 
     @classmethod
@@ -166,7 +159,7 @@ class Structure(NamedTuple):
                 f"The belief holds {still}, which no module writes: a step would lose it. Let one pass it on."
             )
         belief = list(dict.fromkeys([*(key for key in provided if key in step_keys), *summary_keys(carry, step_keys)]))
-        space = declared(initial).space
+        space = role(initial, Initial).space
         kinds = kinds_of(belief, space, carry)
         forecast_of = _forecasts(carry, writes(steps[0][1]), forecast_keys)
         return cls(
@@ -277,7 +270,7 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
     """The entries from outside of which the analyses' readings are made, through whatever sensors."""
     found: dict[NestedKey, None] = {}
     for _, module in update:
-        for part in submodels(module):
+        for part in in_role(module, Update):
             found.update(dict.fromkeys(map(unravel_key, part.reading_keys)))
     for _, module in reversed([*frames, *update]):
         if not found.keys().isdisjoint(writes(module)):
@@ -291,7 +284,7 @@ def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey
     writers: dict[str, list[Placed]] = {}
     for place, module in steps:
         for part in in_sequences(module):
-            info = declared(part).info_prefix
+            info = role(part, Update).info_prefix
             if info is not None:
                 writers.setdefault(info, []).append((place, part))
     own_info: dict[str, dict[NestedKey, NestedKey]] = {}
@@ -318,7 +311,7 @@ def _likelihoods(steps: Sequence[Placed], own_info: Mapping, totals: Mapping) ->
     found = []
     for place, module in steps:
         for part in in_sequences(module):
-            key = (declared(part).info_prefix, "log_likelihood")
+            key = (role(part, Update).info_prefix, "log_likelihood")
             if key in writes(part):
                 found.append(key if key in totals else own_info.get(place, {}).get(key, key))
     return list(dict.fromkeys(found))

@@ -12,7 +12,7 @@ from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
 from torch_denkf.imperfect.bias import FadingBias, biased_parts
 from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
-from torch_denkf.running import declared
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["UKF"]
 
@@ -81,7 +81,7 @@ class UKF(GaussianFilter):
         if sensor_error is not None:
             parts = biased_parts(sensor_error, transition, observation, q, initial, options.get("reading_space"))
             transition, observation, q, initial = parts
-        space = declared(initial).space
+        space = role(initial, Initial).space
         forecast = UKFTransition(transition, q, alpha=alpha, beta=beta, kappa=kappa, space=space)
         update = partial(UKFAnalysis, observation, alpha=alpha, beta=beta, kappa=kappa)
         super().__init__(sensor, noise, forecast, update, initial=initial, **options)

@@ -14,8 +14,8 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import JoinedObservation, JoinedReading, StateObservation
 from torch_denkf.fusion.sensor import FusedSensor, Wired, noise_key_of
 from torch_denkf.fusion.sensor_weights import SensorWeights, WeightedNoise
-from torch_denkf.running import declared
 from torch_denkf.smoothers.past import lagged
+from torch_denkf.submodel import Update, role
 
 __all__ = ["Updates"]
 
@@ -141,7 +141,7 @@ class Updates:
         else:
             update = make(forecast_key=(prefix, "ensemble"), predicted_key=predicted, observation_key=reading, **keys)
             modules = {f"{name}_observation": model, name: lagged(update) if self.lag else update}
-        if declared(update).reading_space is not None and told.get("reading_space") is None:
+        if role(update, Update).reading_space is not None and told.get("reading_space") is None:
             raise ValueError(f"reading_space is for FusedSensor(reading_space=...), not for the analysis of {name!r}.")
         return modules
 

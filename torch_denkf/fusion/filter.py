@@ -29,11 +29,12 @@ from torch_denkf.modules import (
     UKFTransition,
     as_process_noise,
 )
-from torch_denkf.modules._ensemble import EnsembleUpdate
-from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition
-from torch_denkf.running import check_module, declared, writes
+from torch_denkf.modules.ensemble import EnsembleUpdate
+from torch_denkf.modules.gaussian import GaussianAnalysis, GaussianTransition
+from torch_denkf.running import check_module, writes
 from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, with_past
 from torch_denkf.smoothers.past_moments import CrossTransition
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["FusedFilter"]
 
@@ -133,8 +134,8 @@ class FusedFilter(Filter):
             wired[name] = wire(name, sensor)
             modules.update(wired[name].modules)
         age = -1 if kwargs.get("update_at_reset") else 0
-        space = declared(initial).space
-        size = (declared(initial).state_dim if space is None else space.point_dim) or 0
+        space = role(initial, Initial).space
+        size = (role(initial, Initial).state_dim if space is None else space.point_dim) or 0
         if lag and not size:
             raise ValueError(f"{type(initial).__name__} does not say its state_dim, which a delay needs.")
         prefix = "forecast"
@@ -244,7 +245,7 @@ def _moving(transition, process_noise, initial, gaussian):
         if gaussian:
             raise ValueError(_NO_NOISE)
         return transition
-    noise, space = as_process_noise(process_noise, initial), declared(initial).space
+    noise, space = as_process_noise(process_noise, initial), role(initial, Initial).space
     made = EKFTransition if gaussian else NoisyTransition
     return made(transition, noise, space=space)
 

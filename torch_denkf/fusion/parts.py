@@ -12,14 +12,15 @@ from torch.nn import functional as F
 
 from torch_denkf._checks import check_mask
 from torch_denkf.functional.angles import mean_observation
-from torch_denkf.modules.carried import InPlaceOf
+from torch_denkf.modules.around import Wrapper, passes_on
 from torch_denkf.running import check_module, marks_of, reads, run_module, writes
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.submodel import Call, Entries, Sensor, SubModel, Update
 
 __all__ = ["JoinedObservation", "JoinedReading", "OfOwnErrors", "Renamed", "StateObservation"]
 
 
-class Renamed(InPlaceOf):
+@passes_on(Sensor)
+class Renamed(Wrapper, Sensor):
     """A module that reads and writes under other keys, so that two of a kind fit into one filter.
 
     Args:
@@ -43,19 +44,15 @@ class Renamed(InPlaceOf):
         self.names = names
         self.marks = {names.get(made, made): names.get(key, key) for made, key in marks_of(module).items()}
 
-    def noise_sizes(self, *values):
-        """Those of the module inside."""
-        return self.module.noise_sizes(*values)
-
     def on_entries(self, entries, call):
         """What the module writes."""
         inside = {key: value for key, value in entries.items() if key not in self.names}
         inside.update({key: entries[name] for key, name in self.names.items() if name in entries})
-        written = run_module(self.module, inside, call)
+        written = self.run_inside(inside, call)
         return {self.names.get(key, key): value for key, value in written.items()}
 
 
-class OfOwnErrors(InPlaceOf):
+class OfOwnErrors(Wrapper):
     """An observation model of one sensor, of a state that holds the lasting errors of several behind its system.
 
     Args:
@@ -65,24 +62,18 @@ class OfOwnErrors(InPlaceOf):
     """
 
     def __init__(self, observation: TensorDictModuleBase, own: Sequence[int], total: int):
-        check_module("observation", observation)
-        needed, optional = reads(observation)
-        super().__init__(observation, needed, observation.out_keys, optional_keys=optional)
+        super().__init__(observation)
         self.own, self.total = list(own), total
-
-    def noise_sizes(self, *values):
-        """Those of the model inside."""
-        return self.module.noise_sizes(*values)
 
     def on_entries(self, entries, call):
         """The predicted observations."""
         key = unravel_key(self.in_keys[0])
         system, errors = self.required(entries, key).tensor_split([-self.total], -1)
         state = torch.cat([system, errors[..., self.own]], -1)
-        return run_module(self.module, {**entries, key: state}, call)
+        return self.run_inside({**entries, key: state}, call)
 
 
-class StateObservation(InPlaceOf):
+class StateObservation(Wrapper, Update):
     """An observation model of one sensor, of the present state or of an earlier one that a late reading belongs to.
 
     Args:
@@ -141,12 +132,7 @@ class StateObservation(InPlaceOf):
         self.ensemble_key, self.predicted_key, self.observed_key, self.age_key = map(unravel_key, keys)
         self.late_key = None if late_key is None else unravel_key(late_key)
         self.past_key = None if past_key is None else unravel_key(past_key)
-        # For readings that are rejected: what the mask hides.
-        self.reading_keys, self.reads_components = list(map(unravel_key, reading_keys)), True
-
-    def noise_sizes(self, *values):
-        """Those of the model inside."""
-        return self.module.noise_sizes(*values)
+        self.reading_keys = list(map(unravel_key, reading_keys))
 
     def on_entries(self, entries, call):
         """The predicted observations, and the mask."""
@@ -159,7 +145,7 @@ class StateObservation(InPlaceOf):
             states, mask = self._of_its_time(whole, entries)
             written[unravel_key(self.out_keys[1])] = mask
         key, out_key = unravel_key(self.module.in_keys[0]), unravel_key(self.module.out_keys[0])
-        return {self.predicted_key: run_module(self.module, {**entries, key: states}, call)[out_key], **written}
+        return {self.predicted_key: self.run_inside({**entries, key: states}, call)[out_key], **written}
 
     def seen(self, entries: Entries, call: Call) -> tuple[Tensor, Tensor | None]:
         """The predicted observations ``[*B, E, O]``, and the mask of what is observed, if there is one."""
@@ -218,7 +204,7 @@ class JoinedObservation(SubModel):
         return self.by_key((torch.cat(predicted, -1), torch.cat(masks, -1)))
 
 
-class JoinedReading(SubModel):
+class JoinedReading(Sensor):
     """The readings of several sensors side by side, and their noise.
 
     Args:

@@ -14,9 +14,9 @@ from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.fusion.parts import StateObservation
-from torch_denkf.modules._tensors import mean_of_members
+from torch_denkf.modules.tensors import mean_of_members
 from torch_denkf.running import reads
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import Sensor
 
 __all__ = ["SensorAttention", "SensorWeights", "WeightedNoise"]
 
@@ -129,7 +129,7 @@ class SensorAttention(nn.Module):
         return self.floor + (1 - self.floor) * (score + 4).sigmoid()
 
 
-class SensorWeights(SubModel):
+class SensorWeights(Sensor):
     """The weights of all sensors in the forecast, before any of them corrects it.
 
     :class:`torch_denkf.fusion.FusedFilter` makes it.
@@ -206,7 +206,7 @@ class SensorWeights(SubModel):
         return self.by_key(self.module["network"](innovations, torch.stack(seen, -1), features).split(1, -1))
 
 
-class WeightedNoise(SubModel):
+class WeightedNoise(Sensor):
     """A sensor's noise, divided by the sensor's weight.
 
     Args:
@@ -227,7 +227,6 @@ class WeightedNoise(SubModel):
     ):
         super().__init__(nn.Identity(), [noise_key, weight_key], [out_key])
         self.observation_dim = observation_dim
-        self.source_keys = self.in_keys[:1]  # the sensor's own: its weight heeds the masks of all sensors
 
     def compute(self, variance, weight):
         """The larger noise."""

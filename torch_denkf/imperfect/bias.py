@@ -31,10 +31,11 @@ from torch_denkf._checks import check_values
 from torch_denkf.beliefs import is_samples
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._tensors import as_standard_deviations
+from torch_denkf.modules.around import AroundInitial, Wrapper
 from torch_denkf.modules.process_noise import as_process_noise
-from torch_denkf.running import check_module, declared, reads, run_module, writes
-from torch_denkf.submodel import SubModel
+from torch_denkf.modules.tensors import as_standard_deviations
+from torch_denkf.running import check_module
+from torch_denkf.submodel import Initial, Transition, role
 
 __all__ = ["BiasedBelief", "BiasedNoise", "BiasedObservation", "BiasedTransition", "FadingBias", "biased_parts"]
 
@@ -148,7 +149,7 @@ class FadingBias(nn.Module):
         return (2 * self.log_std).exp() * -torch.expm1(-2 * (-self.log_time).exp())
 
 
-class BiasedTransition(SubModel):
+class BiasedTransition(Wrapper, Transition):
     """A transition of S numbers, and behind them biases that fade.
 
     Args:
@@ -167,25 +168,22 @@ class BiasedTransition(SubModel):
         tensor([[1.0000, 0.3679]], grad_fn=...)
     """
 
+    place = "transition"
+
     def __init__(self, transition: TensorDictModuleBase, bias: FadingBias):
         check_module("transition", transition)
-        needed, optional = reads(transition)
-        super().__init__(transition, needed, transition.out_keys, optional_keys=optional)
+        super().__init__(transition)
         self.bias = bias
-
-    def parts(self):
-        """The transition."""
-        return {"transition": self.module}
 
     def on_entries(self, entries, call):
         """The forecast of both, and whatever else the transition writes."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, slow = _split(self.required(entries, key), self.bias, self)
-        written = run_module(self.module, {**entries, key: state}, call.part("transition"))
+        written = self.run_inside({**entries, key: state}, call)
         return {**written, out_key: torch.cat([written[out_key], self.bias.decay * slow], -1)}
 
 
-class BiasedNoise(SubModel):
+class BiasedNoise(Wrapper):
     """The process noise of a state and of the biases behind it: variances ``[*B, N + K]`` or a covariance.
 
     Args:
@@ -201,19 +199,16 @@ class BiasedNoise(SubModel):
         tensor([0.2500, 0.1813], grad_fn=...)
     """
 
+    place = "noise"
+
     def __init__(self, noise: TensorDictModuleBase, bias: FadingBias):
         check_module("noise", noise)
-        needed, optional = reads(noise)
-        super().__init__(noise, needed, noise.out_keys, optional_keys=optional)
+        super().__init__(noise)
         self.bias = bias
-
-    def parts(self):
-        """The noise module."""
-        return {"noise": self.module}
 
     def on_entries(self, entries, call):
         """Q of both."""
-        out, key = run_module(self.module, entries, call.part("noise")), unravel_key(self.out_keys[0])
+        out, key = self.run_inside(entries, call), unravel_key(self.out_keys[0])
         of_state, slow = out[key], self.bias.variance.to(out[key].dtype)
         if of_state.ndim == len(call.batch_size) + 1:
             return {**out, key: torch.cat([of_state, slow.expand(*of_state.shape[:-1], -1)], -1)}
@@ -223,7 +218,7 @@ class BiasedNoise(SubModel):
         return {**out, key: torch.cat(rows, -2)}
 
 
-class BiasedObservation(SubModel):
+class BiasedObservation(Wrapper):
     """What the sensor reads of the state, plus its biases.
 
     With K = G O biases each component of the reading has G of them: the first O belong to components 1 to O, and so do
@@ -246,24 +241,21 @@ class BiasedObservation(SubModel):
         tensor([[3.0000, 4.5000]])
     """
 
+    place = "observation"
+
     def __init__(self, observation: TensorDictModuleBase, bias: FadingBias, dims: Sequence[int] | None = None):
         check_module("observation", observation)
         if dims is not None and len(dims) != len(bias):
             raise ValueError(f"dims names {len(dims)} components of the reading, and there are {len(bias)} biases")
-        needed, optional = reads(observation)
-        super().__init__(observation, needed, observation.out_keys, optional_keys=optional)
+        super().__init__(observation)
         self.bias = bias
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
-
-    def parts(self):
-        """The observation model."""
-        return {"observation": self.module}
 
     def on_entries(self, entries, call):
         """The predicted observations."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, slow = _split(self.required(entries, key), self.bias, self)
-        written = run_module(self.module, {**entries, key: state}, call.part("observation"))
+        written = self.run_inside({**entries, key: state}, call)
         read = written[out_key]
         if self.dims is not None:
             slow = torch.zeros_like(read).index_add(-1, self.dims, slow)
@@ -277,7 +269,7 @@ class BiasedObservation(SubModel):
         return {**written, out_key: read * (1 + slow) if self.bias.factor else read + slow}
 
 
-class BiasedBelief(SubModel):
+class BiasedBelief(AroundInitial):
     """The initial belief of a state, and of the biases behind it: independent, with mean 0 and ``FadingBias.std``.
 
     Args:
@@ -293,12 +285,13 @@ class BiasedBelief(SubModel):
                 [0., 4.]], grad_fn=...)
     """
 
+    place = "initial"
+    derived = Initial.derived  # the module inside knows entries of another size
+
     def __init__(self, initial: TensorDictModuleBase, bias: FadingBias):
         check_module("initial", initial)
-        needed, optional = reads(initial)
-        super().__init__(initial, needed, writes(initial), optional_keys=optional)
-        self.bias, told = bias, declared(initial)
-        self.ensemble_size, self.observation_dim = told.ensemble_size, told.observation_dim
+        super().__init__(initial)
+        self.bias, told = bias, role(initial, Initial)
         self.input_dim = told.input_dim or told.state_dim
         self.state_dim = None if told.state_dim is None else told.state_dim + len(bias)
 
@@ -306,10 +299,6 @@ class BiasedBelief(SubModel):
     def noise_names(self) -> tuple[str, ...]:
         """The draws of an ensemble's biases."""
         return ("",) if any(map(is_samples, self.out_keys)) else ()
-
-    def parts(self):
-        """The initial belief of the state."""
-        return {"initial": self.module}
 
     def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
         """Draws standard-normal values ``[*batch_size, E, K]``."""
@@ -324,7 +313,7 @@ class BiasedBelief(SubModel):
 
     def on_entries(self, entries, call):
         """The belief of both."""
-        written = dict(run_module(self.module, entries, call.part("initial")))
+        written = dict(self.run_inside(entries, call))
         names = {key[-1]: key for key in map(unravel_key, self.out_keys)}
         std, size = self.bias.std, call.batch_size
         if "ensemble" in names:
@@ -372,10 +361,10 @@ def biased_parts(
     """
     if not isinstance(bias, FadingBias):
         raise TypeError(f"sensor_error is a FadingBias, or None; got {type(bias).__name__}")
-    if declared(initial).space is not None:
+    if role(initial, Initial).space is not None:
         raise ValueError(
-            f"sensor_error is for states of plain numbers, not for {declared(initial).space}: put the biases into the "
-            "state, Product(..., Euclidean(K))."
+            f"sensor_error is for states of plain numbers, not for {role(initial, Initial).space}: put the biases into "
+            "the state, Product(..., Euclidean(K))."
         )
     if reading_space is not None:
         raise ValueError(f"sensor_error is added to readings of plain numbers, not to points of {reading_space}.")

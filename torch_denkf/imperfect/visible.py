@@ -29,16 +29,16 @@ from torch_denkf.beliefs import Ensemble, complete
 from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.mixture import log_mixture, mix_members, mix_moments, responsibility
 from torch_denkf.functional.weighted import scored_innovation
-from torch_denkf.modules._tensors import mean_of_members
-from torch_denkf.modules.carried import AnalysisAround
+from torch_denkf.modules.around import Around
 from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.modules.tensors import mean_of_members
 from torch_denkf.running import check_module
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.submodel import Call, Entries, Sensor, Update
 
 __all__ = ["Visibility", "Visible", "heeding"]
 
 
-class Visibility(SubModel):
+class Visibility(Sensor):
     r"""The probability that a reading is about the state at all, from what the sensor encodes.
 
     Labels teach it where there are some: the term ``visible`` of the losses, a binary cross entropy. Where there are
@@ -96,7 +96,7 @@ class Visibility(SubModel):
         return self.floor + (1 - 2 * self.floor) * self.module(encoding).sigmoid()
 
 
-class Visible(AnalysisAround):
+class Visible(Around):
     r"""Lets a reading count as far as it is about the state.
 
     The analysis runs once. With q, the probability that the reading was about the state now that it is known, the
@@ -144,7 +144,7 @@ class Visible(AnalysisAround):
         0.00 0.00
     """
 
-    def __init__(self, analysis: SubModel, *, broad: float = 10.0, visible_key: NestedKey = ("sensor", "visible")):
+    def __init__(self, analysis: Update, *, broad: float = 10.0, visible_key: NestedKey = ("sensor", "visible")):
         check_number("broad", broad, above=1)
         self_made = _kind(analysis)
         if analysis.space is not None or analysis.reading_space is not None:
@@ -153,28 +153,8 @@ class Visible(AnalysisAround):
             analysis,
             [*analysis.in_keys, visible_key],
             [*analysis.out_keys, (analysis.info_prefix, "visible")],
-            optional_keys=analysis.optional_keys,
         )
         self.kind, self.broad, self.visible_key = self_made, broad, unravel_key(visible_key)
-        self.info_prefix, self.reading_keys = analysis.info_prefix, analysis.reading_keys
-        self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
-        self.noise_variance_key, self.predicted_key = analysis.noise_variance_key, analysis.predicted_key
-
-    def noise_sizes(self, *values):
-        """Those of the analysis."""
-        return self.module.noise_sizes(*values)
-
-    def reading_dims(self, entries, call):
-        """Those of the analysis."""
-        return self.module.reading_dims(entries, call)
-
-    def around(self, analysis: SubModel) -> Visible:
-        """The same around another analysis.
-
-        Args:
-            analysis: of the same reading, e.g. a :class:`~torch_denkf.smoothers.past.LaggedAnalysis`.
-        """
-        return Visible(analysis, broad=self.broad, visible_key=self.visible_key)
 
     def on_entries(self, entries, call):
         """The belief and the diagnostics."""
@@ -252,7 +232,7 @@ def heeding(visibility: Visibility | None, analysis: TensorDictModuleBase) -> Te
     if visibility is None:
         return analysis
     check_module("visibility", visibility)
-    return Visible(cast(SubModel, analysis), visible_key=visibility.out_keys[0])
+    return Visible(cast(Update, analysis), visible_key=visibility.out_keys[0])
 
 
 def _like(seen: Tensor, value: Tensor) -> Tensor:
@@ -260,9 +240,10 @@ def _like(seen: Tensor, value: Tensor) -> Tensor:
     return seen.reshape(*seen.shape[:-1], *(1,) * (value.ndim - seen.ndim + 1))
 
 
-def _kind(analysis: SubModel) -> str:
+def _kind(analysis: Update) -> str:
     """What an analysis updates: ``"members"``, ``"moments"`` or ``"particles"``."""
-    if isinstance(analysis, SubModel) and not isinstance(analysis, AnalysisAround) and analysis.info_prefix is not None:
+    wrapped = isinstance(analysis, Around) and not analysis.updates_ensemble
+    if isinstance(analysis, Update) and not wrapped and analysis.info_prefix is not None:
         written = [cast("tuple[str, ...]", unravel_key(key)) for key in analysis.out_keys]
         scores = {(analysis.info_prefix, name) for name in ("nis", "innovation", "log_likelihood")}
         read = [key[-1] for key in map(unravel_key, analysis.in_keys[:2])]

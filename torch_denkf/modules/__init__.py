@@ -4,6 +4,7 @@ Import from here: ``from torch_denkf.modules import EnsembleAnalysis, ImageSenso
 """
 
 from torch_denkf.modules.analysis import EnsembleAnalysis
+from torch_denkf.modules.around import Around
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
 from torch_denkf.modules.continuous import ContinuousMotion, ContinuousNoise, NoisePerSecond
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
@@ -21,10 +22,14 @@ from torch_denkf.modules.stochastic import StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
 from torch_denkf.running import reads, run_module
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import Initial, SubModel, Transition, Update
 
 __all__ = [
     "SubModel",
+    "Initial",
+    "Transition",
+    "Update",
+    "Around",
     "reads",
     "run_module",
     "StochasticMLP",

@@ -6,16 +6,15 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal, Unpack
 
 import torch
-from tensordict import unravel_key
 
 from torch_denkf._checks import check_values
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_cov
-from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
 from torch_denkf.modules._spaces import mean_and_tangents, reading_about
-from torch_denkf.modules._tensors import as_floating, check_dims
+from torch_denkf.modules.ensemble import EnsembleAnalysisKeys, EnsembleUpdate
+from torch_denkf.modules.tensors import as_floating, check_dims
 
 __all__ = ["EnsembleAnalysis"]
 
@@ -46,7 +45,7 @@ class EnsembleAnalysis(EnsembleUpdate):
             :mod:`torch_denkf.functional.manifolds`.
         reading_space: in which the reading lives; innovation and R are tangents. In the place of ``angles``.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
-        **keys: see :class:`~torch_denkf.modules._ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs
+        **keys: see :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs
             learned observations, not one reading.
 
     Raises:
@@ -106,7 +105,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         )
         check_dims("inflated", inflated or [])
         self.inflated = None if inflated is None else list(inflated)
-        self.scheme, self.covariance, self.noise_variance_key = scheme, covariance, unravel_key(self.in_keys[3])
+        self.scheme, self.covariance = scheme, covariance
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
             if factors is not None:
                 check_values(name.replace("_", "'s "), factors)
@@ -173,7 +172,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         return factor
 
     def move_past(self, past, predicted, observation, variance, observed=None, *, noise=None):
-        """See :meth:`SubModel.move_past`; neither inflation nor relaxation touches the past."""
+        """See :meth:`Update.move_past`; neither inflation nor relaxation touches the past."""
         if self.reading_space is not None:
             predicted, observation = reading_about(self.reading_space, predicted, observation, observed)
         center = None

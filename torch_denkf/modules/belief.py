@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import cast
 
 import torch
-from tensordict import NestedKey, unravel_key
+from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf._checks import check_count, check_values
@@ -14,19 +14,19 @@ from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._spaces import checked_space
-from torch_denkf.modules._tensors import (
+from torch_denkf.modules.tensors import (
     as_floating,
     as_standard_deviations,
     check_dims,
     mean_of_members,
     register_location,
 )
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import Initial
 
 __all__ = ["AroundState", "FromSensor", "GaussianPrior"]
 
 
-class _InitialEnsemble(SubModel):
+class _InitialEnsemble(Initial):
     """Draws ``center + std * N(0, I)`` and writes ensemble, mean and variance of the belief."""
 
     def __init__(
@@ -173,8 +173,6 @@ class FromSensor(_InitialEnsemble):
         tensor([5., 0.])
     """
 
-    reads_components = True
-
     def __init__(
         self,
         dims: Sequence[int],
@@ -191,8 +189,7 @@ class FromSensor(_InitialEnsemble):
         register_location(self, "mean", mean)
         check_dims("dims", dims, once=True, size=self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
-        self.observation_dim = self.input_dim = len(self.dims)
-        self.reading_keys, self.observed_key = self.in_keys, unravel_key(observed_key)
+        self.input_dim = len(self.dims)
 
     def on_entries(self, entries, call):
         """The belief; without its reading the prior."""

@@ -9,14 +9,14 @@ from torch import nn
 
 from torch_denkf._checks import check_covariance, check_square, check_values
 from torch_denkf.functional.continuous import discretise
-from torch_denkf.modules._tensors import as_floating, register_constant
+from torch_denkf.modules.tensors import as_floating, register_constant
 from torch_denkf.running import check_module, reads, run_module
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["ContinuousMotion", "ContinuousNoise", "NoisePerSecond"]
 
 
-class ContinuousMotion(SubModel):
+class ContinuousMotion(Transition):
     r"""A linear motion :math:`dx = A x\,dt` over the seconds since the last step.
 
     Args:

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torch_denkf.functional import kalman_update
 from torch_denkf.functional.manifolds import Euclidean, Space
-from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
+from torch_denkf.modules.gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
 from torch_denkf.running import reads
-from torch_denkf.submodel import Call, Entries
+from torch_denkf.submodel import Call, Entries, Update, role
 
 __all__ = ["EKFAnalysis", "EKFTransition"]
 
@@ -111,7 +111,7 @@ class EKFAnalysis(GaussianAnalysis):
 def _needed(module, entries: Entries) -> Entries:
     """What the model inside reads, and the mask."""
     needed, optional = reads(module.module)
-    keys = dict.fromkeys([*needed, *optional, module.observed_key])
+    keys = dict.fromkeys([*needed, *optional, role(module, Update).observed_key])
     return {key: entries[key] for key in keys if key in entries}
 
 

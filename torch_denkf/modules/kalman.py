@@ -14,16 +14,16 @@ from torch_denkf.functional import kalman_predict, kalman_update, wrap_angles
 from torch_denkf.functional.angles import mean_observation
 from torch_denkf.functional.linalg import product_of_known
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._gaussian import as_covariance, further_keys, updated
 from torch_denkf.modules._spaces import checked_space
-from torch_denkf.modules._tensors import as_standard_deviations, check_dims, register_constant
+from torch_denkf.modules.gaussian import as_covariance, further_keys, updated
+from torch_denkf.modules.tensors import as_standard_deviations, check_dims, register_constant
 from torch_denkf.running import run_module
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.submodel import Call, Entries, Initial, Transition, Update
 
 __all__ = ["GaussianAround", "KalmanAnalysis", "LinearTransition", "MomentPrior"]
 
 
-class MomentPrior(SubModel):
+class MomentPrior(Initial):
     """A Gaussian belief given by its moments, the same for every episode.
 
     Args:
@@ -62,7 +62,7 @@ class MomentPrior(SubModel):
         return tuple(value.expand(*batch_size, *value.shape) for value in values)
 
 
-class GaussianAround(SubModel):
+class GaussianAround(Initial):
     """A Gaussian belief around a state that is known at reset, e.g. the ground truth of a data set.
 
     Like :class:`~torch_denkf.modules.AroundState`, for filters with a mean and a covariance.
@@ -108,7 +108,7 @@ class GaussianAround(SubModel):
         return mean, variance.diag_embed(), variance
 
 
-class LinearTransition(SubModel):
+class LinearTransition(Transition):
     r"""Forecast of mean and covariance, :math:`F m + B a` and :math:`F P F^T + Q`.
 
     Args:
@@ -188,7 +188,7 @@ class LinearTransition(SubModel):
         return self.on_entries(entries, call), self.required(entries, self.in_keys[1]) @ self.matrix.mT
 
 
-class KalmanAnalysis(SubModel):
+class KalmanAnalysis(Update):
     """The Kalman update of mean and covariance (Joseph form).
 
     Args:
@@ -220,7 +220,6 @@ class KalmanAnalysis(SubModel):
         tensor([0.5000])
     """
 
-    reads_components = True
     info_prefix: str
 
     def __init__(

@@ -15,9 +15,9 @@ from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.angles import mean_observation
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._spaces import checked_spaces, without_hidden
-from torch_denkf.modules._tensors import as_vector, check_dims, mean_of_members
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.submodel import SubModel
+from torch_denkf.modules.tensors import as_vector, check_dims, mean_of_members
+from torch_denkf.submodel import Update
 
 __all__ = ["GaussianLikelihood", "LearnedLikelihood"]
 
@@ -27,7 +27,7 @@ _SMALLEST_LIKELIHOOD = 0.004
 _SMALLEST_LOG_LIKELIHOOD = -20.0
 
 
-class GaussianLikelihood(SubModel):
+class GaussianLikelihood(Update):
     r"""Log-density of the reading around each particle's prediction, :math:`\log N(\tilde y; h(x^i), R)`.
 
     Dimensions that are not observed drop out; where nothing is observed it is zero for all particles.
@@ -54,8 +54,6 @@ class GaussianLikelihood(SubModel):
         >>> GaussianLikelihood()(td)["forecast", "log_likelihood"]
         tensor([-1.4189, -0.9189])
     """
-
-    reads_components = True
 
     def __init__(
         self,
@@ -109,7 +107,7 @@ class GaussianLikelihood(SubModel):
         return terms.sum(-1)
 
 
-class LearnedLikelihood(SubModel):
+class LearnedLikelihood(Update):
     r"""A learned likelihood: a network looks at the sensor's encoding and at a particle's predicted observation.
 
     .. math:: \log l^i = b(g(e \oplus (h(x^i) - m) / s))

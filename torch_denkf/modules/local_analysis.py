@@ -12,8 +12,8 @@ from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import ensemble_mean, ensemble_var, letkf, neighbours
 from torch_denkf.functional.inflation import random_rotation, relax_to_prior_spread
 from torch_denkf.functional.localisation import Neighbours, neighbours_of_taper
-from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
-from torch_denkf.modules._tensors import mean_of_members, refuse_trained
+from torch_denkf.modules.ensemble import EnsembleAnalysisKeys, EnsembleUpdate
+from torch_denkf.modules.tensors import mean_of_members, refuse_trained
 
 __all__ = ["LocalEnsembleAnalysis"]
 
@@ -45,7 +45,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
             their correlation from chance, see :class:`EnsembleAnalysis`.
         threshold: of ``"significance"``, in standard deviations; a ``Parameter`` is trained.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
-        **keys: see :class:`~torch_denkf.modules._ensemble.EnsembleAnalysisKeys`. Of learned observations the
+        **keys: see :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. Of learned observations the
             mean is taken. What is not observed may be NaN, readings and variances alike.
 
     Raises:

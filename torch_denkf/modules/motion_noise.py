@@ -14,15 +14,15 @@ from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules._spaces import checked_space
-from torch_denkf.modules._tensors import check_dims
 from torch_denkf.modules.noise import ConstantNoise
+from torch_denkf.modules.tensors import check_dims
 from torch_denkf.running import check_module, reads, run_module
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.submodel import Call, Entries, Transition
 
 __all__ = ["NoisyTransition"]
 
 
-class NoisyTransition(SubModel):
+class NoisyTransition(Transition):
     r"""A transition with Gaussian process noise :math:`N(0, Q)` in some or all dimensions of the state.
 
     An ensemble without process noise collapses: its members come together, and its intervals become too narrow. Where

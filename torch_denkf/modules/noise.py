@@ -10,21 +10,21 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number, check_values
-from torch_denkf.modules._tensors import (
+from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.modules.tensors import (
     as_standard_deviations,
     mean_of_members,
     register_location,
     register_scale,
     variance_and_floor,
 )
-from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.running import check_module, reads, run_module
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import Sensor, SubModel
 
 __all__ = ["ConstantNoise", "DiagonalNoise", "ScaledNoise", "MemberGain"]
 
 
-class DiagonalNoise(SubModel):
+class DiagonalNoise(Sensor):
     r"""A learned diagonal of R from the learned observation, with :math:`R = r^2` before training and a floor.
 
     .. math:: R = (r^2 - c)\,(1 + g_\zeta((\tilde y - m) / s))^2 + c
@@ -86,7 +86,7 @@ class DiagonalNoise(SubModel):
         return self.variance * relative**2 + self.floor
 
 
-class ConstantNoise(SubModel):
+class ConstantNoise(Sensor):
     """A constant diagonal of R, learned or known.
 
     Args:
@@ -131,7 +131,7 @@ class ConstantNoise(SubModel):
         return variance.expand(*batch_size, -1)
 
 
-class ScaledNoise(SubModel):
+class ScaledNoise(Sensor):
     r"""What another noise module writes, times the square of a factor that is set by hand after training.
 
     A filter that is too sure of itself needs more spread. Scaling Q and R by one factor widens its intervals and

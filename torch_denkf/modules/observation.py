@@ -10,7 +10,7 @@ from torch import nn
 
 from torch_denkf._checks import check_values
 from torch_denkf.functional.linalg import product_of_known
-from torch_denkf.modules._tensors import check_dims, register_constant, register_location, register_scale
+from torch_denkf.modules.tensors import check_dims, register_constant, register_location, register_scale
 from torch_denkf.modules.transition import MemberNetwork
 from torch_denkf.running import check_network
 from torch_denkf.submodel import SubModel

@@ -28,10 +28,10 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.resampling import effective_sample_size, jitter_copies
 from torch_denkf.functional.weighted import weighted_innovation, weighted_mean, weighted_var
 from torch_denkf.modules._spaces import checked_space, reading_about
-from torch_denkf.modules.carried import Beside
+from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.likelihood import GaussianLikelihood
 from torch_denkf.running import check_module, reads, run_module
-from torch_denkf.submodel import Entries, SubModel
+from torch_denkf.submodel import Entries, Transition, Update
 
 __all__ = ["ParticleAnalysis", "ResampledTransition", "with_weights"]
 
@@ -41,7 +41,7 @@ def with_weights(
     *,
     ensemble_key: NestedKey = ("belief", "ensemble"),
     log_weight_key: NestedKey = ("belief", "log_weight"),
-) -> Beside:
+) -> AugmentedBelief:
     """An initial belief whose members are particles of equal weight.
 
     Args:
@@ -56,7 +56,7 @@ def with_weights(
         >>> start(TensorDict({}, []))["belief", "log_weight"].exp()
         tensor([0.2500, 0.2500, 0.2500, 0.2500])
     """
-    return Beside(initial, [log_weight_key], partial(_equal_weights, unravel_key(ensemble_key)), nested=True)
+    return AugmentedBelief(initial, [log_weight_key], partial(_equal_weights, unravel_key(ensemble_key)), nested=True)
 
 
 def _equal_weights(ensemble_key: NestedKey, belief: Entries, _: torch.Size) -> list[torch.Tensor]:
@@ -64,7 +64,7 @@ def _equal_weights(ensemble_key: NestedKey, belief: Entries, _: torch.Size) -> l
     return [torch.full_like(ensemble[..., 0], -math.log(ensemble.shape[-2]))]
 
 
-class ResampledTransition(SubModel):
+class ResampledTransition(Transition):
     r"""Resamples the particles of the belief, then moves them.
 
     Only frames that are observed change weights, so that only in front of those there is something to resample; over
@@ -261,7 +261,7 @@ def _without_lost(forecast: torch.Tensor, log_weights: torch.Tensor) -> tuple[to
     return forecast, torch.where(lost.any(-1, keepdim=True), left.log_softmax(-1), log_weights)
 
 
-class ParticleAnalysis(SubModel):
+class ParticleAnalysis(Update):
     r"""Bayes' rule on particles: :math:`w^i \propto w^i_{t|t-1}\, p(y_t | x^i)`; the particles stay where they are.
 
     Mean and variance are the weighted ones of all particles, before any resampling, which would only add to their
@@ -324,7 +324,7 @@ class ParticleAnalysis(SubModel):
         self.reading_space = None if likelihood is None else likelihood.reading_space
         if likelihood is not None:
             self.reading_keys, self.predicted_key = likelihood.reading_keys, likelihood.predicted_key
-            self.observed_key, self.reads_components = likelihood.observed_key, True
+            self.observed_key = likelihood.observed_key
 
     def compute(self, particles, prior, log_likelihood, *of_reading):
         """The belief and the diagnostics."""

@@ -16,7 +16,9 @@ from torch import nn
 from torch.nn import functional as F
 
 from torch_denkf._checks import check_count, check_values
-from torch_denkf.modules._tensors import (
+from torch_denkf.modules.noise import ConstantNoise
+from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.modules.tensors import (
     as_floating,
     mean_of_members,
     register_constant,
@@ -24,10 +26,8 @@ from torch_denkf.modules._tensors import (
     register_scale,
     variance_and_floor,
 )
-from torch_denkf.modules.noise import ConstantNoise
-from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.running import check_module, declared, reads, run_module
-from torch_denkf.submodel import SubModel
+from torch_denkf.running import check_module, reads, run_module
+from torch_denkf.submodel import Initial, SubModel, role
 
 __all__ = ["CholeskyNoise", "MappedNoise", "NoiseThrough", "as_process_noise"]
 
@@ -55,7 +55,7 @@ def as_process_noise(
     """
     if isinstance(noise, nn.Module):
         return noise
-    std, size = as_floating(noise, "process_noise"), declared(initial).state_dim
+    std, size = as_floating(noise, "process_noise"), role(initial, Initial).state_dim
     check_values("process_noise, a standard deviation,", std, least=0)
     if std.ndim > 1 or (std.ndim == 1 and size is not None and len(std) != size):
         known = f"[S] = [{size}]" if size is not None else "[S]"

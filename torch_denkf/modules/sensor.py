@@ -11,10 +11,10 @@ from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf._checks import check_count, has_values
-from torch_denkf.modules._tensors import as_vector, register_location, register_scale
 from torch_denkf.modules._trunk import activation_bytes, couples_frames, in_chunks, reduced_precision
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.submodel import SubModel
+from torch_denkf.modules.tensors import as_vector, register_location, register_scale
+from torch_denkf.submodel import Sensor
 
 __all__ = ["ImageSensor", "VectorSensor", "convolutional_trunk"]
 
@@ -44,7 +44,7 @@ def convolutional_trunk(in_channels: int, layers: Sequence[tuple[int, int, int]]
     return nn.Sequential(*parts, nn.Flatten())
 
 
-class StochasticSensor(SubModel):
+class StochasticSensor(Sensor):
     """A sensor whose noise is that of its head ``self.module["head"]``, a stochastic network."""
 
     ensemble_size: int

@@ -7,8 +7,8 @@ from typing import Literal, Unpack
 import torch.distributed as dist
 
 from torch_denkf.functional.kernels.sharded import analyse_sharded
-from torch_denkf.modules._ensemble import EnsembleAnalysisKeys
 from torch_denkf.modules.analysis import EnsembleAnalysis
+from torch_denkf.modules.ensemble import EnsembleAnalysisKeys
 
 __all__ = ["ShardedEnsembleAnalysis"]
 
@@ -32,7 +32,7 @@ class ShardedEnsembleAnalysis(EnsembleAnalysis):
         inflation: factor on the analysis anomalies, where anything is observed, by whichever process; 1 for none.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         group: the processes; ``None`` for all.
-        **keys: see :class:`~torch_denkf.modules._ensemble.EnsembleAnalysisKeys`.
+        **keys: see :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`.
 
     Raises:
         ValueError: for the scheme ``"perturbed"``, whose draws would be the same in processes of one seed.

@@ -8,10 +8,10 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf.modules._tensors import register_location, register_scale
 from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.modules.tensors import register_location, register_scale
 from torch_denkf.running import check_network
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["LearnedTransition", "MemberNetwork"]
 
@@ -40,7 +40,7 @@ class MemberNetwork(SubModel):
         return self.module(features, noise, sample=noise is not None)
 
 
-class LearnedTransition(MemberNetwork):
+class LearnedTransition(MemberNetwork, Transition):
     r"""A learned transition, residual by default: :math:`x_t = x_{t-1} + s \circ f_\theta((x_{t-1} - m) / s, a)`.
 
     Commands in degrees, or in ticks of an encoder, are far from what a network likes to read: give their mean and

@@ -16,7 +16,7 @@ from torch_denkf.functional.unscented import (
     unscented_update,
     unscented_weights,
 )
-from torch_denkf.modules._gaussian import (
+from torch_denkf.modules.gaussian import (
     GaussianAnalysis,
     GaussianAnalysisOptions,
     GaussianTransition,

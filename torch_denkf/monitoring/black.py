@@ -6,13 +6,13 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_number
-from torch_denkf.modules._tensors import mask_of
-from torch_denkf.submodel import SubModel
+from torch_denkf.modules.tensors import mask_of
+from torch_denkf.submodel import Sensor
 
 __all__ = ["BlackIsMissing"]
 
 
-class BlackIsMissing(SubModel):
+class BlackIsMissing(Sensor):
     """Marks pictures that are black all over as not observed: no scene is.
 
     A sensor reads something in a black picture, too, and a filter believes it. Put this module in front of the sensor,

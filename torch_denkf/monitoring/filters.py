@@ -7,17 +7,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Unpack
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters.base import Filter
-from torch_denkf.filters.structure import submodels
 from torch_denkf.fusion.parts import StateObservation
-from torch_denkf.modules.carried import with_state
+from torch_denkf.modules.around import with_state
 from torch_denkf.monitoring.gate import GatedAnalysis, GateOptions, can_be_gated
 from torch_denkf.monitoring.monitor import InnovationMonitor
-from torch_denkf.running import check_module, is_sequence, named_modules_of
-from torch_denkf.submodel import Call, SubModel
+from torch_denkf.running import check_module, in_sequences, is_sequence, named_modules_of, writes
+from torch_denkf.submodel import Call, Sensor, SubModel, Update, role
 
 __all__ = ["Gated", "Monitored"]
 
@@ -202,13 +201,9 @@ def _check_filter(name: str, filter: object) -> None:
         )
 
 
-def _analyses(module: TensorDictModuleBase) -> Iterator[SubModel]:
+def _analyses(module: TensorDictModuleBase) -> Iterator[Update]:
     """The analyses of a module of a filter that can be gated."""
-    if is_sequence(module):
-        for _, part in named_modules_of(module):
-            yield from _analyses(part)
-    elif can_be_gated(module):
-        yield module
+    yield from filter(can_be_gated, in_sequences(module))
 
 
 def _with(module: TensorDictModuleBase, old: SubModel, new: SubModel) -> TensorDictModuleBase:
@@ -218,20 +213,13 @@ def _with(module: TensorDictModuleBase, old: SubModel, new: SubModel) -> TensorD
     return TensorDictSequential(OrderedDict((name, _with(part, old, new)) for name, part in named_modules_of(module)))
 
 
-def _dims_of(module: TensorDictModuleBase, key: NestedKey) -> Iterator[int]:
-    """The numbers of components that sub-models say of an entry which they write."""
-    for part in submodels(module):
-        if key in map(unravel_key, part.out_keys):
-            own = [part] if part.observation_dim is not None else submodels(part)
-            yield from (inner.observation_dim for inner in own if inner.observation_dim is not None)
-
-
-def _dim(filter: Filter, analysis: SubModel) -> int:
+def _dim(filter: Filter, analysis: Update) -> int:
     """How many components an analysis' reading has."""
-    for key in map(unravel_key, analysis.reading_keys[1:2]):
-        known = {dim for _, module in filter.structure.modules for dim in _dims_of(module, key)}
-        if len(known) == 1:
-            return known.pop()
+    noise = set(map(unravel_key, analysis.reading_keys[1:]))
+    for part in (part for _, module in filter.structure.modules for part in in_sequences(module)):
+        dim = role(part, Sensor).observation_dim
+        if dim is not None and not noise.isdisjoint(writes(part)):
+            return dim
     try:
         return analysis.reading_dims({}, Call(torch.Size()))[0]
     except KeyError:

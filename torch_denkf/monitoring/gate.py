@@ -11,14 +11,15 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.modules.carried import AnalysisAround
+from torch_denkf.modules.around import Around
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.monitoring._calibration import IDENTITY, check_observation_dim, chi_square_table, empirical_quantile
 from torch_denkf.monitoring.chi_square import chi_square_quantile
 from torch_denkf.monitoring.gating import adapt, disbelief, spread_about_mean
 from torch_denkf.monitoring.innovation_tests import interpolate
+from torch_denkf.running import random_parts
 from torch_denkf.smoothers.past import LaggedAnalysis
-from torch_denkf.submodel import Call, Entries, SubModel, flat_noise
+from torch_denkf.submodel import Call, Entries, Update, flat_noise
 
 __all__ = ["GateOptions", "GatedAnalysis"]
 
@@ -59,9 +60,10 @@ class GateOptions(TypedDict, total=False):
     gate_prefix: str
 
 
-def can_be_gated(analysis: nn.Module) -> TypeGuard[SubModel]:
+def can_be_gated(analysis: nn.Module) -> TypeGuard[Update]:
     """Whether a module is an analysis that says where its forecast, its reading and its diagnostics are."""
-    if not isinstance(analysis, SubModel) or analysis.observed_key is None or isinstance(analysis, AnalysisAround):
+    wrapped = isinstance(analysis, Around) and not analysis.updates_ensemble
+    if not isinstance(analysis, Update) or analysis.observed_key is None or wrapped:
         return False
     read = [unravel_key(key) for key in analysis.reading_keys]
     scores = {(analysis.info_prefix, name) for name in ("nis", "innovation")}
@@ -69,7 +71,7 @@ def can_be_gated(analysis: nn.Module) -> TypeGuard[SubModel]:
     return bool(read) and in_place and scores <= set(map(unravel_key, analysis.out_keys))
 
 
-class GatedAnalysis(AnalysisAround):
+class GatedAnalysis(Around):
     """Lets a reading count as far as the innovations of the last steps, its own included, deserve it.
 
     The analysis runs twice: as it would, to see the innovation, and then with the variances, mask and spread that
@@ -133,9 +135,11 @@ class GatedAnalysis(AnalysisAround):
     claimed: Tensor | None
     observation_dim: int
 
+    reading_dims = Update.reading_dims  # it knows O, and the variances that a Kalman analysis holds are none of its
+
     def __init__(
         self,
-        analysis: SubModel,
+        analysis: Update,
         observation_dim: int,
         *,
         response: Literal["reject", "student", "huber"] = "student",
@@ -174,16 +178,14 @@ class GatedAnalysis(AnalysisAround):
         further = [(gate_prefix, name) for name in ("factor", "nis", "innovation", "part_nis")]
         in_keys = [key for key in analysis.in_keys if claimed is None or key != analysis.in_keys[3]]
         out_keys = [*analysis.out_keys, *state, *further]
-        super().__init__(analysis, [*in_keys, *state], out_keys, optional_keys=analysis.optional_keys)
+        super().__init__(analysis, [*in_keys, *state], out_keys)
         self.register_buffer("claimed", claimed)
         self.state_keys, self._further, self.of_ensemble = state, further, of_ensemble
         self.response, self.window, self.rate, self.freedom = response, window, rate, freedom
         self.patience, self.by_component = patience, by_component
         self.adapt_noise, self.adapt_inflation = adapt_noise, adapt_inflation
-        self.gate_prefix, self.info_prefix = gate_prefix, analysis.info_prefix
+        self.gate_prefix = gate_prefix
         self.reading_keys = [key for key in analysis.reading_keys if key in in_keys]
-        self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
-        self.reading_space = analysis.reading_space
         self.noise_variance_key = unravel_key(analysis.in_keys[3])
         self.observation_dim, self.parts_count = observation_dim, observation_dim if by_component else 1
         self.register_buffer("tables", IDENTITY.repeat(self.parts_count, 1, 1))
@@ -193,22 +195,6 @@ class GatedAnalysis(AnalysisAround):
         self.register_buffer("limits", torch.tensor(limits))
         usual = [chi_square_quantile(max(rate, _USUAL), n) for n in range(1, most + 1)]
         self.register_buffer("usual", torch.tensor([torch.inf, *usual]))
-
-    def noise_sizes(self, *values):
-        """Those of the analysis."""
-        return self.module.noise_sizes(*values)
-
-    def around(self, analysis: SubModel) -> GatedAnalysis:
-        """The same gate, with the same calibration, around another analysis.
-
-        Args:
-            analysis: of the same reading, e.g. a :class:`LaggedAnalysis` of the one inside.
-        """
-        options = {name: getattr(self, name) for name in GateOptions.__annotations__}
-        gate = GatedAnalysis(analysis, self.observation_dim, **options)
-        for name in ("tables", "slack", "limits", "usual"):
-            setattr(gate, name, getattr(self, name))
-        return gate
 
     def initial_state(self, batch_size: Sequence[int], *, device=None, dtype=None) -> list[Tensor]:
         """The state before anything was observed, in the order of ``state_keys``."""
@@ -284,9 +270,9 @@ class GatedAnalysis(AnalysisAround):
         if self.claimed is not None:
             mean = self.required(entries, self.in_keys[0])
             entries[self.noise_variance_key] = self.claimed.expand(*mean.shape[:-1], *self.claimed.shape)
-        if self.noise_names and call.sample:
-            values = [self.required(entries, key) for key in self.module.in_keys]
-            entries.update(flat_noise(self.module._noise(entries, values, call), call.place))
+        for place, part in random_parts(self.module, call.place) if call.sample else ():
+            values = [self.required(entries, key) for key in part.in_keys]
+            entries.update(flat_noise(part._noise(entries, values, call._replace(place=place)), place))
         return entries
 
     def _parts(self, entries: Entries, nis: Tensor, innovation: Tensor) -> tuple[Tensor, Tensor]:

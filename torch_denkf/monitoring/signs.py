@@ -9,14 +9,14 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.modules._tensors import mask_of
+from torch_denkf.modules.tensors import mask_of
 from torch_denkf.monitoring._calibration import sign_limits
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import Sensor
 
 __all__ = ["SignGate"]
 
 
-class SignGate(SubModel):
+class SignGate(Sensor):
     """Marks readings as not observed whose signs are larger than they are on clean data.
 
     A *sign* is a number that is small while a sensor is sound and large when it fails, whatever it reads: the share of

@@ -11,14 +11,14 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_values
 from torch_denkf.functional.manifolds import Product
-from torch_denkf.modules._tensors import as_vector
+from torch_denkf.modules.tensors import as_vector
 from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["Motion", "densities", "integrated", "walked"]
 
 
-class Motion(SubModel):
+class Motion(Transition):
     """A known motion of states that are points of a space.
 
     A subclass writes :meth:`move` and :meth:`noise_of_step`.

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number, check_values
 from torch_denkf.functional.manifolds import SE2, SE3, SE23, SO3, Circle, Euclidean, Product, Space, rotate
-from torch_denkf.modules._tensors import register_constant
+from torch_denkf.modules.tensors import register_constant
 from torch_denkf.submodel import SubModel
 
 __all__ = ["Gravity", "Magnetic", "PoseOf", "PositionInBody", "RangeBearing"]

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch_denkf._checks import check_mask
 from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.manifolds import Space, whole_parts
-from torch_denkf.running import declared
+from torch_denkf.submodel import Initial, role
 
 if TYPE_CHECKING:
     from torch_denkf.objectives.filter_loss import FilterLoss
@@ -223,7 +223,7 @@ class Truth:
             return self.loss.space.point_dim
         values = (self.out.get(kind.carry[0], None) for kind in filter.structure.kinds if kind.carried)
         sizes = (value.shape[-1] for value in values if value is not None)
-        return next(sizes, declared(filter.initial).state_dim)
+        return next(sizes, role(filter.initial, Initial).state_dim)
 
     def _labels(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None = None) -> Labels:
         space = self.loss.space if name == "state" else None

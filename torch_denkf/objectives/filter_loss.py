@@ -17,7 +17,7 @@ from torch_denkf._checks import check_number
 from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.modules._tensors import as_floating, check_dims
+from torch_denkf.modules.tensors import as_floating, check_dims
 from torch_denkf.objectives._labels import Keys, Truth
 
 __all__ = ["FilterLoss", "ReadingsOptions", "Scale", "SequenceKeys", "SequenceOptions", "StateOptions", "Term"]

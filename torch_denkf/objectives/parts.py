@@ -19,12 +19,12 @@ from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
 from torch_denkf.filters.structure import previous_key
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._tensors import as_floating
+from torch_denkf.modules.tensors import as_floating
 from torch_denkf.objectives import _terms
 from torch_denkf.objectives._labels import Keys, Truth
 from torch_denkf.objectives.filter_loss import FilterLoss, ReadingsOptions, StateOptions, Term
-from torch_denkf.running import declared, reads, reads_of, run_module, run_modules
-from torch_denkf.submodel import Call, Entries
+from torch_denkf.running import reads, reads_of, run_module, run_modules
+from torch_denkf.submodel import Call, Entries, Initial, role
 
 __all__ = ["ObservationLoss", "SensorLoss", "TransitionLoss"]
 
@@ -304,7 +304,7 @@ def members_of(filter: Filter, belief: str, members: int | None) -> int | None:
                 f"the filter carries {list(carry)}. Name the prefix of its belief, belief=..."
             )
         return None
-    members = declared(filter.initial).ensemble_size if members is None else members
+    members = role(filter.initial, Initial).ensemble_size if members is None else members
     if members is None:
         raise ValueError(
             f"{type(filter.initial).__name__} does not say how many members the belief has; pass members=..."

@@ -10,7 +10,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf.filters import Filter
-from torch_denkf.modules._tensors import as_floating
+from torch_denkf.modules.tensors import as_floating
 from torch_denkf.objectives import _terms
 from torch_denkf.objectives.filter_loss import FilterLoss, SequenceKeys, SequenceOptions, Term
 from torch_denkf.smoothers.base import Smoother

@@ -7,11 +7,11 @@ from torch import Tensor
 
 from torch_denkf._checks import check_number
 from torch_denkf.filters import Filter
-from torch_denkf.filters.structure import submodels
 from torch_denkf.functional.smoothing.ensemble import enrts_smooth
 from torch_denkf.smoothers.base import Smoother, last_of_runs
 from torch_denkf.smoothers.fixed_lag import FixedLag, kind_of
 from torch_denkf.smoothers.past import moments_of
+from torch_denkf.submodel import SubModel, in_role
 
 __all__ = ["EnKS", "EnRTS"]
 
@@ -53,7 +53,7 @@ class EnRTS(Smoother):
             raise TypeError(
                 f"EnRTS takes a filter with an ensemble; {type(filter).__name__} carries {filter.carry_keys}."
             )
-        if any(getattr(part, "rotate", False) for part in submodels(filter)):
+        if any(getattr(part, "rotate", False) for part in in_role(filter, SubModel)):
             raise ValueError(
                 "An analysis with rotate=True gives each member another's place, so that EnRTS cannot tell what a "
                 "member's forecast was. Turn the rotation off, or use EnKS, which rotates the past as well."
@@ -74,7 +74,7 @@ class EnRTS(Smoother):
 
     def _refuse_inflation(self) -> None:
         """Raises where gains would carry an inflation back, and nobody said how to damp it."""
-        for part in submodels(self.filter) if self.damping is None else ():
+        for part in in_role(self.filter, SubModel) if self.damping is None else ():
             for name, none in (("inflation", 1.0), ("adapt_inflation", 0.0)):
                 value = getattr(part, name, none)
                 if value > none:

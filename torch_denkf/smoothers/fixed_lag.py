@@ -9,9 +9,10 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters import Filter
 from torch_denkf.modules.particles import ResampledTransition
-from torch_denkf.running import declared, is_sequence, named_modules_of
+from torch_denkf.running import is_sequence, named_modules_of
 from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, lagged, with_past
 from torch_denkf.smoothers.past_moments import MOMENTS_PAST, CrossTransition, LaggedMoments, MomentsPast
+from torch_denkf.submodel import Update, role
 
 __all__ = ["FixedLag", "kind_of", "rebuilt"]
 
@@ -157,7 +158,7 @@ def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> Ordere
         nonlocal found
         if is_sequence(module):
             return TensorDictSequential(OrderedDict((name, changed(part)) for name, part in named_modules_of(module)))
-        if declared(module).info_prefix is not None:
+        if role(module, Update).info_prefix is not None:
             found = True
             return lagged(module)  # which refuses what it cannot wrap
         return module

@@ -15,7 +15,7 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing.particles import backward_smooth
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules import NoisyTransition
-from torch_denkf.modules._gaussian import as_covariance
+from torch_denkf.modules.gaussian import as_covariance
 from torch_denkf.modules.particles import ResampledTransition
 from torch_denkf.running import run_module
 from torch_denkf.smoothers.base import Smoother

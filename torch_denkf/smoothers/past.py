@@ -23,9 +23,8 @@ from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
-from torch_denkf.modules.carried import AnalysisAround, Beside, InPlaceOf
-from torch_denkf.running import declared
-from torch_denkf.submodel import Entries, SubModel
+from torch_denkf.modules.around import Around, AugmentedBelief
+from torch_denkf.submodel import Entries, Initial, SubModel, Update, role
 
 __all__ = ["ENSEMBLE_PAST", "EnsemblePast", "LaggedAnalysis", "LaggedBelief", "Past", "lagged", "with_past"]
 
@@ -56,7 +55,7 @@ def with_past(
     age: int = 0,
     belief_prefix: str = "belief",
     smoothed_prefix: str = "smoothed",
-) -> Beside:
+) -> AugmentedBelief:
     """An initial belief with a past: L copies of its state.
 
     Args:
@@ -79,8 +78,8 @@ def with_past(
         torch.Size([4, 3, 1])
     """
     check_count("lag", lag, cure="It counts the steps to look back")
-    space = declared(initial).space
-    return Beside(
+    space = role(initial, Initial).space
+    return AugmentedBelief(
         initial,
         [*((belief_prefix, name) for name in past.carried), (smoothed_prefix, "age")],
         partial(_begin, past.copies, belief_prefix, lag, age),
@@ -129,7 +128,7 @@ class EnsemblePast(SubModel):
         return torch.cat([ensemble.unsqueeze(-2), past[..., :-1, :]], -2)
 
 
-class LaggedAnalysis(InPlaceOf):
+class LaggedAnalysis(Around):
     """An analysis that corrects the past with the same reading, by the past's covariance with the prediction.
 
     It is the ensemble Kalman smoother (Evensen & van Leeuwen 2000). The past is neither inflated nor relaxed.
@@ -157,35 +156,19 @@ class LaggedAnalysis(InPlaceOf):
 
     def __init__(
         self,
-        analysis: SubModel,
+        analysis: Update,
         *,
         past_key: NestedKey = ("forecast", "past"),
     ):
-        if not (isinstance(analysis, SubModel) and analysis.updates_ensemble):
+        if not (isinstance(analysis, Update) and analysis.updates_ensemble):
             raise TypeError(
                 f"{type(analysis).__name__} does not say what a reading means for earlier states. A lag needs an "
                 "EnsembleAnalysis, a LocalEnsembleAnalysis, or one of your own whose in_keys begin with the ensemble, "
                 "its predicted_key and its reading_keys; smooth other ensembles with EnRTS."
             )
-        super().__init__(
-            analysis,
-            [*analysis.in_keys, past_key],
-            [*analysis.out_keys, past_key],
-            optional_keys=analysis.optional_keys,
-        )
-        self.info_prefix, self.reading_keys = analysis.info_prefix, analysis.reading_keys
-        self.space, self.reading_space = analysis.space, analysis.reading_space
-        self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
-        self.noise_variance_key, self.predicted_key = analysis.noise_variance_key, analysis.predicted_key
+        super().__init__(analysis, [*analysis.in_keys, past_key], [*analysis.out_keys, past_key])
 
-    @property
-    def updates_ensemble(self) -> bool:
-        """As the analysis inside."""
-        return True
-
-    def noise_sizes(self, *values):
-        """Those of the analysis."""
-        return self.module.noise_sizes(*values)
+    updates_ensemble = True
 
     def on_entries(self, entries, call):
         """The belief, the diagnostics, and the past."""
@@ -197,22 +180,20 @@ class LaggedAnalysis(InPlaceOf):
 
     def on_aligned(self, entries, call):
         """See :meth:`EnsembleAnalysis.on_aligned`."""
-        return super().on_entries(entries, call)
-
-    def compute(self, forecast, predicted, observation, variance, past, observed=None, *, noise):
-        """The belief, the diagnostics, and the past."""
-        read, analysis = (predicted, observation, variance, observed), self.module
-        out = analysis.by_key(analysis.compute(forecast, *read, **({"noise": noise} if analysis.draws else {})))
-        return *out.values(), analysis.move_past(past, *read, noise=noise)
+        analysis = self.module
+        values, past = analysis.values(entries), self.required(entries, self.out_keys[-1])
+        noise = analysis._noise(entries, values, call) if analysis.draws else None
+        out = analysis.by_key(analysis.compute(*values, **({"noise": noise} if analysis.draws else {})))
+        return {**out, self.out_keys[-1]: analysis.move_past(past, *values[1:], noise=noise)}
 
 
-def lagged(analysis: SubModel) -> SubModel:
+def lagged(analysis: Update) -> Update:
     """The analysis, which corrects the past, too; inside of what goes around it, such as a gate.
 
     Raises:
         TypeError: if it does not say what it does to other states.
     """
-    if isinstance(analysis, AnalysisAround):
+    if isinstance(analysis, Around):
         return analysis.around(lagged(analysis.module))
     return LaggedAnalysis(analysis)
 

@@ -16,17 +16,16 @@ from torch import nn
 
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing.rts import smoothing_gain
-from torch_denkf.modules._gaussian import GaussianTransition
-from torch_denkf.modules.carried import InPlaceOf
+from torch_denkf.modules.around import Wrapper
+from torch_denkf.modules.gaussian import GaussianTransition
 from torch_denkf.modules.kalman import LinearTransition
-from torch_denkf.running import reads
 from torch_denkf.smoothers.past import Past, check_age
-from torch_denkf.submodel import Entries, SubModel
+from torch_denkf.submodel import Entries, SubModel, Transition
 
 __all__ = ["MOMENTS_PAST", "CrossTransition", "LaggedMoments", "MomentsPast"]
 
 
-class CrossTransition(InPlaceOf):
+class CrossTransition(Wrapper, Transition):
     """A forecast of mean and covariance, with the covariance of the states before and after the step.
 
     Args:
@@ -55,8 +54,7 @@ class CrossTransition(InPlaceOf):
                 f"{type(transition).__name__} does not give the covariance of the states before and after a step; "
                 "LinearTransition, EKFTransition and UKFTransition do."
             )
-        needed, optional = reads(transition)
-        super().__init__(transition, needed, [*transition.out_keys, cross_key], optional_keys=optional)
+        super().__init__(transition, out_keys=[*transition.out_keys, cross_key])
 
     def on_entries(self, entries, call):
         """The forecast and the cross-covariance."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-import torch_denkf.cli._command as command_module
+import torch_denkf.cli.command as command_module
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.borders import kitti, pretrained, recordings, ur5
 from benchmarks.reliability.case import Refused, apart, workshop

@@ -14,7 +14,7 @@ from torch_denkf._checks import check_number
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
 from torch_denkf.applications.car.vision.motion import grey_picture, image_motion
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
-from torch_denkf.modules._tensors import as_floating
+from torch_denkf.modules.tensors import as_floating
 
 __all__ = ["OpticalFlow"]
 

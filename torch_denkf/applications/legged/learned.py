@@ -15,7 +15,8 @@ from torchrl.envs.transforms import CatFrames, Compose, UnaryTransform
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.functional.manifolds import SO3, rotate
-from torch_denkf.modules import CholeskyNoise, StochasticMLP, SubModel
+from torch_denkf.modules import CholeskyNoise, StochasticMLP
+from torch_denkf.submodel import Sensor
 
 __all__ = ["LearnedContacts", "last_rows", "with_last_rows"]
 
@@ -23,7 +24,7 @@ SLIP, MOVES = ("legs", "slip"), ("legs", "moves")
 _KEYS = ("imu", "joints", "joint_rates", "contact")
 
 
-class LearnedContacts(SubModel):
+class LearnedContacts(Sensor):
     r"""Says of each standing foot how it moves: mean and covariance of its velocity, which should be zero.
 
     A foot that has just touched the floor slides or bounces for some rows, and on ice it slides longer. Its rate then
@@ -147,7 +148,7 @@ class LearnedContacts(SubModel):
         self.module.scale.copy_(features.std(0).clamp(min=1e-3))
 
 
-class Variances(SubModel):
+class Variances(Sensor):
     """The variances alone that learned contacts say, as analyses of ensembles read them."""
 
     def __init__(self, contacts: LearnedContacts):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from torch_denkf.applications.car.odometry.paths import read_path
-from torch_denkf.cli._command import alone_in
+from torch_denkf.cli.command import alone_in
 from torch_denkf.cli.main import main
 
 ROOT = Path(__file__).parents[2]

@@ -16,7 +16,7 @@ from pathlib import Path
 from torch_denkf._checks import check_count
 from torch_denkf._files import write_text
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
-from torch_denkf.cli._command import Command, alone_in, say
+from torch_denkf.cli.command import Command, alone_in, say
 
 __all__ = ["Evaluate"]
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from torch_denkf._files import replacing
-from torch_denkf.cli._command import Command, say
+from torch_denkf.cli.command import Command, say
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

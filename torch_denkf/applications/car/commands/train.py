@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
-from torch_denkf.cli._command import Command, alone_in, say
+from torch_denkf.cli.command import Command, alone_in, say
 
 __all__ = ["Train"]
 

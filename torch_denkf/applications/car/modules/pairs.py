@@ -18,10 +18,10 @@ from torch import nn
 
 from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import ensemble_var
-from torch_denkf.modules._tensors import register_constant
-from torch_denkf.modules.carried import Beside
-from torch_denkf.running import check_module, reads, run_module
-from torch_denkf.submodel import Entries, SubModel
+from torch_denkf.modules.around import AroundInitial, AugmentedBelief, Wrapper
+from torch_denkf.modules.tensors import register_constant
+from torch_denkf.running import check_module, reads
+from torch_denkf.submodel import Entries, Initial, SubModel, Transition
 
 __all__ = ["ClonedPrior", "ClonedTransition", "PairObservation", "with_history"]
 
@@ -32,7 +32,7 @@ def with_history(
     *,
     ensemble_key: NestedKey = ("belief", "ensemble"),
     history_key: NestedKey = ("belief", "history"),
-) -> Beside:
+) -> AugmentedBelief:
     """An initial belief with a past: each member has had its present velocities all along.
 
     Args:
@@ -52,7 +52,9 @@ def with_history(
         torch.Size([8, 2, 2])
     """
     check_count("lags", lags)
-    return Beside(initial, [history_key], partial(_same_velocities, unravel_key(ensemble_key), lags), nested=True)
+    return AugmentedBelief(
+        initial, [history_key], partial(_same_velocities, unravel_key(ensemble_key), lags), nested=True
+    )
 
 
 def _same_velocities(ensemble_key: NestedKey, lags: int, belief: Entries, _: torch.Size) -> list[torch.Tensor]:
@@ -118,7 +120,6 @@ class PairObservation(SubModel):
         reach = [torch.inf, torch.inf] if reach is None else reach
         register_constant(self, "reach", reach)
         check_values("reach", self.reach, above=0, infinite=True)
-        self.observation_dim, self.observed_key = 2, unravel_key(observed_key)
 
     def compute(self, forecast, *rest):
         """The predicted observations, the ensemble that the analysis is to update, and the mask."""
@@ -139,7 +140,7 @@ class PairObservation(SubModel):
         return self.module(way), torch.cat([forecast[..., :5], history.flatten(-2)], -1), readable
 
 
-class ClonedPrior(SubModel):
+class ClonedPrior(AroundInitial):
     """An initial belief whose state also holds the velocities of past steps, all equal to the present ones.
 
     Args:
@@ -158,24 +159,20 @@ class ClonedPrior(SubModel):
         torch.Size([8, 9])
     """
 
+    place = "initial"
+    derived = Initial.derived  # the module inside knows entries of another size
+
     def __init__(self, initial: TensorDictModuleBase, lags: int):
         check_module("initial", initial)
         check_count("lags", lags)
-        needed, optional = reads(initial)
-        super().__init__(initial, needed, initial.out_keys, optional_keys=optional)
+        super().__init__(initial)
         self.input_dim, self.state_dim = 5, 5 + 2 * lags
-        if getattr(initial, "ensemble_size", None) is not None:
-            self.ensemble_size = initial.ensemble_size
         eye = torch.eye(5, dtype=torch.get_default_dtype())
         self.register_buffer("copies", torch.cat([eye, *[eye[3:]] * lags]))
 
-    def parts(self):
-        """The initial belief."""
-        return {"initial": self.module}
-
     def on_entries(self, entries, call):
         """The belief."""
-        written = run_module(self.module, entries, call.part("initial"))
+        written = self.run_inside(entries, call)
         for key, value in written.items():
             name, copies = key[-1] if isinstance(key, tuple) else key, self.copies.to(value.dtype)
             if name == "cov":
@@ -185,7 +182,7 @@ class ClonedPrior(SubModel):
         return written
 
 
-class ClonedTransition(SubModel):
+class ClonedTransition(Wrapper, Transition):
     """A transition whose state also holds the velocities of past steps, the latest first: they move on by one.
 
     Args:
@@ -202,24 +199,20 @@ class ClonedTransition(SubModel):
         [[1.0, 0.0, 0.0, 10.0, 0.0, 10.0, 0.0, 9.0, 0.0]]
     """
 
+    place = "transition"
+
     def __init__(self, transition: SubModel, *, history_key: NestedKey = ("belief", "history")):
         check_module("transition", transition)
         self_made = unravel_key(history_key)
-        needed, optional = reads(transition)
-        in_keys = [key for key in needed if key != self_made]
-        super().__init__(transition, in_keys, transition.out_keys, optional_keys=optional)
+        super().__init__(transition, [key for key in reads(transition)[0] if key != self_made])
         self.history_key = self_made
-
-    def parts(self):
-        """The transition."""
-        return {"transition": self.module}
 
     def on_entries(self, entries, call):
         """The forecast ensemble."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state = self.required(entries, key)
         work = {**entries, key: state[..., :5], self.history_key: state[..., 3:].unflatten(-1, (-1, 2))}
-        written = run_module(self.module, work, call.part("transition"))
+        written = self.run_inside(work, call)
         return {**written, out_key: torch.cat([written[out_key], state[..., 3:-2]], -1)}
 
 

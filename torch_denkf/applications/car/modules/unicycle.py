@@ -11,16 +11,16 @@ from torch import nn
 from torch_denkf.applications.car.modules.pairs import within_pair
 from torch_denkf.applications.car.unicycle import unicycle_move
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.modules._tensors import register_location, register_scale
+from torch_denkf.modules.tensors import register_location, register_scale
 from torch_denkf.modules.transition import MemberNetwork
 from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
 from torch_denkf.running import check_network
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["UnicycleMotion", "UnicycleTransition"]
 
 
-class UnicycleTransition(MemberNetwork):
+class UnicycleTransition(MemberNetwork, Transition):
     r"""Known motion of a vehicle, learned change of its velocities (the paper's section IV-A).
 
     .. math::

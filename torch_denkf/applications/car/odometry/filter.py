@@ -17,8 +17,8 @@ from torch_denkf.applications.car.modules.unicycle import UnicycleMotion, Unicyc
 from torch_denkf.applications.car.vision.poses import KITTI_DT
 from torch_denkf.filters import Filter
 from torch_denkf.modules import AroundState, DiagonalNoise, EnsembleAnalysis, StochasticMLP
-from torch_denkf.modules._tensors import as_vector
 from torch_denkf.modules.noise import MemberGain
+from torch_denkf.modules.tensors import as_vector
 
 __all__ = ["CarFilter", "CarSettings", "VELOCITIES", "car_filter"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torch_denkf._checks import check_count
-from torch_denkf.cli._command import Command, say
+from torch_denkf.cli.command import Command, say
 
 __all__ = ["TrainUR5"]
 

@@ -15,10 +15,10 @@ from torch_denkf.functional.angles import mean_observation, wrap_angles
 from torch_denkf.functional.gaussian import GaussianUpdate
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._spaces import checked_space, checked_spaces, without_hidden
-from torch_denkf.modules._tensors import check_dims
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
-from torch_denkf.running import check_module, reads, run_module
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.modules.tensors import check_dims
+from torch_denkf.running import check_module, reads, run_module, writes
+from torch_denkf.submodel import Call, Entries, SubModel, Transition, Update
 
 _DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
 
@@ -42,7 +42,7 @@ class GaussianTransitionKeys(TypedDict, total=False):
     space: Space | None
 
 
-class GaussianTransition(SubModel):
+class GaussianTransition(Transition):
     """Forecasts mean and covariance through a transition of ensembles; a subclass writes :meth:`_forecast`.
 
     Args:
@@ -144,7 +144,7 @@ class GaussianAnalysisOptions(TypedDict, total=False):
     predicted_key: NestedKey
 
 
-class GaussianAnalysis(SubModel):
+class GaussianAnalysis(Update):
     """Updates mean and covariance through an observation model of ensembles; a subclass writes :meth:`_update`.
 
     Args:
@@ -156,8 +156,6 @@ class GaussianAnalysis(SubModel):
         ValueError: if the model holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
         KeyError: if an entry is missing.
     """
-
-    reads_components = True
 
     def __init__(
         self,
@@ -227,9 +225,13 @@ class GaussianAnalysis(SubModel):
         size = self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[0].shape[-1]
         return [size, size if self.reading_space is None else self.reading_space.tangent_dim]
 
-    def mask(self, entries: Entries, mean: torch.Tensor, call: Call) -> torch.Tensor | None:
-        """What is observed, ``[*B, 1]`` or ``[*B, O]``, as the model says that the analysis runs inside."""
-        return self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[1]
+    def with_mask(self, entries, call):
+        """Returns the entries with the mask, where the observation model makes it."""
+        if self.observed_key not in writes(self.module):
+            return entries
+        mean = self.required(entries, self.in_keys[0])
+        mask = self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[1]
+        return entries if mask is None else {**entries, self.observed_key: mask}
 
     def _update(
         self, entries: Entries, mean, cov, observation, noise, call: Call

@@ -14,8 +14,8 @@ from torch_denkf._checks import check_number, check_values
 from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._spaces import checked_spaces
-from torch_denkf.modules._tensors import check_dims
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.modules.tensors import check_dims
+from torch_denkf.submodel import Call, Entries, Update
 
 __all__ = ["EnsembleAnalysisKeys", "EnsembleUpdate"]
 
@@ -46,7 +46,7 @@ class EnsembleAnalysisKeys(TypedDict, total=False):
     info_prefix: str
 
 
-class EnsembleUpdate(SubModel):
+class EnsembleUpdate(Update):
     """Reads a forecast ensemble, its predicted observations and a reading, writes the belief and the diagnostics.
 
     Args:
@@ -65,8 +65,6 @@ class EnsembleUpdate(SubModel):
         ValueError: if ``inflation`` or ``threshold`` is not positive, ``relaxation`` is outside [0, 1], or
             ``localisation`` is not known.
     """
-
-    reads_components = True
 
     def __init__(
         self,

@@ -1,0 +1,151 @@
+"""A wrapper passes on all that the update inside declares, in any order of wrappers, and overrides what it changes."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+
+from tests.filters.factories import linear_denkf, linear_system
+from torch_denkf.imperfect import Visible
+from torch_denkf.modules import Around, EKFAnalysis, EnsembleAnalysis, KalmanAnalysis, LinearObservation, Update
+from torch_denkf.monitoring import GatedAnalysis
+from torch_denkf.running import random_parts
+from torch_denkf.smoothers import FixedLag
+from torch_denkf.smoothers.past import LaggedAnalysis, lagged
+from torch_denkf.submodel import Call, SubModel
+
+E, S, WIDTH = 6, 2, 2
+OWN = {"updates_ensemble", "aligned", "on_aligned"}  # of what goes around, a past and angles know nothing
+
+
+class ScaledInnovation(Around):
+    """Counts a share of each innovation of an ensemble."""
+
+    def __init__(self, analysis, share):
+        super().__init__(analysis)
+        self.share = share
+
+    def on_entries(self, entries, call):
+        return self.run_inside({**entries, self.reading_keys[0]: self.scaled(entries)}, call)
+
+    def scaled(self, entries):
+        expected = entries[self.predicted_key].mean(-2)
+        return expected + self.share * (entries[self.reading_keys[0]] - expected)
+
+
+def frame():
+    torch.manual_seed(0)
+    forecast = {"ensemble": torch.randn(3, E, S), "past": torch.randn(3, E, 4, S)}
+    forecast |= {"mean": torch.randn(3, S), "cov": torch.eye(S).expand(3, S, S)}
+    forecast["observation"] = forecast["ensemble"] @ torch.tensor([[1.0, 0.5], [0.0, 1.0]])
+    sensor = {
+        "ensemble": torch.randn(3, WIDTH),
+        "noise": torch.full((3, WIDTH), 0.5),
+        "visible": torch.full((3, 1), 0.7),
+    }
+    return TensorDict({"forecast": forecast, "sensor": sensor, "observed": torch.rand(3, WIDTH) < 0.7}, [3])
+
+
+def assert_equal(one, other):
+    assert set(one.keys(True, True)) == set(other.keys(True, True))
+    for key in one.keys(True, True):
+        torch.testing.assert_close(one[key], other[key], rtol=0, atol=0, equal_nan=True)
+
+
+UPDATES = {
+    "ensemble": lambda: EnsembleAnalysis("etkf"),
+    "Kalman": lambda: KalmanAnalysis(torch.eye(S), torch.ones(WIDTH), observation_key=("sensor", "ensemble")),
+    "EKF": lambda: EKFAnalysis(LinearObservation(torch.eye(S))),
+    "perturbed, lagged": lambda: LaggedAnalysis(EnsembleAnalysis("perturbed")),
+    "lagged": lambda: LaggedAnalysis(EnsembleAnalysis("etkf")),
+    "visible, lagged": lambda: Visible(LaggedAnalysis(EnsembleAnalysis("etkf"))),
+    "gate": lambda: GatedAnalysis(EnsembleAnalysis("etkf"), WIDTH, window=1),
+    "gate, lagged": lambda: GatedAnalysis(LaggedAnalysis(EnsembleAnalysis("etkf")), WIDTH, window=1, by_component=True),
+    "gate, Kalman": lambda: GatedAnalysis(UPDATES["Kalman"](), WIDTH),
+}
+
+
+@pytest.mark.parametrize("name", UPDATES)
+def test_what_goes_around_passes_on_all_that_the_update_declares(name):
+    inside = UPDATES[name]()
+    declared = {key for key in vars(Update) if not key.startswith("_")} - OWN
+    assert {"reading_keys", "observed_key", "space", "reading_dims", "with_mask", "info_prefix"} <= declared
+    around = Around(Around(inside))
+    for key in [*declared, "in_keys", "out_keys", "optional_keys"]:
+        assert getattr(around, key) == getattr(inside, key), key
+    assert [*random_parts(around, "update")] == [*random_parts(inside, "update")]
+    td = frame()
+    if "gate" in name:
+        td.update(dict(zip(inside.state_keys, inside.initial_state([3]), strict=True)))
+    torch.manual_seed(1)
+    expected = inside(td.copy())
+    for other in (around, pickle.loads(pickle.dumps(around)), copy.deepcopy(around)):
+        torch.manual_seed(1)
+        assert_equal(other(td.copy()), expected)
+
+
+def test_a_plain_module_inside_has_the_defaults():
+    around = Around(TensorDictModule(lambda x: x + 1, ["x"], ["y"]))
+    assert (around.reading_keys, around.info_prefix) == ((), None)
+    assert around(TensorDict({"x": torch.zeros(2)}))["y"].tolist() == [1.0, 1.0]
+
+
+def test_a_scaled_innovation_is_a_scaled_shift_of_the_mean():
+    td = frame()
+    analysis = EnsembleAnalysis("etkf")
+    whole, half = analysis(td.copy()), ScaledInnovation(analysis, 0.5)(td.copy())
+    before = td["forecast", "ensemble"].mean(-2)
+    shift = whole["belief", "mean"] - before
+    torch.testing.assert_close(half["belief", "mean"] - before, 0.5 * shift)
+
+
+@pytest.mark.parametrize("name", ["lagged", "visible, lagged"])
+def test_a_lag_goes_inside_of_what_goes_around(name):
+    """The past is corrected by what the wrapper makes of the reading."""
+    plain = EnsembleAnalysis("etkf") if name == "lagged" else Visible(EnsembleAnalysis("etkf"))
+    around = lagged(ScaledInnovation(plain, 0.5))
+    assert isinstance(around, ScaledInnovation)
+    assert set(around.in_keys) == set(UPDATES[name]().in_keys)
+    td = frame()
+    changed = td.copy().set(("sensor", "ensemble"), around.scaled(dict(td.items(True, True))))
+    expected = UPDATES[name]()(changed).set(("sensor", "ensemble"), td["sensor", "ensemble"])
+    assert_equal(around(td), expected)
+    with pytest.raises(TypeError, match="ScaledInnovation does not say what a reading means for earlier states"):
+        LaggedAnalysis(ScaledInnovation(plain, 0.5))
+    with pytest.raises(TypeError, match="ScaledInnovation does not say"):
+        GatedAnalysis(ScaledInnovation(plain, 0.5), WIDTH)
+
+
+def test_a_wrapper_in_a_filter_and_in_its_fixed_lag(float64):
+    """A share of 1 changes nothing but for rounding, in a step, in a sequence and with a lag; noise keeps its place."""
+    _, _, H, _ = linear_system()
+    frames = TensorDict({"observation": torch.randn(3, 6, len(H)), "observed": torch.rand(3, 6, 1) < 0.8}, [3, 6])
+    plain, around = linear_denkf("perturbed"), linear_denkf("perturbed")
+    around = around.with_modules(analysis=ScaledInnovation(around["analysis"], 1.0))
+    assert set(around.draw_noise(frames.copy())["noise"].keys()) == set(plain.draw_noise(frames.copy())["noise"].keys())
+    for one, other in ((plain, around), (FixedLag(plain, 2), FixedLag(around, 2))):
+        outs = []
+        for filter in (one, other):
+            torch.manual_seed(1)
+            outs.append(filter.sequence(frames.copy()))
+        for key in [("belief", "mean"), *([("smoothed", "mean")] if one is not plain else [])]:
+            torch.testing.assert_close(outs[0][key], outs[1][key], rtol=1e-9, atol=1e-9)
+        start = one.initialise(frames[:, 0].copy())
+        moved = [filter.predict(start.copy())["belief", "mean"].shape for filter in (one, other)]
+        assert moved[0] == moved[1]
+
+
+def test_what_is_passed_on_can_be_traced():
+    update, td = ScaledInnovation(EnsembleAnalysis("etkf"), 0.5), frame()
+    entries, call = dict(td.items(True, True)), Call(torch.Size([3]))
+    traced = torch.compile(lambda entries: update.on_entries(entries, call), backend="eager", fullgraph=True)
+    for key, value in traced(entries).items():
+        torch.testing.assert_close(value, update.on_entries(entries, call)[key])
+
+
+def test_a_sub_model_declares_no_more_than_every_part_needs():
+    attributes = [name for name, value in vars(SubModel).items() if not callable(value) and not name.startswith("_")]
+    assert [name for name in attributes if not isinstance(vars(SubModel)[name], property)] == ["noise_names"]

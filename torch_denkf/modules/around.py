@@ -1,0 +1,241 @@
+"""Wrappers: modules around another one in its role, and an initial belief with further entries."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Protocol, Self, TypeVar
+
+import torch
+from tensordict import NestedKey, unravel_key
+from tensordict.nn import TensorDictModuleBase
+
+from torch_denkf.running import check_module, reads, run_module, writes
+from torch_denkf.submodel import Call, Entries, Initial, SubModel, Update, role
+
+__all__ = ["Around", "AroundInitial", "AugmentedBelief", "Stateful", "Wrapper", "passes_on", "with_state"]
+
+W = TypeVar("W", bound="Wrapper")
+
+
+class _Inside:
+    """An attribute or method of a wrapper: that of the module inside, unless the wrapper has or sets its own."""
+
+    def __init__(self, kind: type[SubModel], name: str):
+        self.kind, self.name = kind, name
+
+    def __get__(self, wrapper, owner=None):
+        return self if wrapper is None else getattr(role(wrapper.module, self.kind), self.name)
+
+
+class Wrapper(SubModel):
+    """Goes around another module and takes its place: keys, noise and the noise's name are those of the module inside.
+
+    A sub-class overrides what it changes, mostly :meth:`on_entries`. :class:`Around` and :class:`AroundInitial` also
+    pass on what the module inside declares in its role, such as the ``reading_keys`` of an update.
+
+    Args:
+        module: any TensorDict module.
+        in_keys: of the wrapper; those of the module by default.
+        out_keys: likewise.
+        optional_keys: likewise.
+
+    Attributes:
+        place: name of the module inside, where its noise has a place inside of the wrapper's, ``("noise",
+            "transition.transition")``; ``None`` where it has the wrapper's.
+    """
+
+    place: str | None = None
+
+    def __init__(
+        self,
+        module: TensorDictModuleBase,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
+        *,
+        optional_keys: Sequence[NestedKey] | None = None,
+    ):
+        check_module("module", module)
+        needed, optional = reads(module)
+        super().__init__(
+            module,
+            needed if in_keys is None else in_keys,
+            writes(module) if out_keys is None else out_keys,
+            optional_keys=optional if optional_keys is None else optional_keys,
+        )
+
+    def parts(self):
+        """Returns the module inside, under the empty name where its noise has the wrapper's place."""
+        return {self.place or "": self.module}
+
+    def run_inside(self, entries: Entries, call: Call) -> Entries:
+        """Returns what the module inside writes."""
+        return run_module(self.module, entries, call if self.place is None else call.part(self.place))
+
+    def on_entries(self, entries, call):
+        """Runs the module inside."""
+        return self.run_inside(entries, call)
+
+
+def passes_on(kind: type[SubModel]) -> Callable[[type[W]], type[W]]:
+    """Lets a class of wrappers pass on all that a role declares, but for what the class defines itself."""
+
+    def passing(wrapper: type[W]) -> type[W]:
+        for name in vars(kind):
+            if not name.startswith("_") and name not in vars(wrapper):
+                setattr(wrapper, name, _Inside(kind, name))
+        return wrapper
+
+    return passing
+
+
+@passes_on(Update)
+class Around(Wrapper, Update):
+    """Goes around an update, and passes on all that the update declares: a wrapper overrides what it changes.
+
+    What corrects a past, such as the lag of :class:`~torch_denkf.smoothers.FixedLag`, goes inside, see :meth:`around`.
+
+    Args:
+        module: the update inside.
+        in_keys: of the wrapper; those of the update by default.
+        out_keys: likewise.
+        optional_keys: likewise.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import EnsembleAnalysis
+        >>> class ScaledInnovation(Around):
+        ...     def __init__(self, analysis, share):
+        ...         super().__init__(analysis)
+        ...         self.share = share
+        ...
+        ...     def on_entries(self, entries, call):
+        ...         key = self.reading_keys[0]
+        ...         expected = entries[self.predicted_key].mean(-2)  # of a reading [*B, O]
+        ...         reading = expected + self.share * (entries[key] - expected)
+        ...         return self.run_inside({**entries, key: reading}, call)
+        >>> members = torch.tensor([[-1.0], [1.0]])
+        >>> td = TensorDict({
+        ...     "forecast": {"ensemble": members, "observation": members},
+        ...     "sensor": {"ensemble": torch.tensor([4.0]), "noise": torch.tensor([2.0])},
+        ... })
+        >>> ScaledInnovation(EnsembleAnalysis("etkf"), 0.5)(td)["belief", "mean"]
+        tensor([1.])
+    """
+
+    updates_ensemble = False  # a past around the wrapper would miss what the wrapper changes
+    aligned, on_aligned = Update.aligned, Update.on_aligned
+
+    def around(self, update: Update) -> Self:
+        """Returns the same wrapper around another update of the same reading, parameters shared.
+
+        Args:
+            update: e.g. a :class:`~torch_denkf.smoothers.past.LaggedAnalysis` of the one inside.
+        """
+        other = copy.copy(self)
+        for name in ("_parameters", "_buffers", "_modules"):
+            setattr(other, name, dict(getattr(self, name)))
+        for name in ("in_keys", "out_keys", "optional_keys"):
+            inside, own = (list(getattr(module, name)) for module in (self.module, self))
+            setattr(other, name, [*getattr(update, name), *(key for key in own if key not in inside)])
+        other.module = update
+        return other
+
+
+@passes_on(Initial)
+class AroundInitial(Wrapper, Initial):
+    """Goes around an initial belief, and passes on all that it declares."""
+
+
+class Stateful(Protocol):
+    """A module that carries entries of its own from step to step.
+
+    Attributes:
+        state_keys: their keys.
+    """
+
+    state_keys: Sequence[NestedKey]
+
+    def initial_state(self, batch_size, *, device=None, dtype=None) -> list[torch.Tensor]:
+        """Their values at the start of an episode, in the order of the keys."""
+
+
+class AugmentedBelief(AroundInitial):
+    """An initial belief, and further entries that begin with the episode.
+
+    Args:
+        initial: the initial belief.
+        keys: the further entries.
+        begin: their values, in that order, from the belief (its tensors by key) and its batch size. So that the filter
+            can be pickled, it is a function of a module, its options in a :class:`functools.partial`.
+        follow_keys: entries of the belief that follow from those that are carried on.
+        follow: their values, in that order, from the entries that are carried on, or from those that ``begin`` gives.
+        nested: whether the noise of ``initial`` has its place inside of this one's: ``("noise", "initial.initial")``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import GaussianPrior
+        >>> def no_steps(belief, batch_size):
+        ...     return [torch.zeros(*batch_size, 1)]
+        >>> start = AugmentedBelief(GaussianPrior([0.0], [1.0], ensemble_size=4), ["steps"], no_steps)
+        >>> start(TensorDict({}, [3]))["steps"].flatten()
+        tensor([0., 0., 0.])
+    """
+
+    def __init__(
+        self,
+        initial: TensorDictModuleBase,
+        keys: Sequence[NestedKey],
+        begin: Callable[[Entries, torch.Size], Iterable[torch.Tensor]],
+        *,
+        follow_keys: Sequence[NestedKey] = (),
+        follow: Callable[[Entries], Iterable[torch.Tensor]] | None = None,
+        nested: bool = False,
+    ):
+        check_module("initial", initial)
+        out_keys = dict.fromkeys(map(unravel_key, (*initial.out_keys, *keys, *follow_keys)))
+        super().__init__(initial, out_keys=list(out_keys))
+        self.keys, self.begin = list(map(unravel_key, keys)), begin
+        self.follow_keys, self.follow = list(map(unravel_key, follow_keys)), follow
+        self.place = "initial" if nested else None
+
+    def on_entries(self, entries, call):
+        """Writes the belief and the further entries."""
+        written = dict(self.run_inside(entries, call))
+        written.update(zip(self.keys, self.begin(written, call.batch_size), strict=True))
+        return {**written, **self._following(written)}
+
+    def derived(self, carried):
+        """Returns what follows for the module inside, and here."""
+        return {**role(self.module, Initial).derived(carried), **self._following(carried)}
+
+    def _following(self, entries: Entries) -> Entries:
+        return {} if self.follow is None else dict(zip(self.follow_keys, self.follow(entries), strict=True))
+
+
+def with_state(initial: TensorDictModuleBase, owners: Sequence[Stateful]) -> AugmentedBelief:
+    """An initial belief, and the entries that other modules carry on.
+
+    Args:
+        initial: the initial belief.
+        owners: such as :class:`InnovationMonitor` and :class:`GatedAnalysis`.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import GaussianPrior
+        >>> from torch_denkf.monitoring import InnovationMonitor, MonitoredSensor
+        >>> monitor = InnovationMonitor({"gps": MonitoredSensor("info", 2)})
+        >>> start = with_state(GaussianPrior([0.0], [1.0], ensemble_size=4), [monitor])
+        >>> start(TensorDict({}, [3]))["monitor", "gps", "p_value"].flatten()
+        tensor([1., 1., 1.])
+    """
+    # In a tuple the owners are not modules of the belief: the filter has them already.
+    keys = [key for owner in owners for key in owner.state_keys]
+    return AugmentedBelief(initial, keys, partial(_states, tuple(owners)))
+
+
+def _states(owners: Sequence[Stateful], belief: Entries, batch_size: torch.Size) -> list[torch.Tensor]:
+    like = next(value for value in belief.values() if value.is_floating_point())
+    states = (owner.initial_state(batch_size, device=like.device, dtype=like.dtype) for owner in owners)
+    return [value for state in states for value in state]
