@@ -277,7 +277,7 @@ class SubModel(Checked, TensorDictModule):
         return out[self.out_keys[0]].unflatten(-1, past.shape[-2:])
 
     def aligned(self, entries: Entries) -> Entries:
-        """Of an analysis: the entries with all angles on one turn, so that they can be averaged like other numbers."""
+        """Of an analysis: the entries with predictions and reading as plain numbers, to average and subtract."""
         return entries
 
     def on_aligned(self, entries: Entries, call: Call) -> Entries:

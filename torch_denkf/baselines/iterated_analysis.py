@@ -13,10 +13,10 @@ from torch import nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import analyse
 from torch_denkf.functional.inflation import inflate, random_rotation
-from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.smoothing.iterated import iterated_smoothing
 from torch_denkf.modules._gaussian import further_keys
-from torch_denkf.modules._spaces import checked_spaces, reading_about
+from torch_denkf.modules._spaces import mean_reading
 from torch_denkf.modules.carried import Beside
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.running import check_module, random_parts, run_module
@@ -120,7 +120,7 @@ class IteratedAnalysis(SubModel):
             optional_keys=[observed_key, *optional],
         )
         self.iterations, self.inflation, self.rotate = iterations, inflation, rotate
-        self.space, self.reading_space = checked_spaces(space, reading_space, ())
+        self.space, self.reading_space = check_space("space", space), check_space("reading_space", reading_space)
         self.info_prefix, self.observed_key = info_prefix, unravel_key(observed_key)
         self.noise_variance_key = unravel_key(noise_variance_key)
         self.reading_keys = self.in_keys[1:3]
@@ -149,7 +149,7 @@ class IteratedAnalysis(SubModel):
         ensemble, reading, variance = (self.required(entries, key) for key in self.in_keys[:3])
         space, on = self.space, self.reading_space
         if reading.ndim == ensemble.ndim:
-            reading = reading.mean(-2) if on is None else on.mean(reading)
+            reading = mean_reading(on, reading)
         center = ensemble[..., :1, :] if space is None else space.mean(ensemble).unsqueeze(-2)
         start = ensemble if space is None else space.minus(ensemble, center)
         observed, dim = entries.get(self.observed_key), start.shape[-1]
@@ -173,7 +173,7 @@ class IteratedAnalysis(SubModel):
             predicted = written[unravel_key(observation.out_keys[0])]
             if on is None:
                 return predicted
-            about, read = reading_about(on, predicted, reading, observed)
+            about, read = on.align(predicted, reading, observed)
             return about - read.unsqueeze(-2)  # as seen from the reading: each iteration has tangents of its own
 
         due = reading if on is None else torch.zeros_like(variance)

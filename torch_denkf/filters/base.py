@@ -187,7 +187,7 @@ class Filter(Checked, TensorDictSequential):
     def replace(self, place: str, module: TensorDictModuleBase) -> Filter:
         """Puts a module in the place of another one, and sorts the modules anew.
 
-        Keys, angles and inflation are those of the new module: give it what the old one had. A mask that is read no
+        Keys, spaces and inflation are those of the new module: give it what the old one had. A mask that is read no
         more is said.
 
         Args:

@@ -26,10 +26,10 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.mixture import log_mixture, mix_members, mix_moments, responsibility
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import scored_innovation
+from torch_denkf.modules._spaces import is_flat
 from torch_denkf.modules._tensors import mean_of_members
 from torch_denkf.modules.carried import AnalysisAround
 from torch_denkf.modules.stochastic import StochasticMLP
@@ -148,8 +148,11 @@ class Visible(AnalysisAround):
     def __init__(self, analysis: SubModel, *, broad: float = 10.0, visible_key: NestedKey = ("sensor", "visible")):
         check_number("broad", broad, above=1)
         self_made = _kind(analysis)
-        if analysis.space is not None or analysis.reading_space is not None:
-            raise TypeError(f"Visible is for plain numbers; {type(analysis).__name__} is on a space.")
+        if analysis.space is not None or not is_flat(analysis.reading_space):
+            raise TypeError(
+                f"Visible is for plain states, and readings of numbers and angles; {type(analysis).__name__} has "
+                f" space={analysis.space} and reading_space={analysis.reading_space}."
+            )
         super().__init__(
             analysis,
             [*analysis.in_keys, visible_key],
@@ -237,7 +240,8 @@ class Visible(AnalysisAround):
         """What the analysis makes of likelihoods that are mixtures."""
         prior, likelihood = (self.required(entries, key) for key in self.module.in_keys[1:3])
         predicted, reading, variance = (self.required(entries, key) for key in self.module.in_keys[3:6])
-        predicted, reading = align_angles(predicted, reading, self.module.angles, mask)
+        if self.module.reading_space is not None:
+            predicted, reading = self.module.reading_space.align(predicted, reading, mask)
         if reading.ndim == predicted.ndim:
             reading = reading.mean(-2)
         innovation, nis, log_det = scored_innovation(predicted, prior, reading, variance, observed=mask)

@@ -1,0 +1,232 @@
+"""Lines and circles: plain numbers, some of which are angles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+
+import torch
+from torch import Tensor
+
+from torch_denkf._checks import check_count
+from torch_denkf.functional.angles import wrap_angles
+from torch_denkf.functional.manifolds.matrices import eye
+from torch_denkf.functional.manifolds.space import Space
+
+__all__ = ["Circle", "Euclidean", "Flat"]
+
+
+class Flat(Space):
+    """N plain numbers, of which some are angles in rad, in any order: lines and circles.
+
+    Points and tangents are both N numbers. All is in closed form: a difference and a sum are those of the numbers,
+    with angles wrapped to [-pi, pi), and Jacobians are the identity.
+
+    Args:
+        size: N.
+        circular: components that are angles.
+
+    Raises:
+        TypeError: if a component is no whole number.
+        ValueError: if there is no such component.
+
+    Example:
+        >>> plane = Flat(3, circular=[2])  # x, y and a heading: Euclidean(2) * Circle()
+        >>> plane.minus(torch.tensor([1.0, 0.0, 3.0]), torch.tensor([0.0, 0.0, -3.0]))
+        tensor([ 1.0000,  0.0000, -0.2832])
+    """
+
+    def __init__(self, size: int, circular: Sequence[int] = ()):
+        check_count("size", size, least=1)
+        for index in circular:
+            if isinstance(index, bool) or not hasattr(index, "__index__"):
+                raise TypeError(f"circular holds indices of components, whole numbers; got {index!r}")
+            if not 0 <= index < size:
+                raise ValueError(f"circular holds components of {size}, 0 to {size - 1}; got {index}")
+        self.size, self.circular = size, tuple(sorted({int(index) for index in circular}))
+        runs = groupby(range(size), lambda index: index in self.circular)
+        self._runs = tuple((turns, len(list(run))) for turns, run in runs)
+
+    def __repr__(self):
+        return f"Flat(size={self.size}, circular={self.circular})"
+
+    def __eq__(self, other):
+        return isinstance(other, Flat) and (self.size, self.circular) == (other.size, other.circular)
+
+    def __hash__(self):
+        return hash((self.size, self.circular))
+
+    @property
+    def point_dim(self) -> int:  # type: ignore[override]
+        """N."""
+        return self.size
+
+    @property
+    def tangent_dim(self) -> int:  # type: ignore[override]
+        """N."""
+        return self.size
+
+    @property
+    def flat(self):
+        """This space."""
+        return self
+
+    @property
+    def parts(self) -> tuple[Space, ...]:
+        """The lines that stand side by side, and each circle."""
+        return tuple(
+            part for turns, count in self._runs for part in ([Circle()] * count if turns else [Euclidean(count)])
+        )
+
+    @property
+    def _angles(self) -> int:  # type: ignore[override]
+        return len(self.circular)
+
+    def compose(self, first, second):
+        """The sum, angles wrapped."""
+        return self.normalise(first + second)
+
+    def inverse(self, point):
+        """The negative."""
+        return -point
+
+    def exp(self, tangent):
+        """The same numbers, angles wrapped."""
+        return self.normalise(tangent)
+
+    def log(self, point):
+        """The same numbers, angles wrapped."""
+        return self.normalise(point)
+
+    def right_jacobian(self, tangent):
+        """The identity."""
+        return eye(tangent, self.size)
+
+    def adjoint(self, point):
+        """The identity."""
+        return eye(point, self.size)
+
+    def basis(self, point):
+        """The identity."""
+        return eye(point, self.size)
+
+    def dual_basis(self, point):
+        """The identity."""
+        return eye(point, self.size)
+
+    def neutral(self, like=None):
+        """Zeros."""
+        return torch.zeros(self.size) if like is None else like.new_zeros(self.size)
+
+    def normalise(self, point):
+        """The same numbers, angles wrapped."""
+        if not self.circular:
+            return point
+        if len(self.circular) == self.size:
+            return wrap_angles(point)
+        parts = point.split([count for _, count in self._runs], -1)
+        return torch.cat(
+            [wrap_angles(part) if turns else part for (turns, _), part in zip(self._runs, parts, strict=True)], -1
+        )
+
+    def plus(self, point, tangent):
+        """The sum, angles wrapped."""
+        self.check(point=point, tangent=tangent)
+        return self.normalise(point + tangent)
+
+    def minus(self, point, origin):
+        """The difference, angles wrapped."""
+        self.check(point=point, origin=origin)
+        return self.normalise(point - origin)
+
+    def mean(self, points, weights=None):
+        """The mean; of angles that of the deviations from the direction of their sum as unit vectors."""
+        if not self.circular:
+            return _mean(points, weights).squeeze(-2)
+        center = self._directions(points, weights)
+        return self.normalise(center + _mean(self.normalise(points - center), weights)).squeeze(-2)
+
+    def near(self, points, weights=None):
+        """The mean."""
+        return self.mean(points, weights)
+
+    def innovation(self, reading, expected, observed=None):
+        """The difference, angles wrapped; NaN where the reading is."""
+        return self.minus(reading, expected)
+
+    def align(self, predicted, reading, observed=None):
+        """Brings angles to the same turn; plain numbers stay as they are.
+
+        Predictions go within half a turn of their circular mean, the reading's samples within half a turn of their own,
+        and that within half a turn of the predictions'. See :meth:`Space.align`.
+
+        Example:
+            >>> predicted, reading = Circle().align(torch.tensor([[3.1], [-3.1]]), torch.tensor([-3.0]))
+            >>> predicted.mean().round(decimals=2).abs(), (reading - predicted.mean()).round(decimals=2)
+            (tensor(3.1400), tensor([0.1400]))
+        """
+        self.check(predicted=predicted, reading=reading)
+        if not self.circular:
+            return predicted, reading
+        samples = reading if reading.ndim == predicted.ndim else reading.unsqueeze(-2)
+        if observed is not None:
+            samples = torch.where(observed.unsqueeze(-2), samples, 0)
+        center, own = self._directions(predicted), self._directions(samples)
+        samples = center + self.normalise(own - center) + self.normalise(samples - own)
+        predicted = center + self.normalise(predicted - center)
+        return predicted, samples if reading.ndim == predicted.ndim else samples.squeeze(-2)
+
+    def _directions(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
+        """The directions of the sums of unit vectors ``[*B, 1, N]``, 0 of numbers.
+
+        They are constants to the gradient: they only pick the turn.
+        """
+        parts = points.detach().split([count for _, count in self._runs], -1)
+        return torch.cat(
+            [
+                torch.atan2(_mean(part.sin(), weights), _mean(part.cos(), weights)) if turns else 0 * part[..., :1, :]
+                for (turns, _), part in zip(self._runs, parts, strict=True)
+            ],
+            -1,
+        )
+
+    def _whole(self, known):
+        return known, known
+
+
+class Euclidean(Flat):
+    """N plain numbers.
+
+    Args:
+        size: N.
+
+    Example:
+        >>> Euclidean(2).plus(torch.tensor([1.0, 2.0]), torch.tensor([0.5, 0.0]))
+        tensor([1.5000, 2.0000])
+    """
+
+    def __init__(self, size: int):
+        super().__init__(size)
+
+    def __repr__(self):
+        return f"Euclidean(size={self.size})"
+
+
+class Circle(Flat):
+    """An angle in rad, in [-pi, pi).
+
+    Example:
+        >>> Circle().minus(torch.tensor([3.0]), torch.tensor([-3.0]))
+        tensor([-0.2832])
+    """
+
+    def __init__(self):
+        super().__init__(1, [0])
+
+    def __repr__(self):
+        return "Circle()"
+
+
+def _mean(values: Tensor, weights: Tensor | None) -> Tensor:
+    """The mean ``[*B, 1, N]`` of values ``[*B, E, N]``."""
+    return values.mean(-2, keepdim=True) if weights is None else (weights.unsqueeze(-1) * values).sum(-2, keepdim=True)
