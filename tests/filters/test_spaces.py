@@ -517,7 +517,7 @@ def test_what_does_not_fit_is_refused():
         make("EKF", sensor_error=FadingBias([0.1], time=10.0))
     parts = (Turning(), None, Orientation(), ConstantNoise(R, in_key="pose"))
     plain = {"process_noise": [0.1] * 7, "sensor_error": FadingBias([0.1] * 4, time=10.0)}
-    error, around = "sensor_error is added to readings of plain numbers", AroundState([0.1] * 7, ensemble_size=E)
+    error, around = "sensor_error is added to readings of numbers and angles", AroundState([0.1] * 7, ensemble_size=E)
     for filter in (EKF, UKF):
         with pytest.raises(ValueError, match=error):
             filter(*parts, initial=GaussianAround([0.1] * 7), reading_space=SO3(), observation_key="pose", **plain)

@@ -25,7 +25,6 @@ class Own(SubModel):
         noise_variance_key=("sensor", "noise"),
         observed_key="observed",
         belief_prefix="belief",
-        reading_space=None,
     ):
         writes = [(belief_prefix, name) for name in ("ensemble", "mean", "var")]
         writes += [("info", name) for name in ("innovation", "nis", "log_likelihood")]

@@ -51,7 +51,7 @@ def test_a_dimension_with_infinite_scale_does_not_count(score):
     torch.testing.assert_close(alone, expected, **CLOSE)
     # What does not count may hold anything, and an angle keeps its place.
     frames["state"][..., 1] = math.inf
-    again = DEnKFLoss(filter, score=score, **ONLY_STATE, state_scale=scale, space=Flat(2, circular=[1]))(frames)[
+    again = DEnKFLoss(filter, score=score, **ONLY_STATE, state_scale=scale, space=Flat(3, circular=[1]))(frames)[
         "loss_state"
     ]
     assert again.equal(losses["loss_state"])

@@ -79,10 +79,10 @@ class GaussianFilter(Filter):
         check_module("initial", initial)
         refuse_other_beliefs(type(self).__name__, initial, transition.in_keys[:2])
         space = declared(initial).space
+        spaces = {"space": space, "reading_space": reading_space}
         update = analysis(
-            **({} if space is None else {"space": space}),
+            **{name: space for name, space in spaces.items() if space is not None},
             inflation=inflation,
-            reading_space=reading_space,
             observation_key=observation_key,
             noise_variance_key=noise.out_keys[0],
             observed_key=observed_key,

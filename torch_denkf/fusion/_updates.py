@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import cast
 
 from tensordict import unravel_key
 from tensordict.nn import TensorDictModuleBase
@@ -51,9 +51,7 @@ class Updates:
             keys = {"reading": wired[name].reading, "noise": wired[name].noise, "observed": wired[name].observed}
             if model.state_dim is not None:
                 keys["observed"] = model.out_keys[1]
-            told: dict[str, Any] = {"reading_space": sensor.reading_space}
-            if self.space is not None:
-                told["space"] = self.space
+            told = self._spaces(sensor.reading_space)
             modules.update(self._update(name, model, prefix, to, told, sensor.analysis, **keys))
             prefix = to
         return modules
@@ -80,9 +78,7 @@ class Updates:
             observation_dim=None if None in sizes else sum(size for size in sizes if size is not None),
         )
         model = JoinedObservation(models, predicted_key=("forecast", "observation"), observed_key=keys["observed"])
-        told: dict[str, Any] = {"reading_space": _side_by_side(spaces, sizes)}
-        if self.space is not None:
-            told["space"] = self.space
+        told = self._spaces(_side_by_side(spaces, sizes))
         return {"readings": join, **self._update("analysis", model, prefix, last, told, None, **keys)}
 
     def weighted(self, prefix, sensors, wired, weights):
@@ -107,6 +103,11 @@ class Updates:
             modules[f"{name}_weighted"] = WeightedNoise(wired[name].noise, ("weight", name), key, observation_dim=size)
             wired[name] = replace(wired[name], noise=key)
         return modules
+
+    def _spaces(self, reading_space: Space | None) -> dict[str, Space]:
+        """The spaces that an update is told: none of plain numbers."""
+        spaces = {"space": self.space, "reading_space": reading_space}
+        return {name: space for name, space in spaces.items() if space is not None}
 
     def _model(self, prefix: str, name: str, sensor: FusedSensor, wired: Wired) -> StateObservation:
         ensemble = (prefix, "ensemble")

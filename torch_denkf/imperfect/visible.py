@@ -149,10 +149,7 @@ class Visible(AnalysisAround):
         check_number("broad", broad, above=1)
         self_made = _kind(analysis)
         if analysis.space is not None or not is_flat(analysis.reading_space):
-            raise TypeError(
-                f"Visible is for plain states, and readings of numbers and angles; {type(analysis).__name__} has "
-                f" space={analysis.space} and reading_space={analysis.reading_space}."
-            )
+            raise TypeError(f"Visible is for numbers, and readings of angles; {type(analysis).__name__} is on a space.")
         super().__init__(
             analysis,
             [*analysis.in_keys, visible_key],

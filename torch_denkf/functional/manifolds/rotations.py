@@ -83,16 +83,16 @@ class _RotationAndVectors(Space):
         length = torch.where(small, 1.0, size).sqrt()
         ratio = size / w.clamp_min(0.5).square()  # atan(t) / t in t^2, where it is small
         near = (2 / w.clamp_min(0.5)) * (1 - ratio / 3 + ratio.square() / 5 - ratio.pow(3) / 7 + ratio.pow(4) / 9)
-        angles = torch.where(small, near, 2 * torch.atan2(length, w) / length) * axis
-        third = series(angles.square().sum(-1, keepdim=True), inverse_third)
-        return self._bent(angles, angles, point, torch.full_like(third, -0.5), third)
+        turns = torch.where(small, near, 2 * torch.atan2(length, w) / length) * axis
+        third = series(turns.square().sum(-1, keepdim=True), inverse_third)
+        return self._bent(turns, turns, point, torch.full_like(third, -0.5), third)
 
-    def _bent(self, turn: Tensor, angles: Tensor, value: Tensor, half: Tensor, third: Tensor) -> Tensor:
+    def _bent(self, turn: Tensor, turns: Tensor, value: Tensor, half: Tensor, third: Tensor) -> Tensor:
         """A rotation, and what :func:`bend` makes of the vectors of a point or tangent."""
         if not self.vectors:
             return turn
         vectors = self._vectors(value, value.shape[-1] - 3 * self.vectors)
-        bent = bend(angles.unsqueeze(-2), vectors, half.unsqueeze(-1), third.unsqueeze(-1))
+        bent = bend(turns.unsqueeze(-2), vectors, half.unsqueeze(-1), third.unsqueeze(-1))
         return torch.cat([turn, bent.flatten(-2)], -1)
 
     def right_jacobian(self, tangent):

@@ -198,7 +198,7 @@ def check_space(name: str, space: Space | None, *, flat: bool = False) -> Space 
     if space is None:
         return None
     if not isinstance(space, Space):
-        raise TypeError(f"{name} is a Space, such as Product(SO3(), Euclidean(3)); got {space!r}"[:200])
+        raise TypeError(f"{name} is a Space, such as SO3() or Product(SE2(), Euclidean(2)); got {space!r}"[:200])
     if flat and space.flat is None:
         raise ValueError(f"{name} is one of numbers and angles here, such as Euclidean(2) * Circle(); got {space}.")
     return space.flat or space
