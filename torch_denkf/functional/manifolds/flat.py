@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import groupby
 
 import torch
@@ -14,6 +14,9 @@ from torch_denkf.functional.manifolds.matrices import eye
 from torch_denkf.functional.manifolds.space import Space
 
 __all__ = ["Circle", "Euclidean", "Flat"]
+
+_Parts = Callable[..., tuple[Tensor, ...]]
+_RUNS = 4  # of angles and of other numbers, up to which cutting them apart costs less than a mask
 
 
 class Flat(Space):
@@ -45,7 +48,7 @@ class Flat(Space):
                 raise ValueError(f"circular holds components of {size}, 0 to {size - 1}; got {index}")
         self.size, self.circular = size, tuple(sorted({int(index) for index in circular}))
         runs = groupby(range(size), lambda index: index in self.circular)
-        self._runs = tuple((turns, len(list(run))) for turns, run in runs)
+        self._runs = tuple((turns, len(list(run))) for turns, run in runs)  # side by side: whether angles, how many
 
     def __repr__(self):
         return f"Flat(size={self.size}, circular={self.circular})"
@@ -120,14 +123,7 @@ class Flat(Space):
 
     def normalise(self, point):
         """The same numbers, angles wrapped."""
-        if not self.circular:
-            return point
-        if len(self.circular) == self.size:
-            return wrap_angles(point)
-        parts = point.split([count for _, count in self._runs], -1)
-        return torch.cat(
-            [wrap_angles(part) if turns else part for (turns, _), part in zip(self._runs, parts, strict=True)], -1
-        )
+        return self._apart(lambda angle: (wrap_angles(angle),), _same, point)[0]
 
     def plus(self, point, tangent):
         """The sum, angles wrapped."""
@@ -141,10 +137,12 @@ class Flat(Space):
 
     def mean(self, points, weights=None):
         """The mean; of angles that of the deviations from the direction of their sum as unit vectors."""
-        if not self.circular:
-            return _mean(points, weights).squeeze(-2)
-        center = self._directions(points, weights)
-        return self.normalise(center + _mean(self.normalise(points - center), weights)).squeeze(-2)
+
+        def of_circles(values: Tensor) -> tuple[Tensor]:
+            center = _direction(values, weights)
+            return (wrap_angles(center + _mean(wrap_angles(values - center), weights)),)
+
+        return self._apart(of_circles, lambda values: (_mean(values, weights),), points)[0].squeeze(-2)
 
     def near(self, points, weights=None):
         """The mean."""
@@ -171,24 +169,28 @@ class Flat(Space):
         samples = reading if reading.ndim == predicted.ndim else reading.unsqueeze(-2)
         if observed is not None:
             samples = torch.where(observed.unsqueeze(-2), samples, 0)
-        center, own = self._directions(predicted), self._directions(samples)
-        samples = center + self.normalise(own - center) + self.normalise(samples - own)
-        predicted = center + self.normalise(predicted - center)
+
+        def of_circles(predicted: Tensor, samples: Tensor) -> tuple[Tensor, Tensor]:
+            center, own = _direction(predicted), _direction(samples)
+            samples = center + wrap_angles(own - center) + wrap_angles(samples - own)
+            return center + wrap_angles(predicted - center), samples
+
+        predicted, samples = self._apart(of_circles, _same, predicted, samples)
         return predicted, samples if reading.ndim == predicted.ndim else samples.squeeze(-2)
 
-    def _directions(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
-        """The directions of the sums of unit vectors ``[*B, 1, N]``, 0 of numbers.
-
-        They are constants to the gradient: they only pick the turn.
-        """
-        parts = points.detach().split([count for _, count in self._runs], -1)
-        return torch.cat(
-            [
-                torch.atan2(_mean(part.sin(), weights), _mean(part.cos(), weights)) if turns else 0 * part[..., :1, :]
-                for (turns, _), part in zip(self._runs, parts, strict=True)
-            ],
-            -1,
-        )
+    def _apart(self, of_circles: _Parts, of_lines: _Parts, *values: Tensor) -> tuple[Tensor, ...]:
+        """Maps the angles among values ``[*, N]`` by one function, and the other numbers by another."""
+        if not self.circular:
+            return of_lines(*values)
+        if len(self.circular) == self.size:
+            return of_circles(*values)
+        if len(self._runs) > _RUNS:
+            turns = torch.tensor([index in self.circular for index in range(self.size)], device=values[0].device)
+            both = zip(of_circles(*values), of_lines(*values), strict=True)
+            return tuple(torch.where(turns, circles, lines) for circles, lines in both)
+        runs = zip(*(value.split([count for _, count in self._runs], -1) for value in values), strict=True)
+        parts = [(of_circles if turns else of_lines)(*own) for (turns, _), own in zip(self._runs, runs, strict=True)]
+        return tuple(torch.cat(own, -1) for own in zip(*parts, strict=True))
 
     def _whole(self, known):
         return known, known
@@ -227,6 +229,16 @@ class Circle(Flat):
         return "Circle()"
 
 
+def _same(*values: Tensor) -> tuple[Tensor, ...]:
+    return values
+
+
 def _mean(values: Tensor, weights: Tensor | None) -> Tensor:
     """The mean ``[*B, 1, N]`` of values ``[*B, E, N]``."""
     return values.mean(-2, keepdim=True) if weights is None else (weights.unsqueeze(-1) * values).sum(-2, keepdim=True)
+
+
+def _direction(turns: Tensor, weights: Tensor | None = None) -> Tensor:
+    """The direction of the sum of unit vectors, ``[*B, 1, N]``; a constant to the gradient: it only picks the turn."""
+    turns = turns.detach()
+    return torch.atan2(_mean(turns.sin(), weights), _mean(turns.cos(), weights))
