@@ -30,6 +30,7 @@ class Opposite(Space):
         Barrau & Bonnabel 2017, IEEE T-AC 62.
 
     Example:
+        >>> from torch_denkf.functional.manifolds import SE3
         >>> turned = torch.tensor([0.0, 0.0, 0.0, 1.0, 5.0, 0.0, 0.0])  # half a turn around z
         >>> Opposite(SE3()).plus(turned, torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))[4:]
         tensor([6., 0., 0.])
@@ -104,6 +105,7 @@ class Product(Space):
         *parts: spaces.
 
     Example:
+        >>> from torch_denkf.functional.manifolds import Euclidean, SO3
         >>> state = Product(SO3(), Euclidean(3))  # an orientation, and a gyro's bias
         >>> state.point_dim, state.tangent_dim
         (7, 6)
@@ -194,6 +196,7 @@ class Repeated(Space):
         count: N.
 
     Example:
+        >>> from torch_denkf.functional.manifolds import SO3
         >>> Repeated(SO3(), 4).point_dim, Repeated(SO3(), 4).tangent_dim
         (16, 12)
     """
@@ -289,6 +292,7 @@ def places_of(space: Space) -> list[Place]:
     """The parts of a product, and of products within it; a space that is none is its own part.
 
     Example:
+        >>> from torch_denkf.functional.manifolds import Euclidean, SE3
         >>> [place.rotation for place in places_of(Product(Euclidean(2), SE3()))]
         [slice(0, 0, None), slice(2, 5, None)]
     """
@@ -318,6 +322,7 @@ def whole_parts(space: Space, known: Tensor) -> tuple[Tensor, Tensor]:
         ``[*, D]``.
 
     Example:
+        >>> from torch_denkf.functional.manifolds import Euclidean, SO3
         >>> whole_parts(Product(SO3(), Euclidean(2)), torch.tensor([True, True, False, True, True, False]))[1]
         tensor([False, False, False,  True, False])
     """
