@@ -172,9 +172,9 @@ def test_a_state_on_lines_and_circles_is_that_of_plain_numbers(kind):
 
 
 def test_wrong_calls_are_refused():
-    assert_refused(ValueError, "components of 3, 0 to 2; got 3", Flat, 3, [3])
-    assert_refused(ValueError, "got -1", Flat, 3, [-1])
-    assert_refused(TypeError, "whole numbers; got 0.5", Flat, 3, [0.5])
+    assert_refused(ValueError, "circular .* 3", Flat, 3, [3])
+    assert_refused(ValueError, "circular .* -1", Flat, 3, [-1])
+    assert_refused(TypeError, "interpreted as an integer", Flat, 3, [0.5])
     assert_refused(TypeError, "space is a Space", check_space, "space", 3)
     assert_refused(ValueError, "point has shape", MIXED.minus, torch.zeros(4), torch.zeros(4))
     flat = "reading_space is one of numbers and angles here"

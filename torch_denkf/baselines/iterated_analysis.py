@@ -16,7 +16,6 @@ from torch_denkf.functional.inflation import inflate, random_rotation
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.smoothing.iterated import iterated_smoothing
 from torch_denkf.modules._gaussian import further_keys
-from torch_denkf.modules._spaces import mean_reading
 from torch_denkf.modules.carried import Beside
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.running import check_module, random_parts, run_module
@@ -149,7 +148,7 @@ class IteratedAnalysis(SubModel):
         ensemble, reading, variance = (self.required(entries, key) for key in self.in_keys[:3])
         space, on = self.space, self.reading_space
         if reading.ndim == ensemble.ndim:
-            reading = mean_reading(on, reading)
+            reading = reading.mean(-2) if on is None else on.mean(reading)
         center = ensemble[..., :1, :] if space is None else space.mean(ensemble).unsqueeze(-2)
         start = ensemble if space is None else space.minus(ensemble, center)
         observed, dim = entries.get(self.observed_key), start.shape[-1]

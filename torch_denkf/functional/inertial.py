@@ -10,7 +10,7 @@ from torch import Tensor, cat
 
 from torch_denkf._checks import check_shape
 from torch_denkf.functional.manifolds import SE23, SO3, rotate
-from torch_denkf.functional.manifolds.series import bend, fourth, half_versine, one_minus_sinc, series
+from torch_denkf.functional.manifolds.rotations import bend, fourth, half_versine, one_minus_sinc, series
 
 __all__ = ["move_inertially"]
 

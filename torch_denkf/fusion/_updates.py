@@ -10,11 +10,10 @@ from tensordict import unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf.functional.manifolds import Euclidean, Product, Space, check_space
+from torch_denkf.functional.manifolds import Euclidean, Product, Space, check_space, is_flat
 from torch_denkf.fusion.parts import JoinedObservation, JoinedReading, StateObservation
 from torch_denkf.fusion.sensor import FusedSensor, Wired, noise_key_of
 from torch_denkf.fusion.sensor_weights import SensorWeights, WeightedNoise
-from torch_denkf.modules._spaces import is_flat
 from torch_denkf.running import declared
 from torch_denkf.smoothers.past import lagged
 

@@ -12,7 +12,6 @@ from torch.nn import functional as F
 
 from torch_denkf._checks import check_mask
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._spaces import mean_reading
 from torch_denkf.modules.carried import InPlaceOf
 from torch_denkf.running import check_module, marks_of, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, SubModel
@@ -258,7 +257,7 @@ class JoinedReading(SubModel):
         """The readings and their noise."""
         count, size = len(self.spaces), len(batch_size)
         readings = [
-            value if value.ndim == size + 1 else mean_reading(space, value)
+            value if value.ndim == size + 1 else value.mean(-2) if space is None else space.mean(value)
             for value, space in zip(values[:count], self.spaces, strict=True)
         ]
         noises, total, begin = list(values[count:]), sum(reading.shape[-1] for reading in readings), 0

@@ -29,8 +29,7 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_values
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._spaces import is_flat
+from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.modules._tensors import as_standard_deviations
 from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.running import check_module, declared, reads, run_module, writes

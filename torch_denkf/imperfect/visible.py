@@ -26,10 +26,10 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.manifolds import is_flat
 from torch_denkf.functional.mixture import log_mixture, mix_members, mix_moments, responsibility
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import scored_innovation
-from torch_denkf.modules._spaces import is_flat
 from torch_denkf.modules._tensors import mean_of_members
 from torch_denkf.modules.carried import AnalysisAround
 from torch_denkf.modules.stochastic import StochasticMLP

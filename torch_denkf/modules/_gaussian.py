@@ -12,8 +12,8 @@ from torch import nn
 
 from torch_denkf._checks import check_number
 from torch_denkf.functional.gaussian import GaussianUpdate
-from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.modules._spaces import is_flat, mean_reading
+from torch_denkf.functional.manifolds import Space, check_space, is_flat
+from torch_denkf.modules._spaces import mean_reading
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.running import check_module, reads, run_module
 from torch_denkf.submodel import Call, Entries, SubModel

@@ -8,12 +8,7 @@ from torch_denkf.functional import ensemble_var
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.weighted import weighted_var
 
-__all__ = ["is_flat", "mean_and_tangents", "mean_reading", "moments_on"]
-
-
-def is_flat(*spaces: Space | None) -> bool:
-    """Returns whether the formulas of plain numbers hold: all are plain numbers, or lines and circles."""
-    return all(space is None or space.flat is not None for space in spaces)
+__all__ = ["mean_and_tangents", "mean_reading", "moments_on"]
 
 
 def mean_reading(space: Space | None, samples: Tensor) -> Tensor:

@@ -11,10 +11,10 @@ from tensordict import unravel_key
 from torch_denkf._checks import check_values
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
-from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
-from torch_denkf.modules._spaces import is_flat, mean_and_tangents
+from torch_denkf.modules._spaces import mean_and_tangents
 from torch_denkf.modules._tensors import as_floating, check_dims
 
 __all__ = ["EnsembleAnalysis"]

@@ -10,9 +10,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_denkf.functional import kalman_update
-from torch_denkf.functional.manifolds import Euclidean, Space
+from torch_denkf.functional.manifolds import Euclidean, Space, is_flat
 from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
-from torch_denkf.modules._spaces import is_flat
 from torch_denkf.running import reads
 from torch_denkf.submodel import Call, Entries
 
@@ -62,7 +61,7 @@ class EKFTransition(GaussianTransition):
             return self._move(rows, states, call), None
 
         entries = _needed(self, entries)
-        if is_flat(self.space):
+        if self.space is None or self.space.flat is not None:
             forecast, jacobian, _ = _linearise(move, entries, call, mean, mean.shape[-1])
         else:
             forecast, jacobian, _ = _linearise_on(move, entries, call, mean, self.space, self.space)

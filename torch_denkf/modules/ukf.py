@@ -8,6 +8,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf._checks import check_number
+from torch_denkf.functional.manifolds import is_flat
 from torch_denkf.functional.unscented import (
     UnscentedWeights,
     sigma_points,
@@ -22,7 +23,6 @@ from torch_denkf.modules._gaussian import (
     GaussianTransition,
     GaussianTransitionKeys,
 )
-from torch_denkf.modules._spaces import is_flat
 
 __all__ = ["UKFAnalysis", "UKFTransition"]
 
@@ -148,9 +148,9 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
         around = mean.unsqueeze(-2)
         around = around + points if self.space is None else self.space.plus(around, points)
         predicted, observed = self._observe(entries, around, call)
-        if not is_flat(on):
-            expected, on = on.mean(predicted, weights.mean), None
-            predicted = self.reading_space.minus(predicted, expected.unsqueeze(-2))
+        if on is not None and on.flat is None:
+            expected = on.mean(predicted, weights.mean)
+            predicted, on = on.minus(predicted, expected.unsqueeze(-2)), None
             observation = self._innovation(observation, expected, observed)
         update = unscented_update(points, predicted, observation, noise, weights, observed=observed, space=on)
         return self._moved(mean, update), observed

@@ -16,8 +16,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from torch_denkf._checks import check_mask
-from torch_denkf.functional.manifolds import Space, whole_parts
-from torch_denkf.modules._spaces import is_flat
+from torch_denkf.functional.manifolds import Space, is_flat, whole_parts
 from torch_denkf.running import declared
 
 if TYPE_CHECKING:

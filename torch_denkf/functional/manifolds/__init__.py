@@ -15,7 +15,6 @@ Barfoot 2017, State Estimation for Robotics, eq. 7.86 (the Jacobian's lower bloc
 """
 
 from torch_denkf.functional.manifolds.flat import Circle, Euclidean, Flat
-from torch_denkf.functional.manifolds.plane import SE2
 from torch_denkf.functional.manifolds.products import Opposite, Place, Product, Repeated, places_of, whole_parts
 from torch_denkf.functional.manifolds.quaternions import (
     quaternion_of,
@@ -24,8 +23,8 @@ from torch_denkf.functional.manifolds.quaternions import (
     rotation_matrix,
     skew,
 )
-from torch_denkf.functional.manifolds.rotations import SE3, SE23, SO3, Turned
-from torch_denkf.functional.manifolds.space import Space, check_space
+from torch_denkf.functional.manifolds.rotations import SE2, SE3, SE23, SO3, Turned
+from torch_denkf.functional.manifolds.space import Space, check_space, is_flat
 
 __all__ = [
     "SE2",
@@ -42,6 +41,7 @@ __all__ = [
     "Space",
     "Turned",
     "check_space",
+    "is_flat",
     "places_of",
     "quaternion_of",
     "quaternion_product",

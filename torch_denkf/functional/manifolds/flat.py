@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from itertools import groupby
 
 import torch
 from torch import Tensor
 
-from torch_denkf._checks import check_count
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional.angles import wrap_angles
-from torch_denkf.functional.manifolds.matrices import eye
-from torch_denkf.functional.manifolds.space import Space
+from torch_denkf.functional.manifolds.space import Space, eye
 
 __all__ = ["Circle", "Euclidean", "Flat"]
 
@@ -41,12 +41,11 @@ class Flat(Space):
 
     def __init__(self, size: int, circular: Sequence[int] = ()):
         check_count("size", size, least=1)
-        for index in circular:
-            if isinstance(index, bool) or not hasattr(index, "__index__"):
-                raise TypeError(f"circular holds indices of components, whole numbers; got {index!r}")
-            if not 0 <= index < size:
-                raise ValueError(f"circular holds components of {size}, 0 to {size - 1}; got {index}")
-        self.size, self.circular = size, tuple(sorted({int(index) for index in circular}))
+        self.size = self.point_dim = self.tangent_dim = size
+        self.circular = tuple(sorted({operator.index(component) for component in circular}))
+        self._angles = len(self.circular)
+        for component in self.circular:
+            check_number("circular", component, least=0, below=size)
         runs = groupby(range(size), lambda index: index in self.circular)
         self._runs = tuple((turns, len(list(run))) for turns, run in runs)  # side by side: whether angles, how many
 
@@ -60,16 +59,6 @@ class Flat(Space):
         return hash((self.size, self.circular))
 
     @property
-    def point_dim(self) -> int:  # type: ignore[override]
-        """N."""
-        return self.size
-
-    @property
-    def tangent_dim(self) -> int:  # type: ignore[override]
-        """N."""
-        return self.size
-
-    @property
     def flat(self):
         """This space."""
         return self
@@ -81,10 +70,6 @@ class Flat(Space):
             part for turns, count in self._runs for part in ([Circle()] * count if turns else [Euclidean(count)])
         )
 
-    @property
-    def _angles(self) -> int:  # type: ignore[override]
-        return len(self.circular)
-
     def compose(self, first, second):
         """The sum, angles wrapped."""
         return self.normalise(first + second)
@@ -93,29 +78,11 @@ class Flat(Space):
         """The negative."""
         return -point
 
-    def exp(self, tangent):
-        """The same numbers, angles wrapped."""
-        return self.normalise(tangent)
-
-    def log(self, point):
-        """The same numbers, angles wrapped."""
-        return self.normalise(point)
-
     def right_jacobian(self, tangent):
         """The identity."""
         return eye(tangent, self.size)
 
-    def adjoint(self, point):
-        """The identity."""
-        return eye(point, self.size)
-
-    def basis(self, point):
-        """The identity."""
-        return eye(point, self.size)
-
-    def dual_basis(self, point):
-        """The identity."""
-        return eye(point, self.size)
+    adjoint = basis = dual_basis = right_jacobian
 
     def neutral(self, like=None):
         """Zeros."""
@@ -124,6 +91,8 @@ class Flat(Space):
     def normalise(self, point):
         """The same numbers, angles wrapped."""
         return self._apart(lambda angle: (wrap_angles(angle),), _same, point)[0]
+
+    exp = log = normalise
 
     def plus(self, point, tangent):
         """The sum, angles wrapped."""
@@ -144,9 +113,7 @@ class Flat(Space):
 
         return self._apart(of_circles, lambda values: (_mean(values, weights),), points)[0].squeeze(-2)
 
-    def near(self, points, weights=None):
-        """The mean."""
-        return self.mean(points, weights)
+    near = mean
 
     def innovation(self, reading, expected, observed=None):
         """The difference, angles wrapped; NaN where the reading is."""

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf.functional.manifolds.flat import Flat
-from torch_denkf.functional.manifolds.matrices import blocks, eye
-from torch_denkf.functional.manifolds.space import Space
+from torch_denkf.functional.manifolds.space import Space, blocks, eye
 
 __all__ = ["Opposite", "Place", "Product", "Repeated", "places_of", "whole_parts"]
 

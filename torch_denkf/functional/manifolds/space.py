@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,7 +12,7 @@ if TYPE_CHECKING:
     from torch_denkf.functional.manifolds.flat import Flat
     from torch_denkf.functional.manifolds.products import Product
 
-__all__ = ["Space", "check_space"]
+__all__ = ["Space", "check_space", "is_flat"]
 
 _MEAN_STEPS = 3  # of Gauss-Newton, each of which takes at least the square of the spread off the error
 
@@ -202,3 +203,24 @@ def check_space(name: str, space: Space | None, *, flat: bool = False) -> Space 
     if flat and space.flat is None:
         raise ValueError(f"{name} is one of numbers and angles here, such as Euclidean(2) * Circle(); got {space}.")
     return space.flat or space
+
+
+def is_flat(*spaces: Space | None) -> bool:
+    """Returns whether the formulas of plain numbers hold: all are plain numbers, or lines and circles."""
+    return all(space is None or space.flat is not None for space in spaces)
+
+
+def eye(like: Tensor, size: int) -> Tensor:
+    """Returns the identity ``[*, size, size]`` for points ``[*, N]``."""
+    return torch.eye(size, dtype=like.dtype, device=like.device).expand(*like.shape[:-1], size, size)
+
+
+def blocks(parts: Sequence[Tensor]) -> Tensor:
+    """Matrices on the diagonal of one."""
+    sizes = [part.shape[-1] for part in parts]
+    rows = []
+    for place, part in enumerate(parts):
+        batch = part.shape[:-1]
+        before, after = part.new_zeros(*batch, sum(sizes[:place])), part.new_zeros(*batch, sum(sizes[place + 1 :]))
+        rows.append(torch.cat([before, part, after], -1))
+    return torch.cat(rows, -2)
