@@ -15,7 +15,10 @@ Barfoot 2017, State Estimation for Robotics, eq. 7.86 (the Jacobian's lower bloc
 """
 
 from torch_denkf.functional.manifolds.flat import Circle, Euclidean, Flat
-from torch_denkf.functional.manifolds.products import Opposite, Place, Product, Repeated, places_of, whole_parts
+from torch_denkf.functional.manifolds.products import Opposite, Product, Repeated
+from torch_denkf.functional.manifolds.products import Place as Place
+from torch_denkf.functional.manifolds.products import places_of as places_of
+from torch_denkf.functional.manifolds.products import whole_parts as whole_parts
 from torch_denkf.functional.manifolds.quaternions import (
     quaternion_of,
     quaternion_product,
@@ -24,7 +27,9 @@ from torch_denkf.functional.manifolds.quaternions import (
     skew,
 )
 from torch_denkf.functional.manifolds.rotations import SE2, SE3, SE23, SO3, Turned
-from torch_denkf.functional.manifolds.space import Space, check_space, is_flat
+from torch_denkf.functional.manifolds.space import Space
+from torch_denkf.functional.manifolds.space import check_space as check_space
+from torch_denkf.functional.manifolds.space import is_flat as is_flat
 
 __all__ = [
     "SE2",
@@ -35,18 +40,13 @@ __all__ = [
     "Euclidean",
     "Flat",
     "Opposite",
-    "Place",
     "Product",
     "Repeated",
     "Space",
     "Turned",
-    "check_space",
-    "is_flat",
-    "places_of",
     "quaternion_of",
     "quaternion_product",
     "rotate",
     "rotation_matrix",
     "skew",
-    "whole_parts",
 ]
