@@ -203,7 +203,7 @@ def heeding(make):
 
     def heeds(turn):
         filter = make(turn)
-        return filter.replace("analysis", Visible(filter["analysis"], visible_key="visible"))
+        return filter.with_modules(analysis=Visible(filter["analysis"], visible_key="visible"))
 
     return heeds
 
@@ -372,8 +372,9 @@ def know_of_spaces():
             if isinstance(node, ast.ClassDef) and any(map(_speaks_of_spaces, ast.walk(node))):
                 place = ".".join(["torch_denkf", *file.relative_to(root).with_suffix("").parts])
                 found.add(getattr(importlib.import_module(place), node.name))
-    motions = "torch_denkf.motions."  # their readings only say which space they are in
-    return {kind for kind in found if issubclass(kind, nn.Module) and not kind.__module__.startswith(motions)}
+    # Readings of motions say which space they are in, and what rejects readings looks at each by itself.
+    others = ("torch_denkf.motions.", "torch_denkf.imperfect.rejection")
+    return {kind for kind in found if issubclass(kind, nn.Module) and not kind.__module__.startswith(others)}
 
 
 def _speaks_of_spaces(node):

@@ -50,6 +50,7 @@ from .filters import (
     ParticleFilter,
 )
 from .fusion import FusedFilter, FusedSensor, Refiltering
+from .imperfect import RejectReadings
 from .monitoring import Gated, Monitored
 from .objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from .pretrained.folders import available, from_pretrained, save_pretrained
@@ -124,6 +125,7 @@ __all__ = [
     "Recording",
     "RecordingReplay",
     "Refiltering",
+    "RejectReadings",
     "ReplayEnv",
     "SaltAndPepper",
     "SensorLoss",

@@ -1,8 +1,8 @@
 """What outer rings register with inner ones, which import nothing of theirs: here it is looked up by name.
 
 A folder of ``torch_denkf.applications`` has a file ``registered.py`` with ``BUILDERS`` and ``COMMANDS``, and weights in
-``weights/NAME/``. Nothing else of the library knows an application. ``torch_denkf.compilation`` is what filters compile
-with.
+``weights/NAME/``. Nothing else of the library knows an application. The kit's rooms that a filter uses by default
+are here, too: ``diagnosis`` and ``compilation``.
 """
 
 from __future__ import annotations
@@ -38,6 +38,16 @@ def commands() -> dict[str, tuple[str, str]]:
 def compiler() -> ModuleType:
     """The room that knows torch's compiler; importing inductor itself, which it does later, takes half a second."""
     return import_module("torch_denkf.compilation")
+
+
+def diagnosis() -> ModuleType:
+    """The room of a filter's default observers."""
+    return import_module("torch_denkf.diagnosis")
+
+
+def primers() -> ModuleType:
+    """The room of torchrl's transforms, which stands on the filters."""
+    return import_module("torch_denkf.transforms")
 
 
 def weights() -> dict[str, Path]:

@@ -31,14 +31,12 @@ class Call(NamedTuple):
         place: where the module stands in the filter, e.g. ``"transition"``; its noise is ``("noise", place)``.
         sample: whether random modules draw; if not, they run their deterministic forward.
         time: whether the last dimension of ``batch_size`` is time.
-        missing: entries that an initial belief must do without.
     """
 
     batch_size: torch.Size
     place: str = "self"
     sample: bool = True
     time: bool = False
-    missing: frozenset[NestedKey] = frozenset()
 
     def part(self, name: str) -> Call:
         """The call of a part of the module."""

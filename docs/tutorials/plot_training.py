@@ -91,8 +91,7 @@ def make() -> DEnKF:
 
 def fit(length: int, initial: torch.nn.Module, updates: int = 110, **options) -> DEnKF:
     """Trains a new filter on windows of some length."""
-    filter = make()
-    filter.replace("initial", initial)
+    filter = make().with_modules(initial=initial)
     loss = DEnKFLoss(filter, state_scale=scale, **options)
     noises = [parameter for name, parameter in loss.named_parameters() if "log_variance" in name]
     others = [parameter for name, parameter in loss.named_parameters() if "log_variance" not in name]
@@ -106,8 +105,7 @@ def fit(length: int, initial: torch.nn.Module, updates: int = 110, **options) ->
         torch.nn.utils.clip_grad_norm_(filter.parameters(), 1.0)
         optimiser.step()
         schedule.step()
-    filter.replace("initial", anywhere)  # a filter that is used does not know where it begins
-    return filter
+    return filter.with_modules(initial=anywhere)  # a filter that is used does not know where it begins
 
 
 filters = {

@@ -92,7 +92,7 @@ def still_filter(members=8):
     filter = cartpole.unlearned_filter(members)
     torch.manual_seed(0)
     start = torch.tensor(cartpole.START) + 0.1 * torch.randn(members, 5)
-    filter.replace("initial", FixedEnsemble(start))
+    filter = filter.with_modules(initial=FixedEnsemble(start))
     with torch.no_grad():
         filter["transition"].module["noise"].log_variance.fill_(-60.0)
     return filter

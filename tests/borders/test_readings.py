@@ -1,22 +1,21 @@
-"""Readings that cannot be true: refused with the key's name, or filtered exactly as if a mask hid them, and counted."""
+"""Readings that cannot be true raise with the key's name; RejectReadings filters them as if a mask hid them."""
 
 import re
-import warnings
-from functools import partial
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch._subclasses.fake_tensor import FakeTensorMode
-from torchrl.envs import ExcludeTransform, TransformedEnv, check_env_specs
+from torchrl.envs import ExcludeTransform, TransformedEnv
 
 from tests.filters.factories import M, S, linear_denkf, linear_kalman, linear_system, toy_denkf
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
+from torch_denkf import RejectReadings
 from torch_denkf._checks import has_values
 from torch_denkf.baselines import LSTMFilter
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import DEnKF, Filter, KalmanFilter, ParticleFilter, finish
+from torch_denkf.filters import DEnKF, Filter, KalmanFilter, ParticleFilter
 from torch_denkf.functional import soft_resample, systematic_resample
 from torch_denkf.modules import (
     ConstantNoise,
@@ -130,6 +129,12 @@ def frames_of(name, *batch, value=float("nan"), masked=False):
     return expected, spoiled, (hidden & observed).sum(-1, keepdim=True)
 
 
+def rejecting(name, **options):
+    """What rejects bad readings in front of the filter of that name."""
+    _, key, by_component = FILTERS[name]
+    return RejectReadings({key: "observed"}, by_component=[key] if by_component else [], **options)
+
+
 def same(filter, got, expected):
     keys = [*filter.belief_keys, *filter.log_likelihood_keys]
     for key in keys:
@@ -145,25 +150,22 @@ def test_a_sequence_is_that_of_a_mask(name, masked, value):
     torch.manual_seed(0)
     expected = make(name).sequence(expected)
     torch.manual_seed(0)
-    filter = make(name, reject=True)
-    got = filter.sequence(spoiled.copy())
+    filter = make(name)
+    got = filter.sequence(rejecting(name)(spoiled.copy()))
     same(filter, got, expected)
-    assert (got[REJECTED][:, 0] == 0).all()  # an initial belief has rejected nothing
-    assert got[REJECTED][:, 1:].equal(count[:, 1:])
+    assert got[REJECTED].equal(count)
     assert count.sum() > 0
-    for key, given in spoiled.items():  # what came in stays
-        assert ((got[key] == given) | (given != given)).all()
 
 
 @ALL
 def test_steps_are_those_of_a_mask(name):
     expected, spoiled, count = frames_of(name, 3, 12)
-    outs = []
-    for filter, frames in ((make(name), expected), (make(name, reject=True), spoiled)):
+    outs, filter = [], make(name)
+    for frames, prepare in ((expected, lambda td: td), (spoiled, rejecting(name))):
         torch.manual_seed(0)
-        td, out = filter.initialise(frames[:, 0].copy()), []
+        td, out = filter.initialise(prepare(frames[:, 0].copy())), []
         for t in range(1, 12):
-            td = filter.step(td.update(frames[:, t]))
+            td = filter.step(prepare(td.update(frames[:, t])))
             out.append(td.clone())
         outs.append(torch.stack(out, 1))
     same(filter, outs[1], outs[0])
@@ -171,32 +173,23 @@ def test_steps_are_those_of_a_mask(name):
 
 
 @ALL
-def test_nothing_changes_where_all_readings_are_sound(name):
-    frames = frames_of(name, 3, 12)[0]
-    outs = []
-    for reject in (False, True):
-        torch.manual_seed(0)
-        filter = make(name, reject=reject)
-        outs.append(filter.sequence(frames.copy()))
-    same(filter, *outs)
-    assert (outs[1][REJECTED] == 0).all()
-    assert REJECTED not in make(name).out_keys
-
-
-@ALL
 @pytest.mark.parametrize("value", BAD)
-def test_a_step_refuses_with_the_key(name, value):
+def test_a_bad_reading_raises_with_the_key(name, value):
+    """In front of the filter; by itself it raises where its new belief is not finite."""
     _, key, _ = FILTERS[name]
-    filter = make(name)
+    filter, check = make(name), rejecting(name, on_bad="raise")
     td = filter.initialise(frames_of(name, 3)[0])
     before = td.clone()
     td[key][1, 0] = value
     td["observed"][:] = True
-    with pytest.raises(ValueError, match=re.escape(f"['{key}']")):
-        filter.step(td)
+    with pytest.raises(ValueError, match=rf"^'{key}' is {re.escape(f'{value:g}')} at \[1, 0\]"):
+        check(td)
+    if value != value:
+        with pytest.raises(ValueError, match=re.escape(f"NaN or infinity in ['{key}']")):
+            filter.step(td)
     assert all(td[belief].equal(before[belief]) for belief in filter.carry_keys)
     td["observed"][1] = False
-    assert filter.step(td)["belief", "mean"].isfinite().all()
+    assert filter.step(check(td))["belief", "mean"].isfinite().all()
 
 
 @pytest.mark.parametrize("name", ["Kalman", "etkf", "systematic"])
@@ -216,151 +209,53 @@ def test_readings_that_no_step_uses_may_be_anything(name):
         env.step(env.rand_action(td))
 
 
-def some(*names, slow):
-    """Of each kind of belief one traced here, in one way or the other; the rest with the slow tests."""
-    return pytest.mark.parametrize("name", [*names, *(pytest.param(name, marks=pytest.mark.slow) for name in slow)])
-
-
-@some("sensor", "Kalman", slow=["etkf", "systematic", "LSTM"])
-def test_compiled_steps_and_sequences(name):
-    """Through dynamo: one graph without a branch."""
-    _, spoiled, _ = frames_of(name, 3, 6)
-    torch.manual_seed(0)
-    eager = make(name, reject=True)
-    expected = eager.sequence(spoiled.copy())
-    torch.manual_seed(0)
-    filter = make(name, reject=True).compile(chunk=2, backend="eager")
-    got = filter.sequence(spoiled.copy())
-    for key in (*filter.belief_keys, REJECTED):
-        torch.testing.assert_close(got[key], expected[key], rtol=1e-5, atol=1e-5)
-    td = filter.initialise(spoiled[:, 0].copy())
-    assert filter.step(td.update(spoiled[:, 1]))[REJECTED].equal(got[REJECTED][:, 1])
-
-
-@some("systematic", "LSTM", slow=["Kalman", "etkf", "sensor", "transport"])
-def test_packaged_steps(name, tmp_path):
-    _, spoiled, count = frames_of(name, 3, 6)
-    filter = make(name, reject=True)
-    start = filter.initialise(spoiled[:, 0].copy())
-    drawn = filter.draw_noise(start.copy())
-    step = load_step(export_step(filter, drawn.exclude("info"), tmp_path / "step.pt2", compiled=False))
-    assert "info.rejected" in step.outputs
-    noise = _flat(drawn.select("noise", strict=False))
-    carry = {".".join(key): start[key] for key in filter.carry_keys}
-    for t in range(1, 6):
-        out = step({**_flat(spoiled[:, t]), **carry, **noise})
-        carry = {name: out[name] for name in step.carry}
-        assert out["info.rejected"].equal(count[:, t])
-        assert all(value.isfinite().all() for value in carry.values())
-    assert (
-        "info.rejected"
-        not in load_step(export_step(make(name), start.exclude("info"), tmp_path / "other.pt2", compiled=False)).outputs
-    )
-
-
-def _flat(tensordict):
-    return {key if isinstance(key, str) else ".".join(key): value for key, value in tensordict.items(True, True)}
-
-
-@pytest.mark.parametrize("make_filter", [linear_kalman, lambda **kw: linear_denkf("etkf", **kw), from_sensor])
-@pytest.mark.parametrize("update_at_reset", [False, True])
-def test_the_transform_without_its_check(make_filter, update_at_reset):
-    """An environment that says when a reading is missing, and one that does not: the beliefs are the same."""
-    rollouts = []
-    for silent in (False, True):
-        env = TransformedEnv(base_env(missing=0.4, batch_size=[2], max_steps=[3, 5], seed=1))
-        if silent:
-            env.append_transform(ExcludeTransform("observed"))
-        filter = make_filter(update_at_reset=update_at_reset)
-        env.append_transform(DEnKFTransform(filter, check_finite=False, diagnostics=[REJECTED]))
-        if silent:
-            check_env_specs(env)
-        env.set_seed(1)
-        torch.manual_seed(0)
-        rollouts.append(env.rollout(9, break_when_any_done=False))
-    said, silent = rollouts
-    missing = ~said["next", "observed"]
-    assert missing.any()
-    assert missing[:, 1:].any()
-    for key in filter.belief_keys:
-        assert said["next"][key].isfinite().all()
-        torch.testing.assert_close(silent["next"][key], said["next"][key], rtol=0, atol=0)
-        torch.testing.assert_close(silent[key], said[key], rtol=0, atol=0)
-    assert silent["next"][REJECTED].equal(2 * missing.long())
-    assert (said["next"][REJECTED] == 0).all()
-
-
-@pytest.mark.parametrize("make_filter", [partial(particles, "systematic"), linear_kalman])
 @pytest.mark.parametrize("value", BAD)
-def test_the_transform_with_its_check(value, make_filter):
-    env = TransformedEnv(base_env(batch_size=[2]))
-    env.append_transform(ExcludeTransform("observed"))
-    env.append_transform(DEnKFTransform(make_filter()))
+def test_a_transform_that_raises(value):
+    env = TransformedEnv(base_env(batch_size=[2]), ExcludeTransform("observed"))
+    env.append_transform(RejectReadings({"observation": "observed"}, on_bad="raise"))
+    env.append_transform(DEnKFTransform(linear_kalman()))
     td = env.rand_action(env.reset())
     emit = env.base_env._emit
     env.base_env._emit = lambda *args: emit(*args).update({"observation": torch.tensor([[0.0, 0.0], [value, 0.0]])})
-    with pytest.raises(ValueError, match=r"because of .* in \['observation'\].*check_finite=False"):
+    with pytest.raises(ValueError, match=r"^'observation' is .* at \[1, 0\], and a reading must be"):
         env.step(td)
 
 
 def test_the_transform_of_a_package(tmp_path):
-    """Rejecting or refusing; without either, a word in advance."""
-    frame = TensorDict({"observation": torch.zeros(2, 2)}, [2])
-    steps = {
-        reject: load_step(export_step(linear_kalman(reject=reject), frame, tmp_path / f"{reject}.pt2", compiled=False))
-        for reject in (False, True)
-    }
+    """Behind what rejects readings; by itself it raises."""
+    frame = TensorDict({"observation": torch.zeros(2, 2), "observed": torch.ones(2, 1, dtype=torch.bool)}, [2])
+    step = load_step(export_step(linear_kalman(), frame, tmp_path / "step.pt2", compiled=False))
 
-    def rollout(**options):
-        env = TransformedEnv(base_env(missing=0.4, batch_size=[2], seed=1)).append_transform(
-            ExcludeTransform("observed")
-        )
-        env.append_transform(DEnKFTransform(linear_kalman(), diagnostics=[], **options))
+    def rollout(*transforms, **options):
+        env = TransformedEnv(base_env(missing=0.4, batch_size=[2], seed=1), ExcludeTransform("observed"))
+        for transform in transforms:
+            env.append_transform(transform)
+        env.append_transform(DEnKFTransform(linear_kalman(), **options))
         env.set_seed(1)
         return env.rollout(9)["next", "belief", "mean"]
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        expected = rollout(check_finite=False)
-        torch.testing.assert_close(rollout(check_finite=False, packaged=steps[True]), expected)
+    expected = rollout(RejectReadings({"observation": "observed"}))
+    torch.testing.assert_close(rollout(RejectReadings({"observation": "observed"}), packaged=step), expected)
     assert expected.isfinite().all()
-    with pytest.warns(UserWarning, match="packaged step rejects no readings.*reject=True"):
-        assert rollout(check_finite=False, packaged=steps[False]).isnan().any()
-    for step in steps.values():
-        with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
-            rollout(packaged=step)
+    with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
+        rollout(packaged=step)
 
 
-@pytest.mark.parametrize("value", [1e25, -2e18])
-def test_a_belief_beyond_all_units_is_refused(value):
-    """Stored, or given to a reset; up to 1e18 the step is the exact one, K = 1/3 at P = 1 beside R = 2."""
+def test_a_step_is_exact_up_to_the_limit():
+    """K = 1/3 at P = 1 beside R = 2."""
     one = torch.eye(2)
     kf = KalmanFilter(one, one, process_noise_cov=0 * one, noise_cov=2 * one, mean=torch.zeros(2), cov=one)
-    rows = TensorDict({"observation": torch.zeros(3, 2)}, [3])
-    belief = kf.initialise(rows.clone())
+    belief = kf.initialise(TensorDict({"observation": torch.zeros(3, 2)}, [3]))
     belief["belief", "mean"] = torch.full((3, 2), 9e17)
-    torch.testing.assert_close(kf.step(belief.clone())["belief", "mean"], torch.full((3, 2), 6e17))
-    belief["belief", "mean"] = torch.tensor([[0.0, 0.0], [0.0, value], [0.0, 0.0]])
-    match = r"The belief has numbers of more than 1e\+18 in \[\('belief', 'mean'\)\]"
-    with pytest.raises(ValueError, match=match):
-        kf.step(belief.clone())
-    stored = torch.stack([belief, belief], 1)
-    stored["is_init"] = torch.tensor([True, False]).view(1, 2, 1).expand(3, 2, 1)
-    with pytest.raises(ValueError, match=match):
-        kf.sequence(stored)
-    env = TransformedEnv(base_env(batch_size=[3]), DEnKFTransform(linear_kalman()))
-    prior = env.reset().select("belief")
-    prior["belief", "mean"] = torch.full((3, 2), value)
-    with pytest.raises(ValueError, match=match):
-        env.reset(prior)
+    torch.testing.assert_close(kf.step(belief)["belief", "mean"], torch.full((3, 2), 6e17))
 
 
 def test_gradients_do_not_meet_what_was_rejected():
     """Also those of the sensor that would have read it: they are those of a masked frame."""
     expected, spoiled, _ = frames_of("sensor", 3, 12)
     gradients = []
-    for reject, frames in ((False, expected), (True, spoiled)):
-        filter = make("sensor", reject=reject)
+    for frames in (expected, rejecting("sensor")(spoiled)):
+        filter = make("sensor")
         torch.manual_seed(0)
         filter.sequence(frames)["belief", "mean"].square().mean().backward()
         gradients.append({name: value.grad for name, value in filter.named_parameters() if value.grad is not None})
@@ -374,7 +269,7 @@ def test_two_sensors_with_masks_of_their_own():
     """One is broken, the other goes on: as a filter that has it alone."""
     _, _, H, R = linear_system()
 
-    def two(**options):
+    def two():
         def analysis(key, start, end):
             keys = {"observed_key": f"{key}_seen", "observation_key": key, "noise_variance_key": (key + "_noise",)}
             return EnsembleAnalysis("etkf", forecast_key=start, belief_prefix=end, **keys)
@@ -391,7 +286,6 @@ def test_two_sensors_with_masks_of_their_own():
                 "second": analysis("b", ("half", "ensemble"), "belief"),
             },
             initial=single.initial,
-            **options,
         )
 
     clean = TensorDict({"a": torch.randn(3, 8, 2), "b": torch.randn(3, 8, 2)}, [3, 8])
@@ -400,7 +294,8 @@ def test_two_sensors_with_masks_of_their_own():
     masked = clean.clone()
     masked["a_seen"] = torch.ones(3, 8, 1, dtype=torch.bool)
     masked["a_seen"][:, 2:5] = False
-    got, expected = two(reject=True).sequence(spoiled), two().sequence(masked)
+    reject = RejectReadings({"a": "a_seen", "b": "b_seen"}, by_component=["a", "b"])
+    got, expected = two().sequence(reject(spoiled)), two().sequence(masked)
     torch.testing.assert_close(got["belief", "ensemble"], expected["belief", "ensemble"], rtol=0, atol=0)
     assert got[REJECTED][:, :, 0].tolist() == [[0, 0, 2, 2, 2, 0, 0, 0]] * 3
 
@@ -438,29 +333,22 @@ def test_weights_that_are_not_a_number_stay_so(resample):
     assert after[1].equal(expected[1][1])
 
 
-def test_only_what_nobody_can_look_at_is_passed_over(monkeypatch):
-    """Under vmap and of tensors without values nothing is said; a real error of torch is one."""
-    filter = linear_denkf()
+def test_only_what_nobody_can_look_at_is_passed_over():
+    """Under vmap and of tensors without values nothing is said."""
+    filter, check = linear_denkf(), RejectReadings({"observation": "observed"}, on_bad="raise")
 
     def means(observation):
-        return filter.sequence(TensorDict({"observation": observation}, observation.shape[:-1]))["belief", "mean"]
+        return filter.sequence(check(TensorDict({"observation": observation}, observation.shape[:-1])))[
+            "belief", "mean"
+        ]
 
     readings = torch.randn(3, 4, 5, 2)
     readings[1, 2, 3] = torch.nan
     torch.vmap(means)(readings)
     torch.func.vmap(torch.func.jacrev(means))(readings[:, 0])
-    with pytest.raises(ValueError, match="observation"):
-        means(readings)
-    with pytest.raises(ValueError, match="observation"):
-        torch.func.jacrev(means)(readings[1])
-
-    def broken(*_):
-        raise RuntimeError("out of memory")
-
-    monkeypatch.setattr(finish, "rejected_keys", broken)
-    torch.vmap(means)(readings)
-    with pytest.raises(RuntimeError, match="out of memory"):
-        means(readings)
+    for run in (means, torch.func.jacrev(means)):
+        with pytest.raises(ValueError, match="observation"):
+            run(readings[1])
 
 
 def test_whether_values_can_be_looked_at():

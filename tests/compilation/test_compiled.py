@@ -69,7 +69,7 @@ def test_what_changes_after_compiling_is_noticed(monkeypatch):
 
     monkeypatch.setattr(torch, "compile", traced)
     filter = linear_denkf()
-    filter.replace("observation", LearnedObservation(StochasticMLP(2, 2, (4,), layer="none")))
+    filter = filter.with_modules(observation=LearnedObservation(StochasticMLP(2, 2, (4,), layer="none")))
     frames = TensorDict({"observation": torch.randn(2, 2, 2)}, [2, 2])
     compiled = pickle.loads(pickle.dumps(filter)).compile(chunk=1)
     means = []
@@ -97,7 +97,7 @@ def test_what_changes_after_compiling_is_noticed(monkeypatch):
     agree(lambda model: freeze(model, False))
     agree(lambda model: setattr(model["analysis"], "inflation", 1.5))
     agree(lambda model: setattr(model["observation"].module, "activation", nn.Tanh()))
-    agree(lambda model: model.replace("noise", ConstantNoise([1.0, 2.0], in_key="observation")))
+    agree(lambda model: model.with_modules(noise=ConstantNoise([1.0, 2.0], in_key="observation")))
     agree(lambda model: setattr(model, "update_at_reset", True))
     assert means[0].equal(means[1])
     for before, after in pairwise(means[1:]):

@@ -145,7 +145,7 @@ def test_training_mode_is_left_as_it_was(tmp_path):
 def test_a_filter_in_training_is_exported_as_it_is_evaluated(tmp_path):
     """A user's network with layers that depend on the mode: the package holds their deterministic forward."""
     filter = small_filter()
-    filter.replace("transition", LearnedTransition(nn.Sequential(nn.Dropout(0.5), nn.Linear(3, 3))))
+    filter = filter.with_modules(transition=LearnedTransition(nn.Sequential(nn.Dropout(0.5), nn.Linear(3, 3))))
     example = TensorDict({"state": torch.ones(3), "reading": torch.zeros(2), "observed": torch.tensor([False])})
     step = load_step(export_step(filter.train(), example, tmp_path / "a.pt2", compiled=False))
     assert set(example.keys()) == {"state", "reading", "observed"}, "the example is left as it is"

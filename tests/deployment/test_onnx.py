@@ -27,9 +27,9 @@ def one_number(**options):
     return KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one, **options)
 
 
-def perturbed(*, reject=False):
+def perturbed():
     analysis = EnsembleAnalysis("perturbed", observation_key="reading")
-    return DEnKF(**parts(bend), analysis=analysis, initial=members(), process_noise=[0.1] * 3, reject=reject)
+    return DEnKF(**parts(bend), analysis=analysis, initial=members(), process_noise=[0.1] * 3)
 
 
 def of_readings(*batch):
@@ -75,8 +75,8 @@ def test_steps_are_the_filters(name, tmp_path):
 
 
 def test_a_step_by_hand_without_torch(tmp_path):
-    """The forecast's variance is 2, so the gain 2/3; a reading that is hidden leaves the forecast; NaN is rejected."""
-    filter = one_number(reject=True)
+    """The forecast's variance is 2, so the gain 2/3; a reading that is hidden leaves the forecast."""
+    filter = one_number()
     example = TensorDict({"observation": torch.zeros(1), "observed": torch.ones(1, dtype=torch.bool)})
     path = export_step(filter, example, tmp_path / "step.onnx", format="onnx")
     program = f"""
@@ -87,16 +87,16 @@ import onnxruntime
 session = onnxruntime.InferenceSession({str(path)!r})
 names = json.loads(session.get_modelmeta().custom_metadata_map["torch_denkf"])
 belief = {{"belief.mean": np.zeros(1, np.float32), "belief.cov": np.ones((1, 1), np.float32)}}
-for value, seen in ((1, True), (7, False), (np.nan, True)):
+for value, seen in ((1, True), (7, False), (np.nan, False)):
     frame = {{"observation": np.array([value], np.float32), "observed": np.array([seen])}}
     out = dict(zip(names["outputs"], session.run(None, belief | frame)))
     belief = {{name: out[name] for name in names["carry"]}}
-    print(*(float(out[name].squeeze()) for name in ("belief.mean", "belief.cov", "info.rejected")))
+    print(*(float(out[name].squeeze()) for name in ("belief.mean", "belief.cov")))
 assert "torch" not in sys.modules
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     found = np.array([line.split() for line in done.stdout.splitlines()], float)
-    np.testing.assert_allclose(found, [[2 / 3, 2 / 3, 0], [2 / 3, 5 / 3, 0], [2 / 3, 8 / 3, 1]], rtol=1e-6)
+    np.testing.assert_allclose(found, [[2 / 3, 2 / 3], [2 / 3, 5 / 3], [2 / 3, 8 / 3]], rtol=1e-6)
 
 
 def test_what_onnx_lacks_is_named(tmp_path):

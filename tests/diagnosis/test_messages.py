@@ -51,7 +51,7 @@ class Perturbed(SubModel):
 
 def with_analysis(analysis, **kwargs):
     filter = linear_denkf("perturbed", noisy=True, **kwargs)
-    filter.replace("analysis", analysis)
+    filter = filter.with_modules(analysis=analysis)
     return filter
 
 
@@ -84,7 +84,7 @@ def test_a_stochastic_analysis_that_names_no_variances_compiles(float64):
 def test_a_compiled_filter_that_cannot_draw_its_noise_says_so_once():
     F, Q, _, _ = linear_system()
     filter = linear_denkf("perturbed", noisy=True)
-    filter.replace("transition", SizeAtTheStep(F, torch.linalg.cholesky(Q)))
+    filter = filter.with_modules(transition=SizeAtTheStep(F, torch.linalg.cholesky(Q)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         out = filter.sequence(readings(2, 3))
@@ -172,7 +172,7 @@ def test_no_false_alarm_for_an_analysis_without_a_mask(case):
     filter = with_analysis(Perturbed())
     if case == "another reads it":
         plain = linear_denkf("perturbed", noisy=True)
-        plain.replace("analysis", linear_denkf("etkf")["analysis"])
+        plain = plain.with_modules(analysis=linear_denkf("etkf")["analysis"])
         second = Perturbed(reading="encoders", info="other")
         second.in_keys[0] = ("belief", "ensemble")
         filter = Filter({**dict(plain.module.items()), "second": second}, initial=plain.initial)

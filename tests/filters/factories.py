@@ -131,7 +131,7 @@ def linear_denkf(scheme="etkf", *, ensemble_size=6, noisy=False, control=None, i
 def believing(threshold, **kwargs):
     """The same, which believes the covariances that are significant."""
     analysis = EnsembleAnalysis("etkf", observation_key="observation", localisation="significance", threshold=threshold)
-    return linear_denkf(**kwargs).replace("analysis", analysis)
+    return linear_denkf(**kwargs).with_modules(analysis=analysis)
 
 
 def linear_with(modules, *, analysis=None, initial=None, **options):

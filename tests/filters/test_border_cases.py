@@ -62,7 +62,7 @@ class MeanIfThere(FixedEnsemble):
 @pytest.mark.parametrize("run", ["initialise", "sequence"])
 def test_a_start_knows_nothing_of_the_belief_that_is_there(run):
     filter = linear_denkf()
-    filter.replace("initial", MeanIfThere(filter.initial.members))
+    filter = filter.with_modules(initial=MeanIfThere(filter.initial.members))
     frames = TensorDict({"observation": torch.randn(3, 5, 2)}, [3, 5]).set(MEAN, torch.ones(3, 5, 2))
     out = filter.sequence(frames)[:, 0] if run == "sequence" else filter.initialise(frames[:, 0])
     assert (out[ENSEMBLE] == filter.initial.members).all()
@@ -115,7 +115,7 @@ def test_keep_returns_what_is_asked_for(float64):
 
 def test_the_covariance_of_an_ensemble_on_request(float64):
     filter = linear_denkf()
-    filter.replace("analysis", EnsembleAnalysis("etkf", observation_key="observation", covariance=True))
+    filter = filter.with_modules(analysis=EnsembleAnalysis("etkf", observation_key="observation", covariance=True))
     frames = TensorDict({"observation": torch.randn(3, 5, 2)}, [3, 5])
     out = filter.sequence(frames)
     deviations = out[ENSEMBLE] - out[MEAN].unsqueeze(-2)
@@ -141,7 +141,7 @@ class Keyed(nn.Module):
 
 def test_freezing_a_network_called_keys_is_noticed():
     filter = linear_denkf()
-    filter.replace("observation", LearnedObservation(Keyed()))
+    filter = filter.with_modules(observation=LearnedObservation(Keyed()))
     filter.compile(chunk=1, backend="eager")
     frames, network = TensorDict({"observation": torch.randn(3, 2, 2)}, [3, 2]), filter["observation"].module.keys
     network.requires_grad_(False)
@@ -165,7 +165,7 @@ def test_guards_that_are_left_out_are_not_about_what_users_change():
 
 
 def test_other_versions_of_torch_get_plain_inductor(monkeypatch, caplog):
-    from torch_denkf import inductor
+    from torch_denkf.compilation import options as inductor
 
     monkeypatch.setattr(torch, "__version__", "3.1.0")
     monkeypatch.setattr(inductor, "_said", False)

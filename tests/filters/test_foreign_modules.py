@@ -59,7 +59,7 @@ class OwnForward(NoisyLinear):
 def test_a_forward_of_its_own_is_what_runs_and_it_finds_its_noise():
     filter, (F, Q, *_) = linear_denkf(), linear_system()
     root = torch.linalg.cholesky(Q)
-    filter.replace("transition", OwnForward(F, root))
+    filter = filter.with_modules(transition=OwnForward(F, root))
     frames, belief, *found = forecasts(filter)
     expected = 3.0 * (belief @ F.mT + frames["noise", "transition"][:, 1] @ root.mT)
     for value in found:
@@ -85,7 +85,7 @@ class Wrapped(SubModel):
 def test_noise_of_a_part_inside_is_found_by_its_place_inside():
     filter, (F, Q, *_) = linear_denkf(), linear_system()
     root = torch.linalg.cholesky(Q)
-    filter.replace("transition", Wrapped(NoisyLinear(F, root)))
+    filter = filter.with_modules(transition=Wrapped(NoisyLinear(F, root)))
     frames, belief, *found = forecasts(filter)
     assert set(frames["noise"].keys()) == {"transition.inner"}
     expected = belief @ F.mT + frames["noise", "transition.inner"][:, 1] @ root.mT

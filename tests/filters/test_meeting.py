@@ -22,6 +22,7 @@ from tests.filters.factories import (
 )
 from torch_denkf.filters import Filter
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.imperfect import RejectReadings
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LinearObservation, SubModel
 from torch_denkf.transforms import DEnKFTransform, LastAction
 
@@ -147,17 +148,10 @@ def test_a_policy_refuses_what_is_not_finite(make):
     frames = TensorDict({"observation": torch.randn(2, 5, 2), "action": torch.zeros(2, 5, 1)}, [2, 5])
     frames["is_init"] = torch.zeros(2, 5, 1, dtype=torch.bool)
     frames["observation"][1, 3, 0] = torch.nan
-    for reject in (False, True):
-        policy = TensorDictSequential(make(reject=reject), ReplayedFrames(frames).player())
-        env = TransformedEnv(ReplayedFrames(frames), get_env_transforms_from_module(policy))
-        if reject:
-            with torch.no_grad():
-                rollout = env.rollout(5, policy)
-            assert rollout[MEAN].isfinite().all()
-            assert rollout["info", "rejected"].sum() == 1
-        else:
-            with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
-                env.rollout(5, policy)
+    policy = TensorDictSequential(make(), ReplayedFrames(frames).player())
+    env = TransformedEnv(ReplayedFrames(frames), get_env_transforms_from_module(policy))
+    with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
+        env.rollout(5, policy)
 
 
 @pytest.mark.parametrize("make", [linear_kalman, linear_denkf])
@@ -183,41 +177,29 @@ def test_readings_of_several_robots_are_not_averaged(make, way):
 class Robust(SubModel):
     """An ensemble update that trusts a reading the less, the further it is from what was predicted."""
 
-    def __init__(self, mask):
+    def __init__(self):
         reads = [("forecast", "ensemble"), ("forecast", "observation"), "observation", ("sensor", "noise")]
         writes = [("belief", name) for name in ("ensemble", "mean", "var")]
-        super().__init__(nn.Identity(), reads, writes, optional_keys=["observed"] if mask else [])
-        self.reading_keys = self.in_keys[2:]
-        if mask == "named":
-            self.observed_key = "observed"
+        super().__init__(nn.Identity(), reads, writes, optional_keys=["observed"])
+        self.reading_keys, self.observed_key = self.in_keys[2:], "observed"
 
     def compute(self, forecast, predicted, reading, variance, observed=None):
         ensemble = analyse(forecast, predicted, reading, variance, scheme="etkf", observed=observed).ensemble
         return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)
 
 
-def robust(mask, **kwargs):
-    return linear_with({}, analysis=Robust(mask), **kwargs)
+def robust():
+    return linear_with({}, analysis=Robust())
 
 
-@pytest.mark.parametrize("mask", [None, "optional"])
-def test_an_analysis_that_does_not_say_its_mask_rejects_nothing_and_is_refused(mask):
-    robust(mask)
-    with pytest.raises(ValueError, match=r"Robust.*self.observed_key = \"observed\""):
-        robust(mask, reject=True)
-    with pytest.raises(ValueError, match="Robust"):
-        DEnKFTransform(robust(mask), check_finite=False)
-
-
-def test_an_analysis_that_says_its_mask_rejects(float64):
-    filter = robust("named", reject=True)
+def test_an_analysis_whose_reading_is_rejected(float64):
     frames = TensorDict({"observation": torch.randn(2, 6, 2)}, [2, 6])
     frames["observation"][0, 3] = torch.nan
     seen = frames["observation"].isfinite()
-    out = filter.sequence(frames.copy())
-    expected = robust("named").sequence(frames.copy().set("observed", seen))
+    out = robust().sequence(RejectReadings({"observation": "observed"})(frames.copy()))
+    expected = robust().sequence(frames.copy().set("observed", seen))
     torch.testing.assert_close(out[MEAN], expected[MEAN], rtol=0, atol=1e-12)
-    assert out["info", "rejected"].sum() == 1  # one for all that an analysis of one's own reads
+    assert out["info", "rejected"].sum() == 1
 
 
 # ------------------------------------------------------------------------------------------- groups that end alone
@@ -297,16 +279,6 @@ def test_a_negative_covariance_is_no_divergence():
         random_walk().step(row)
 
 
-@pytest.mark.parametrize(
-    "mask", [torch.ones(2, 1), torch.ones(2, 3, dtype=torch.bool), torch.ones(2, dtype=torch.bool)]
-)
-def test_with_reject_a_bad_mask_is_named(mask):
-    filter = linear_kalman(reject=True)
-    row = filter.initialise(TensorDict({"observation": torch.ones(2, 2)}, [2])).set("observed", mask)
-    with pytest.raises(ValueError, match="the mask 'observed' must be"):
-        filter.step(row)
-
-
 def test_a_sensor_that_is_none_is_named_as_the_sensor():
     with pytest.raises(TypeError, match=r"^sensor must be a TensorDict module, such as those of .*modules; got"):
         linear_with({"sensor": torch.nn.Linear(2, 2)})
@@ -325,7 +297,6 @@ def test_a_function_in_the_place_of_an_observation_is_told_its_module():
         ({"init_key": b"is_init"}, "init_key of KalmanFilter is a key"),
         ({"control_keys": "action"}, "control_keys of KalmanFilter is a list of keys"),
         ({"prefix": 3}, "prefix of KalmanFilter is a name"),
-        ({"reject": "yes"}, "reject of KalmanFilter is True or False"),
         ({"update_at_reset": 1}, "update_at_reset of KalmanFilter is True or False"),
         ({"observd_key": "seen"}, "KalmanFilter takes no argument 'observd_key'; it takes transition,"),
     ],

@@ -116,7 +116,7 @@ class Halfway(SubModel):
 
 def test_a_prediction_refuses_an_analysis_that_does_not_name_its_reading(float64):
     td = TensorDict({"observation": torch.randn(2)})
-    named, nameless = (linear_denkf().replace("analysis", Halfway(named)) for named in (True, False))
+    named, nameless = (linear_denkf().with_modules(analysis=Halfway(named)) for named in (True, False))
     start = named.initialise(td.clone())
     still = named.predict(start.clone())
     close(still, {MEAN: still["forecast", "ensemble"].mean(-2)}, [MEAN])
@@ -125,7 +125,7 @@ def test_a_prediction_refuses_an_analysis_that_does_not_name_its_reading(float64
 
 
 def test_an_analysis_that_cannot_take_a_past_says_what_to_write(float64):
-    lagged = FixedLag(linear_denkf().replace("analysis", Halfway(True)), lag=2)
+    lagged = FixedLag(linear_denkf().with_modules(analysis=Halfway(True)), lag=2)
     with pytest.raises(RuntimeError, match=r"2 times 2 components: write Halfway.move_past"):
         lagged.sequence(TensorDict({"observation": torch.randn(4, 2)}, [4]))
 
@@ -198,7 +198,7 @@ def test_an_unstable_system_that_nobody_observes_stays_finite_and_comes_back(kin
         else:
             filter = bootstrap(64, initial=prior)
             filter.module["transition"].module = NoisyLinear(F, one)
-            filter.replace("observation", parts["observation"]).replace("noise", parts["noise"])
+            filter = filter.with_modules(observation=parts["observation"]).with_modules(noise=parts["noise"])
     td = filter.initialise(TensorDict({"observation": torch.zeros(1)}))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

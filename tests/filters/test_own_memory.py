@@ -106,7 +106,7 @@ def test_a_belief_around_a_state_is_not_that_state():
     filter = KalmanFilter(
         torch.eye(2), torch.eye(2), process_noise_cov=torch.eye(2), noise_cov=torch.eye(2), mean=state, cov=torch.eye(2)
     )
-    filter.replace("initial", belief)
+    filter = filter.with_modules(initial=belief)
     row = filter.initialise(TensorDict({"state": state}))
     row["belief", "mean"].add_(1.0)
     assert row["state"].tolist() == [1.0, 2.0]

@@ -16,6 +16,7 @@ from torchrl.modules.utils import get_env_transforms_from_module
 from tests.filters.composed import ReplayedFrames
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.imperfect import RejectReadings
 from torch_denkf.modules import EKFAnalysis, LinearTransition, MomentPrior, Select, SubModel
 from torch_denkf.monitoring import BlackIsMissing, Gated, InnovationMonitor, Monitored, MonitoredSensor
 from torch_denkf.transforms import DEnKFTransform
@@ -79,7 +80,6 @@ def build(features):
         initial=MomentPrior(torch.zeros(2), torch.eye(2)),
         lag=3 if has("joint past") else None,
         weights=Doubt() if has("learned weights") else None,
-        reject=has("reject"),
         prefix="robot" if has("prefix") else None,
     ).double()
     if has("gate"):
@@ -282,6 +282,8 @@ def packaged(filter, frames, first, tmp_path):
 def check(features, way, tmp_path=None):
     filter, frames = build(features), frames_for(features)
     expected, start, begin = oracle(features, frames), None, 0
+    if "reject" in features:
+        frames = RejectReadings({"pixels": "camera_observed", "wheel": "wheel_observed"})(frames)
     if "stored belief" in features:
         begin = BEGIN
         start = filter.sequence(frames.copy())[:, begin].select(*filter.belief_keys).clone()

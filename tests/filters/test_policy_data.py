@@ -108,7 +108,7 @@ def test_a_policy_carries_actions_that_need_not_be_there():
             self.in_keys, self.optional_keys = self.in_keys[:1], ["action"]
 
     filter = linear_denkf()
-    filter.replace("transition", Coasting(linear_system()[0], torch.tensor([[0.5], [-1.0]])))
+    filter = filter.with_modules(transition=Coasting(linear_system()[0], torch.tensor([[0.5], [-1.0]])))
     assert ("previous", "action") in filter.make_tensordict_primer().actions.values()
     td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
     coasting = filter.predict(td.copy())["belief", "mean"]
@@ -121,7 +121,7 @@ def test_a_policy_carries_actions_that_need_not_be_there():
 def test_a_reading_that_a_start_does_not_use_may_be_anything(name, update_at_reset):
     """As in a transform. In the other row, and where the first frame is used, it is refused."""
     filter = FILTERS[name]()
-    filter.update_at_reset = update_at_reset
+    filter = filter.with_options(update_at_reset=update_at_reset)
     row = policy_data(filter, anew=(0,))[0][:, 0]
     row["previous", "known"][1] = True
     first, second = row.copy(), row.copy()

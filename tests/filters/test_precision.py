@@ -91,7 +91,7 @@ def test_a_replaced_network_draws_its_own_noise():
     filter["transition"].module = StochasticMLP(3, 3, (16, 16, 4), rate=0.3)
     assert filter.draw_noise(frames.copy())["noise", "transition"].shape[-1] == 36
     assert filter.sequence(frames.copy())[MEAN].isfinite().all()
-    filter.replace("observation", Select([0, 1]))
+    filter = filter.with_modules(observation=Select([0, 1]))
     out = filter.sequence(frames.copy())
     assert out["forecast", "observation"][:, 1:].equal(out["forecast", "ensemble"][:, 1:, :, :2])
 

@@ -22,8 +22,7 @@ MEAN, VAR = ("belief", "mean"), ("belief", "var")
 def named(name, prefix="imu"):
     """A filter of the contract's table, twice: without and with a prefix, under one noise."""
     plain, other = FILTERS[name](), FILTERS[name]()
-    other.prefix = prefix
-    other._sort()  # as its constructor would
+    other = other.with_options(prefix=prefix)
     frames = plain.draw_noise(readings(3, 6))
     return plain, other, frames
 

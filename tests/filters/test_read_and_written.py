@@ -13,6 +13,7 @@ from tests.filters.factories import FixedEnsemble, NoisyLinear
 from tests.filters.test_contract import FILTERS, every_filter
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.imperfect import RejectReadings
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, LinearObservation, SubModel, VectorSensor
 from torch_denkf.monitoring import BlackIsMissing, SignGate
 from torch_denkf.running import reads_of, writes
@@ -144,7 +145,7 @@ def test_black_pictures_and_readings_that_cannot_be_true(float64, where):
     sensor = TensorDictSequential(BlackIsMissing(), OfPicture(plain["sensor"]))
     parts = dict(plain.module.named_children())
     if where == "sequence":
-        filter = Filter({**parts, "sensor": sensor}, initial=plain.initial, reject=True)
+        filter = Filter({**parts, "sensor": sensor}, initial=plain.initial)
     elif where == "DEnKF":
         filter = DEnKF(
             parts["transition"],
@@ -153,12 +154,12 @@ def test_black_pictures_and_readings_that_cannot_be_true(float64, where):
             parts["noise"],
             parts["analysis"],
             initial=plain.initial,
-            reject=True,
         )
     else:
         fused = FusedSensor(parts["observation"], parts["noise"], sensor=sensor)
-        filter = FusedFilter(parts["transition"], {"cam": fused}, initial=plain.initial, reject=True)
-    out = filter.sequence(frames.copy())
+        filter = FusedFilter(parts["transition"], {"cam": fused}, initial=plain.initial)
+    mask = "cam_observed" if where == "FusedSensor" else "observed"
+    out = filter.sequence(RejectReadings({"pixels": mask})(frames.copy()))
     expected = plain.sequence(frames.copy().set("seen", seen))
     torch.testing.assert_close(out["belief", "mean"], expected["belief", "mean"], rtol=0, atol=1e-12)
     assert out["info", "rejected"].flatten().tolist() == [0] * 9 + [1, 0, 0]

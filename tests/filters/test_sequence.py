@@ -269,7 +269,7 @@ def test_gradients_reach_every_sub_model_through_50_steps(scheme, layer):
 @pytest.mark.parametrize("layer", ["dropout", "flipout"])
 def test_a_stochastic_observation_model_draws_its_own_noise(float64, layer):
     filter = toy_denkf()
-    filter.replace("observation", LearnedObservation(StochasticMLP(S, OBS, (8,), layer=layer, rate=0.5)))
+    filter = filter.with_modules(observation=LearnedObservation(StochasticMLP(S, OBS, (8,), layer=layer, rate=0.5)))
     frames = filter.draw_noise(toy_frames((2, 5)))  # for whole chunks
     assert frames.get(("noise", "observation"), None) is not None
     first = filter.sequence(frames.copy())

@@ -51,7 +51,7 @@ def test_members_that_are_not_held_do_not_move_by_a_bit():
     F = torch.diag(torch.tensor([1.7, 0.9]))
     held, free = linear_denkf(variance_ceiling=5.0), linear_denkf(variance_ceiling=None)
     for filter in (held, free):
-        filter.replace("transition", NoisyLinear(F))
+        filter = filter.with_modules(transition=NoisyLinear(F))
     td = free.initialise(unseen(2))
     td[ENSEMBLE] = td[ENSEMBLE] / 7 + torch.tensor([1.0, 1 / 3])
     td[ENSEMBLE][1, :, 0] *= 20.0
@@ -84,5 +84,5 @@ def test_a_compiled_filter_holds_it_and_says_so_once(sequence):
 def test_a_ceiling_that_changes_after_compiling_is_noticed():
     filter = kalman(1e12, torch.diag(torch.tensor([399.0, 24.0]))).compile(chunk=2, backend="eager")
     assert filter.sequence(unseen(4))[VAR][-1, 0] > 400.0
-    filter.variance_ceiling = 100.0
+    filter = filter.with_options(variance_ceiling=100.0)
     torch.testing.assert_close(filter.sequence(unseen(4))[VAR][-1], torch.tensor([100.0, 27.0]))

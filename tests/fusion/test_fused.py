@@ -15,12 +15,11 @@ from torch.testing import assert_close
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check
 from torch_denkf.filters import EKF, DEnKF, Filter, KalmanFilter
-from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
 from torch_denkf.fusion.parts import JoinedReading
-from torch_denkf.imperfect import FadingBias
+from torch_denkf.imperfect import FadingBias, RejectReadings
 from torch_denkf.modules import (
     CholeskyNoise,
     ConstantNoise,
@@ -355,7 +354,7 @@ def test_an_update_at_reset_sees_the_first_frame_and_no_late_one(float64, kind):
     late, order = arriving(frames, PATTERNS["three steps late"]), frames.copy()
     order["second_observed"] = order["second_observed"].clone()
     order["second_observed"][:, -DELAY:] = False
-    plain.update_at_reset = True
+    plain = plain.with_options(update_at_reset=True)
     expected = plain.sequence(order)
     F, Q, _, _ = linear_system()
     motion = LinearTransition(F, Q) if kind == "Kalman" else NoisyLinear(F)
@@ -374,8 +373,7 @@ def test_readings_that_cannot_be_true_count_once_and_change_nothing(float64, kin
     members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
     given = {"members": members, "noisy": False} if kind == "ensemble" else {}
     filter = fused(kind, joint=joint, delay=delay, **given)
-    filter.reject = True
-    filter._sort()  # as its constructor would
+    reject = RejectReadings({"first": "first_observed", "second": "second_observed"})
     broken = frames.copy()
     broken["second"] = frames["second"].clone()
     broken["second_observed"][:, 4:6] = True
@@ -383,10 +381,11 @@ def test_readings_that_cannot_be_true_count_once_and_change_nothing(float64, kin
     hidden = frames.copy()
     hidden["second_observed"] = frames["second_observed"].clone()
     hidden["second_observed"][:, 4:6] = False
-    outs = [filter.sequence(value.copy()) for value in (broken, hidden)]
+    outs = [filter.sequence(value.copy()) for value in (reject(broken), hidden)]
     assert_close(outs[0]["belief", "mean"], outs[1]["belief", "mean"], rtol=0, atol=0)
-    assert (outs[0][REJECTED][:, 4:6] == 1).all()
-    assert outs[0][REJECTED].sum() == 2 * B
+    count = outs[0]["info", "rejected"]
+    assert (count[:, 4:6] == 1).all()
+    assert count.sum() == 2 * B
 
 
 @pytest.mark.parametrize("joint", [False, True])

@@ -147,7 +147,7 @@ def test_what_is_refused(float64):
     frames["is_init"][:, 4] = True
     with pytest.raises(ValueError, match="cut it there"):
         Refiltering(filter, LATE, DELAY).sequence(frames)
-    filter.update_at_reset = True
+    filter = filter.with_options(update_at_reset=True)
     with pytest.raises(ValueError, match="update_at_reset"):
         Refiltering(filter, LATE, DELAY)
 

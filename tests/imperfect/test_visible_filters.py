@@ -49,7 +49,7 @@ CERTAIN = [name for name in MAKERS if name != "particles"]  # these resample whe
 
 def heeds(filter):
     """The filter, whose update heeds p from the data."""
-    return filter.replace("analysis", Visible(filter["analysis"], visible_key="visible"))
+    return filter.with_modules(analysis=Visible(filter["analysis"], visible_key="visible"))
 
 
 def frames(*batch):
@@ -94,7 +94,7 @@ def test_a_start_in_the_middle_is_a_start(float64, name):
 def test_it_goes_through_an_environment(float64, name):
     filter, td = heeds(MAKERS[name]()), frames(2, 6)
     td["action"] = torch.zeros(2, 6, 1)
-    env = TransformedEnv(ReplayedFrames(td), DEnKFTransform(heeds(MAKERS[name]()), check_finite=False))
+    env = TransformedEnv(ReplayedFrames(td), DEnKFTransform(heeds(MAKERS[name]())))
     out = env.rollout(5, auto_reset=True)["next"]
     whole = filter.sequence(td.copy())
     for key in (("belief", "mean"), ("belief", "var")):

@@ -10,6 +10,7 @@ from torch import nn
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.imperfect import RejectReadings
 from torch_denkf.modules import EnsembleAnalysis, LinearObservation, SubModel
 from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import EnRTS, FixedLag
@@ -48,22 +49,13 @@ def late(analysis):
     )
 
 
-def rejecting(filter):
-    return type(filter)(
-        *(filter[name] for name in ("transition",)),
-        None,
-        *(filter[name] for name in ("observation", "noise", "analysis")),
-        initial=filter.initial,
-        reject=True,
-    )
-
-
+REJECT = RejectReadings({"observation": "observed"})
 WAYS = {
     "as it is": lambda filter: filter.sequence,
     "lagged": lambda filter: FixedLag(filter, 3).sequence,
     "gated": lambda filter: Gated(filter, 2, response="reject", window=1, rate=0.3).sequence,
     "gated and lagged": lambda filter: FixedLag(Gated(filter, 2, rate=0.3, adapt_noise=0.1), 2).sequence,
-    "rejected": lambda filter: rejecting(filter).sequence,
+    "rejected": lambda filter: lambda data: filter.sequence(REJECT(data)),
     "smoothed": EnRTS,
     "predicted": lambda filter: lambda data: filter.predict(filter.initialise(data[:, 0])),
 }
@@ -80,7 +72,7 @@ def data(float64):
 def test_it_gives_what_ours_gives(data, way):
     if way == "rejected":
         data["observation"][1, 4] = torch.nan
-    ours, own = (WAYS[way](linear_denkf(ensemble_size=8).replace("analysis", part)) for part in both())
+    ours, own = (WAYS[way](linear_denkf(ensemble_size=8).with_modules(analysis=part)) for part in both())
     expected, out = ours(data.clone()), own(data.clone())
     keys = [key for key in expected.keys(True, True) if expected[key].is_floating_point()]
     assert ("belief", "mean") in keys

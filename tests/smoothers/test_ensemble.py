@@ -19,6 +19,7 @@ from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.smoothing.ensemble import enrts_smooth, enrts_step
+from torch_denkf.imperfect import RejectReadings
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
@@ -249,11 +250,11 @@ def test_what_cannot_be_smoothed_says_so():
 
 @pytest.mark.parametrize("smoother", [lambda f: FixedLag(f, 2), lambda f: EnKS(f, 2), EnRTS, RTSSmoother])
 def test_rejected_readings_are_missing_ones(float64, smoother):
-    filter = (linear_kalman if smoother is RTSSmoother else linear_denkf)(reject=True)
+    filter = (linear_kalman if smoother is RTSSmoother else linear_denkf)()
     frames = drive(2, 7, missing=0.0, resets=False)
     masked = frames.copy()
     masked["observed"] = frames["observed"].clone()
     masked["observed"][:, 3, 0] = False
     frames["observation"][:, 3, 0] = torch.nan
-    made = smoother(filter)
-    assert made.sequence(frames)["smoothed", "mean"].equal(made.sequence(masked)["smoothed", "mean"])
+    made, reject = smoother(filter), RejectReadings({"observation": "observed"}, by_component=["observation"])
+    assert made.sequence(reject(frames))["smoothed", "mean"].equal(made.sequence(masked)["smoothed", "mean"])

@@ -48,7 +48,7 @@ def test_online_lag_says_it_that_much_later(float64, name):
 def test_an_update_at_the_first_frame_counts_for_the_past_too(float64, name):
     frames = drive(3, 6, resets=False, missing=0.0)
     filter = make(name)
-    filter.update_at_reset = True
+    filter = filter.with_options(update_at_reset=True)
     whole = RTSSmoother(filter)(frames.copy())
     online = FixedLag(filter, 5).sequence(frames.copy())
     assert_close(online["smoothed", "mean"][:, -1], whole["smoothed", "mean"][:, 0], rtol=0, atol=1e-10)

@@ -133,7 +133,7 @@ def filter_stage(filter, spoil, updates=6):
     return Stage("fit", GaussianLoss(filter, state=1.0), sample, updates, lr=0.01)
 
 
-def test_readings_that_a_filter_refuses_are_left_out_and_said_once(tmp_path, caplog):
+def test_updates_with_readings_that_are_not_finite_are_left_out_and_said_once(tmp_path, caplog):
     filter, twin = small_filter(), small_filter()
     twin.load_state_dict(filter.state_dict())
     trainer = FilterTrainer(filter, [filter_stage(filter, (1, 2, 4))], out=tmp_path / "a", device="cpu", log_every=3)
@@ -153,7 +153,7 @@ def test_readings_that_a_filter_refuses_are_left_out_and_said_once(tmp_path, cap
         torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
-def test_too_many_refused_in_a_row_end_it_with_the_key(tmp_path):
+def test_too_many_such_updates_in_a_row_end_it_with_the_key(tmp_path):
     filter = small_filter()
     trainer = FilterTrainer(
         filter, [filter_stage(filter, range(2, 20), 20)], out=tmp_path, device="cpu", save_every=1, max_skipped=3

@@ -22,6 +22,7 @@ from tests.transforms.envs_for_tests import (
     toy_base_env,
     toy_filter,
 )
+from torch_denkf.imperfect import RejectReadings
 from torch_denkf.transforms import DEnKFTransform
 
 
@@ -57,15 +58,17 @@ def test_unobserved_nan_changes_nothing(make_base, make_filter):
 def test_observed_nan_raises_and_names_the_key(make_base, make_filter):
     filter = make_filter()
 
-    def make(honest=False, **kwargs):
-        transforms = Compose(break_observation(honest), DEnKFTransform(filter, **kwargs))
+    def make(*transforms, honest=False):
         torch.manual_seed(1)
-        return TransformedEnv(make_base(batch_size=[3]), transforms)
+        return TransformedEnv(
+            make_base(batch_size=[3]), Compose(break_observation(honest), *transforms, DEnKFTransform(filter))
+        )
 
     assert make().rollout(2).shape == (3, 2)
-    assert_refused(ValueError, r"NaN or infinity in \['observation'\].*'observed'", make().rollout, 8)
-    # Without the check such a reading counts as missing: the beliefs are those under a mask that tells the truth.
-    assert_equal(make(check_finite=False).rollout(8)["next"], make(honest=True).rollout(8)["next"], BELIEF)
+    assert_refused(ValueError, r"NaN or infinity in \['observation'\].*RejectReadings", make().rollout, 8)
+    # Where such a reading is rejected the beliefs are those under a mask that tells the truth.
+    reject = RejectReadings({"observation": "observed"})
+    assert_equal(make(reject).rollout(8)["next"], make(honest=True).rollout(8)["next"], BELIEF)
 
 
 def test_nan_at_reset_with_an_update_there():

@@ -51,7 +51,7 @@ class LSTMFilter(Filter):
         update_at_reset: see :class:`Filter`; not with ``motion``: nothing moves into the first frame.
         **kwargs: passed on to :class:`~torch_denkf.baselines.lstm_cell.LSTMUpdate`: ``extra_keys`` and
             ``extra_features``, ``floor``, ``observation_loc``, ``observation_scale``, ``observed_key``; and
-            ``variance_ceiling``, ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
+            ``variance_ceiling``, ``check_finite`` and ``prefix`` of :class:`Filter`.
 
     Raises:
         ValueError: if there is a ``motion`` and no ``initial``, or ``update_at_reset``.

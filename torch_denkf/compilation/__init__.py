@@ -1,4 +1,4 @@
-"""What knows torch's compiler: its passes, the tracing of packages, and what compares compiled with eager numbers.
+"""Compilation: a strategy that runs steps compiled, inductor's passes, tracing of packages, comparison with eager.
 
 It is the only room for torch's private names.
 
@@ -7,99 +7,11 @@ little. The passes make no result right that is wrong without them. They are use
 were tested with; with others inductor runs as it is.
 """
 
-from __future__ import annotations
-
-import logging
-import re
-from collections.abc import Sequence
-from typing import Any
-
-import torch
-
-from torch_denkf.compilation.compared import placed as placed
 from torch_denkf.compilation.compared import refuse_other_numbers as refuse_other_numbers
-from torch_denkf.compilation.compared import tensors as tensors
+from torch_denkf.compilation.compiled import CompiledSteps as CompiledSteps
 from torch_denkf.compilation.libraries import clear_damaged_libraries as clear_damaged_libraries
 from torch_denkf.compilation.libraries import clear_full_cache as clear_full_cache
+from torch_denkf.compilation.options import need_compiler as need_compiler
+from torch_denkf.compilation.options import options_for_processors as options_for_processors
+from torch_denkf.compilation.options import worth_checking as worth_checking
 from torch_denkf.compilation.tracing import trace_below_autograd as trace_below_autograd
-
-#: Versions of torch, by their first two numbers, that the passes were tested with.
-TESTED_VERSIONS = ("2.13", "2.15")
-
-_LOG = logging.getLogger("torch_denkf")
-_said = False
-
-
-def options_for_processors() -> dict[str, Any]:
-    """Options of ``torch.compile`` for small steps on a processor."""
-    global _said
-    version = ".".join(torch.__version__.split(".")[:2])
-    if version in TESTED_VERSIONS:
-        try:
-            from torch_denkf.compilation.kernels import FewCalls
-            from torch_denkf.compilation.partition import FewSavedTensors
-            from torch_denkf.compilation.scheduling import ShortFunctions
-
-            return {
-                "cpp_wrapper": True,
-                "custom_partitioner_fn": FewSavedTensors(),
-                "post_grad_custom_post_pass": FewCalls(),
-                "_post_fusion_custom_pass": ShortFunctions(),
-                "guard_filter_fn": worth_checking,
-            }
-        except ImportError as error:
-            reason = f"could not be imported ({error})"
-    else:
-        reason = f"were tested with torch {', '.join(TESTED_VERSIONS)}"
-    if not _said:
-        _said = True
-        _LOG.warning("torch_denkf's passes %s; this is torch %s, so plain inductor compiles.", reason, version)
-    return {"cpp_wrapper": True}
-
-
-def worth_checking(guards: Sequence) -> list[bool]:
-    """What torch.compile checks before each call: all that a user may change. The rest takes longer than a step.
-
-    Tensors (also parameters: their type, whether they are trained), types, numbers and names that modules hold stay.
-    What torch and this package define, a module's keys (part of what a function is kept under) and hooks do not.
-    """
-
-    def may_change(guard) -> bool:
-        name = guard.name
-        if guard.is_global:
-            return not name.startswith(("G['torch", "G['__import_torch", "G['__builtins", "G['___unnamed"))
-        never = ("EMPTY_NN_MODULE_HOOKS_DICT", "NOT_PRESENT_IN_GENERIC_DICT", "DICT_NOT_CONTAINS")
-        if guard.guard_type in never or name.split("[")[0] in _CLOSED_OVER or name.startswith(_OF_CLASSES):
-            return False
-        path = re.findall(r"\w+", name)
-        return _KEYS.isdisjoint(path) and not (path[:2] == ["steps", "structure"] and path[2:3] not in _MODULES)
-
-    return [may_change(guard) for guard in guards]
-
-
-#: What the compiled functions close over, and never changes.
-_CLOSED_OVER = ("writes", "batch", "cuts", "first", "keep", "keys", "start_keys", "steps")
-#: Attributes that hold the names of entries.
-_KEYS = frozenset({"in_keys", "_in_keys", "out_keys", "_out_keys_apparent", "optional_keys", "reading_keys", "_wants"})
-#: Where a filter's structure holds modules; all else in it are names.
-_MODULES = (["frames"], ["transition"], ["update"])
-#: What is looked up in classes.
-_OF_CLASSES = ("dict(type(", "dict(G[", "type(")
-
-
-def need_compiler() -> None:
-    """Checks that inductor finds a C++ compiler.
-
-    Raises:
-        RuntimeError: if it does not; the message says what to install.
-    """
-    from torch._inductor.cpp_builder import get_cpp_compiler
-    from torch._inductor.exc import InvalidCxxCompiler
-
-    try:
-        get_cpp_compiler()
-    except InvalidCxxCompiler as error:
-        raise RuntimeError(
-            "Compiling a filter needs a C++ compiler (Debian: apt install g++; or set CXX to one); without, leave out "
-            "filter.compile(), or pass compiled=False to export_step."
-        ) from error

@@ -23,7 +23,6 @@ from torch_denkf.compilation import (
 from torch_denkf.deployment.onnx_model import need_onnx, onnx_model
 from torch_denkf.deployment.package import SIGNATURE, run_onnx
 from torch_denkf.filters import Filter
-from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.submodel import Entries
 
 Format = Literal["pt2", "onnx"]
@@ -66,8 +65,8 @@ def export_step(
     ONNX lacks factors of matrices. Small systems are written out: readings of up to 4 numbers, and covariances of up to
     6 x 6. What remains is refused by the name of its operator.
 
-    A package cannot raise. That of a filter with ``reject=True`` counts readings that are not finite as missing, and
-    returns their number, ``"info.rejected"``; that of another one has a belief of NaN from then on.
+    A package cannot raise: after a reading that is not finite its belief is NaN from then on. Put a mask into
+    ``example``, and set it to ``False`` for such readings.
 
     What the package returns for the example is compared with the eager step, see
     :meth:`~torch_denkf.filters.Filter.compile`; with noise in the example number by number, otherwise within what the
@@ -126,15 +125,15 @@ def export_step(
     if any(example.get(key, None) is None for key in filter.carry_keys):
         example = filter.initialise(example.copy())
     structure = filter.structure
-    inner = {filter.outer(key): key for key in (*structure.frame_keys, *filter.steps().step_keys)}
+    inner = {filter.outer(key): key for key in (*structure.frame_keys, *structure.step_keys)}
     asked = [inner.get(key, key) for key in map(unravel_key, out_keys)]
-    out_keys = list(dict.fromkeys([*structure.carry, *structure.belief, *asked, *[REJECTED] * filter.reject]))
+    out_keys = list(dict.fromkeys([*structure.carry, *structure.belief, *asked]))
     unknown = [key for key in out_keys if key not in inner.values()]
     if unknown:
         raise ValueError(f"the filter does not write {unknown}; it writes {list(inner)}")
     entries = filter.entries_of(example, one_step=True)
     if format == "onnx":
-        entries |= filter.missing_noise(entries, example.batch_size, structure.modules)[0]
+        entries |= filter.missing_noise(entries, example.batch_size)
     in_keys = _inputs(filter, entries, example)
     # Not parts of one another, whose strides the graph would hold.
     values = tuple(entries[key].clone(memory_format=torch.contiguous_format) for key in in_keys)

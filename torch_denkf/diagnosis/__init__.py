@@ -1,7 +1,25 @@
-"""Diagnosis: checks of an analysis of one's own, warnings, signs of a collapsed ensemble."""
+"""Diagnosis: observers of a filter that warn or raise, and checks of an analysis of one's own.
 
+A filter calls its ``observers`` with itself and a :class:`~torch_denkf.filters.finish.Record` of each run.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch_denkf.diagnosis.ceiling import CeilingReached
 from torch_denkf.diagnosis.check import check_analysis
+from torch_denkf.diagnosis.collapse import NarrowEnsemble
+from torch_denkf.diagnosis.composition import check_composition as check_composition
+from torch_denkf.diagnosis.masks import UnreadMasks
+from torch_denkf.diagnosis.policy import PolicyStart
+from torch_denkf.diagnosis.shapes import ReadingRanks
 
 __all__ = [
     "check_analysis",
 ]
+
+
+def default_observers() -> list[Any]:
+    """Returns the observers that a new filter has."""
+    return [ReadingRanks(), UnreadMasks(), CeilingReached(), NarrowEnsemble(), PolicyStart()]

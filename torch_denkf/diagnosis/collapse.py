@@ -1,4 +1,4 @@
-"""What a filtered sequence tells of an ensemble that has become too narrow for its readings."""
+"""Warns where an ensemble has become too narrow for its observations."""
 
 from __future__ import annotations
 
@@ -6,39 +6,44 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import flag_value
-from torch_denkf.diagnosis.messages import Messages
-from torch_denkf.filters.structure import Structure
+from torch_denkf.diagnosis.once import Once
+from torch_denkf.filters.base import Filter
+from torch_denkf.filters.finish import Record
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.running import in_sequences
 from torch_denkf.submodel import Entries
 
-__all__ = ["say_collapse"]
+__all__ = ["NarrowEnsemble"]
 
 #: Readings of the second half of a sequence that it takes, and how far the median one lies off, in standard deviations.
 _READINGS, _FAR = 20, 4.0
 
 
-def say_collapse(messages: Messages, structure: Structure, outputs: Entries) -> None:
-    """Warns once of each update whose readings mostly lie far outside of what the ensemble expects.
+class NarrowEnsemble(Once):
+    """Warns once of each update whose observations mostly lie far outside of what the ensemble expects.
 
-    The median is looked at, which outliers do not move, and the second half of the steps, when a wrong start is over.
-
-    Args:
-        messages: of the filter.
-        structure: of the filter.
-        outputs: what it wrote on ``[*B, T]``; updates whose diagnostics are not kept are not looked at.
+    It looks at sequences without gradients: at the median, which outliers do not move, of the second half of the
+    steps, when a wrong start is over.
     """
-    for place, module in structure.update:
-        for part in in_sequences(module):
-            if isinstance(part, EnsembleUpdate):
-                keys = [(part.info_prefix, name) for name in ("nis", "innovation")]
-                nis, innovation = (outputs.get(structure.own_info.get(place, {}).get(key, key)) for key in keys)
-                if nis is not None and innovation is not None and not nis.is_cuda:
-                    _say(messages, place, part, outputs, nis, innovation)
+
+    ways = ("sequence",)
+
+    def __call__(self, filter: Filter, record: Record) -> None:
+        """Looks at innovations; updates whose diagnostics are not kept are not looked at."""
+        if torch.is_grad_enabled():
+            return
+        structure, outputs = filter.structure, record.written
+        for place, module in structure.update:
+            for part in in_sequences(module):
+                if isinstance(part, EnsembleUpdate):
+                    keys = [(part.info_prefix, name) for name in ("nis", "innovation")]
+                    nis, innovation = (outputs.get(structure.own_info.get(place, {}).get(key, key)) for key in keys)
+                    if nis is not None and innovation is not None and not nis.is_cuda:
+                        _look(self, place, part, outputs, nis, innovation)
 
 
-def _say(
-    messages: Messages, place: str, module: EnsembleUpdate, outputs: Entries, nis: Tensor, innovation: Tensor
+def _look(
+    messages: Once, place: str, module: EnsembleUpdate, outputs: Entries, nis: Tensor, innovation: Tensor
 ) -> None:
     late = nis.shape[-2] // 2
     seen = (innovation != 0).sum(-1)[..., late:]
@@ -55,7 +60,7 @@ def _say(
         most = int(told.abs().nan_to_num().argmax())
         spread = float(members.std(0)[most])
         component = f" Number {number} tells most of component {most} of the state, of standard deviation {spread:.2g}."
-    messages.once(
+    messages.warn(
         f"narrow at {place!r}",
         f"The ensemble is too narrow for the readings {module.in_keys[2]!r} at place {place!r}: half of them lie more "
         f"than {float(median):.1f} standard deviations from what it expects.{component} Chance correlations of "

@@ -23,7 +23,7 @@ class GaussianOptions(FilterOptions, total=False):
     """What the filters with a mean, a covariance and a learned sensor take beside their models.
 
     They also take ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
-    ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
+    ``check_finite`` and ``prefix`` of :class:`Filter`.
 
     Attributes:
         inflation: factor on the belief's standard deviations, where anything is observed; 1 by default. What is never

@@ -11,11 +11,10 @@ Nothing is kept on ``self`` between steps: the belief lives in the tensordict.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
-from functools import partial
-from importlib import import_module
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import copy
 from itertools import chain
-from typing import Any, cast
+from typing import Any, Unpack, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -27,18 +26,12 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from torch_denkf._arguments import Checked
-from torch_denkf._checks import check_count, check_number
+from torch_denkf._checks import check_count
+from torch_denkf._registered import compiler, diagnosis, primers
 from torch_denkf._slices import as_rows, starts_of
-from torch_denkf.filters.finish import (
-    own,
-    refuse_far_belief,
-    refuse_non_finite,
-    without_absurd_readings,
-    write,
-)
-from torch_denkf.filters.gather import gather_rows
-from torch_denkf.filters.gather import of_one_robot as _of_one_robot
-from torch_denkf.filters.noise import draw_noise
+from torch_denkf.filters.finish import Record, check_belief, own
+from torch_denkf.filters.gather import gather_rows, of_one_robot
+from torch_denkf.filters.noise import Drawn, draw_noise, recorded_draws
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.filters.refusals import (
     check_inputs,
@@ -46,17 +39,19 @@ from torch_denkf.filters.refusals import (
     refuse_nameless_readings,
     refuse_single_readings,
     refuse_two_precisions,
-    refuse_unguarded,
     refuse_unknown_noise,
     refuse_unknown_readings,
 )
 from torch_denkf.filters.scan import Steps, where_rows
-from torch_denkf.filters.structure import KNOWN, Structure, previous_key, sequences_in, submodels
-from torch_denkf.modules._summaries import summaries
-from torch_denkf.running import check_module, declared, named_modules_of, reads, run_module
+from torch_denkf.filters.structure import KNOWN, Structure, previous_key, submodels
+from torch_denkf.modules.variance_ceiling import VarianceCeiling
+from torch_denkf.running import check_module, declared, named_modules_of, random_parts, reads, run_module
 from torch_denkf.submodel import Call, Entries, flat_noise
 
 __all__ = ["Filter"]
+
+#: Sees each run of a filter before anything is written; it may warn, count, or raise.
+Observer = Callable[["Filter", Record], None]
 
 
 class Filter(Checked, TensorDictSequential):
@@ -91,13 +86,11 @@ class Filter(Checked, TensorDictSequential):
             counts, too.
         update_at_reset: whether the initial belief is updated with the first frame.
         forecast_keys: the forecast of each carried entry, where it cannot be told by its name.
-        variance_ceiling: the belief's variances are held at it, so that an unstable system that nobody observes stays
-            finite, with one warning; in the state's units squared. ``None`` for no ceiling.
-        check_finite: whether a reading that is not finite, or larger than 1e18 in whatever unit, raises; and in a step
-            a belief that is not finite. In a sequence the NaN of a belief that diverges goes on to its end.
-        reject: whether such readings count as not observed, in steps, sequences, compiled and packaged, and
-            ``("info", "rejected")`` ``[*B, 1]`` counts them: each component of a vector that an update reads itself,
-            and one for all that a sensor reads. What shares a mask is rejected together.
+        variance_ceiling: the belief's variances are clamped to it, so that an unstable system that nobody observes
+            stays finite, with one warning; in the state's units squared. ``None`` for no ceiling.
+        check_finite: whether a step raises where its new belief is not finite. In a sequence the NaN of a belief that
+            diverges goes on to its end. Readings are checked, or rejected, by
+            ``torch_denkf.imperfect.RejectReadings`` in front of the filter.
         prefix: name under which all stands that the filter writes, carries on or finds as noise: with ``"imu"`` the
             mean is ``("imu", "belief", "mean")``. Two filters of one environment or policy need one. ``None`` for none.
 
@@ -139,7 +132,6 @@ class Filter(Checked, TensorDictSequential):
         forecast_keys: Mapping[NestedKey, NestedKey] | None = None,
         variance_ceiling: float | None = 1e12,
         check_finite: bool = True,
-        reject: bool = False,
         prefix: str | None = None,
     ):
         if len(modules) == 1 and isinstance(modules[0], Mapping):
@@ -154,28 +146,33 @@ class Filter(Checked, TensorDictSequential):
         self.initial = initial
         self.init_key = unravel_key(init_key)
         self.control_keys = [unravel_key(key) for key in control_keys]
-        self.update_at_reset, self.forecast_keys = update_at_reset, dict(forecast_keys or {})
-        if variance_ceiling is not None:
-            check_number("variance_ceiling", variance_ceiling, above=0, cure="None is for no ceiling")
-        self.variance_ceiling, self.check_finite, self.reject = variance_ceiling, check_finite, reject
+        self.forecast_keys, self.check_finite = dict(forecast_keys or {}), check_finite
+        self._options: dict[str, Any] = {
+            "update_at_reset": update_at_reset,
+            "variance_ceiling": variance_ceiling,
+            "prefix": prefix,
+        }
         if prefix == "next":
             raise ValueError('prefix="next" is where torchrl keeps the next step: give the filter another name')
-        self.prefix = prefix
         self.compiled: Any = None
-        self.messages = import_module("torch_denkf.diagnosis.messages").Messages(type(self).__name__)
+        #: Called with the filter and a :class:`Record` of each run, before anything is written.
+        self.observers: list[Observer] = diagnosis().default_observers()
         refuse_two_precisions(self)
         self._sort()
 
     def _sort(self) -> None:
-        """Sorts the modules, and says what they read and write."""
-        structure = Structure.of(named_modules_of(self), self.initial, self.control_keys, self.forecast_keys)
-        if self.reject:
-            refuse_unguarded(structure, type(self).__name__)
-        self.structure = structure
-        places = [sequence.module._modules for sequence in sequences_in(self)]
-        self._sorted = [(modules, tuple(modules.values())) for modules in places]
-        self._sorted_with = (self.initial, self.reject, self.prefix)
-        written = [*structure.frame_keys, *self.steps().step_keys]
+        """Sorts the modules, and looks up once what each run reads and writes."""
+        modules = named_modules_of(self)
+        structure = Structure.of(modules, self.initial, self.control_keys, self.forecast_keys)
+        diagnosis().check_composition(modules, structure)
+        if self.variance_ceiling is not None:
+            ceiling = VarianceCeiling(structure.kinds, structure.belief, self.variance_ceiling)
+            structure = structure._replace(posterior=(*structure.update, ("variance_ceiling", ceiling)))
+        self.structure, self.steps = structure, Steps(structure, self.update_at_reset)
+        self._drawn: dict[tuple, Drawn] = {}
+        placed = (*modules, ("initial", self.initial))
+        self._random = [found for place, module in placed for found in random_parts(module, place)]
+        written = structure.out_keys
         self._own_keys = {*written, *map(unravel_key, self.initial.out_keys)}
         self.in_keys = [self.outer(key) for key in structure.in_keys(self.init_key)]
         self.out_keys = [self.outer(key) for key in written]
@@ -184,58 +181,85 @@ class Filter(Checked, TensorDictSequential):
         a_step = [*structure.needed, *structure.optional, *structure.controls, *structure.carry]
         self._all_keys, self._step_keys = ({key: self.outer(key) for key in keys} for keys in (everything, a_step))
 
-    def replace(self, place: str, module: TensorDictModuleBase) -> Filter:
-        """Puts a module in the place of another one, and sorts the modules anew.
+    @property
+    def update_at_reset(self) -> bool:
+        """Whether the initial belief is updated with the first frame."""
+        return self._options["update_at_reset"]
 
-        Keys, spaces and inflation are those of the new module: give it what the old one had. A mask that is read no
-        more is said.
+    @property
+    def variance_ceiling(self) -> float | None:
+        """Ceiling of the belief's variances."""
+        return self._options["variance_ceiling"]
+
+    @property
+    def prefix(self) -> str | None:
+        """Name under which the filter's own entries stand."""
+        return self._options["prefix"]
+
+    def with_options(self, **options: Unpack[FilterOptions]) -> Filter:
+        """Returns a filter of the same modules with other options, see the class.
+
+        Example:
+            >>> from torch_denkf.filters import KalmanFilter
+            >>> one = torch.eye(1)
+            >>> kf = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
+            >>> kf.with_options(prefix="imu").carry_keys
+            [('imu', 'belief', 'mean'), ('imu', 'belief', 'cov')]
+        """
+        new = _shallow(self)
+        new._options = {**self._options}
+        for name, value in options.items():
+            if name in new._options:
+                new._options[name] = value
+            else:
+                setattr(new, name, value)
+        return new._renewed(self)
+
+    def with_modules(
+        self, modules: Mapping[str, TensorDictModuleBase] | None = None, /, **others: TensorDictModuleBase
+    ) -> Filter:
+        """Returns a filter with other modules in some places; all else is shared with this one.
+
+        Keys, spaces and inflation are those of the new modules: give them what the old ones had.
 
         Args:
-            place: name or number of the module; of one inside a sequence both names, ``"second.1"``; ``"initial"`` for
-                the initial belief.
-            module: the new one.
-
-        Returns:
-            This filter.
+            modules: new modules by name or number of their place; of one inside a sequence both names, ``"second.1"``;
+                ``"initial"`` for the initial belief.
+            **others: the same, by name.
 
         Raises:
             KeyError: if there is no such place.
-            TypeError: if ``module`` is no TensorDict module.
-            ValueError: if the new module does not fit the others. The old one then stays.
+            TypeError: if one is no TensorDict module.
+            ValueError: if a new module does not fit the others.
 
         Example:
             >>> from torch_denkf.filters import KalmanFilter
             >>> from torch_denkf.modules import KalmanAnalysis
             >>> one = torch.eye(1)
             >>> kf = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
-            >>> kf.replace("analysis", KalmanAnalysis(one, 4 * one)).module["analysis"].noise
-            tensor([[4.]])
+            >>> other = kf.with_modules(analysis=KalmanAnalysis(one, 4 * one))
+            >>> kf["analysis"].noise, other["analysis"].noise
+            (tensor([[1.]]), tensor([[4.]]))
         """
-        check_module("module", module)
-        *path, name = place.split(".")
-        try:
-            sequences = (f"{step}.module" for step in path)
-            where = self if place == "initial" else self.get_submodule(".".join(["module", *sequences]))
-            old = where.get_submodule(name)
-        except AttributeError:
-            names = [name for name, _ in named_modules_of(self)]
-            raise KeyError(f"{type(self).__name__} has no module at {place!r}; it has {names}.") from None
-        mask = declared(old).observed_key
-        other = declared(module).observed_key
-        if None not in (mask, other) and mask not in chain(*reads(module)):
-            self.messages.once(
-                f"mask of {place!r}",
-                f"{type(old).__name__} at {place!r} reads the mask {mask!r}, and {type(module).__name__} reads "
-                f"{other!r}: readings that the first hides will count. Give the new module observed_key={mask!r}, "
-                "unless that is meant.",
-            )
-        setattr(where, name, module)
-        try:
-            self._sort()
-        except ValueError:
-            setattr(where, name, old)
-            self._sort()
-            raise
+        new = _shallow(self)
+        for place, module in {**(modules or {}), **others}.items():
+            check_module(place, module)
+            where: torch.nn.Module = new
+            *path, name = [place] if place == "initial" else ["module", *".module.".join(place.split(".")).split(".")]
+            for step in path:
+                inner = where._modules.get(step)
+                if inner is None:
+                    break
+                where._modules[step] = where = _shallow(inner)
+            if name not in where._modules:
+                places = [*(name for name, _ in named_modules_of(self)), "initial"]
+                raise KeyError(f"{type(self).__name__} has no module at {place!r}; it has {places}.")
+            where._modules[name] = module
+        return new._renewed(self)
+
+    def _renewed(self, old: Filter) -> Filter:
+        self.observers, self.compiled = list(old.observers), copy(old.compiled)
+        self._sort()
         return self
 
     @property
@@ -284,12 +308,12 @@ class Filter(Checked, TensorDictSequential):
         return out if self.prefix is None else out.update(tensordict.get(self.prefix))
 
     def __setitem__(self, index, module) -> None:
-        """Refuses: :meth:`replace` exchanges a module.
+        """Raises: :meth:`with_modules` makes a filter with another module.
 
         Raises:
             TypeError: always.
         """
-        raise TypeError(f"{type(self).__name__} exchanges its modules itself: filter.replace({index!r}, module)")
+        raise TypeError(f"A filter with another module is a new one: filter.with_modules({{{index!r}: module}})")
 
     def __getitem__(self, index):
         """Returns one module, by number or name, or a plain ``TensorDictSequential`` of several."""
@@ -308,20 +332,16 @@ class Filter(Checked, TensorDictSequential):
         Like :meth:`torchrl.modules.LSTMModule.make_tensordict_primer`; where actions drive the filter, it also brings
         the last action (:class:`torch_denkf.transforms.LastAction`).
         """
-        told, like = declared(self.initial), self.like()
-        like = torch.zeros(()) if like is None else like
-        size = told.input_dim or told.state_dim or 1
-        zeros = torch.zeros(size, dtype=like.dtype, device=like.device)
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
-            belief = self.initial(TensorDict({key: zeros.clone() for key in self.initial.in_keys}))
-        primers = Composite()
+            belief = run_module(self.initial, self._nothing(()), Call(torch.Size(), "initial"))
+        found = Composite()
         for key in self.structure.carry:
-            value = belief.get(key)
+            value = belief[key]
             kept = self.outer(previous_key(key))
-            primers[kept] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
-        primers[self.outer(KNOWN)] = Unbounded(shape=(1,), dtype=torch.bool, device=like.device)
-        return import_module("torch_denkf.transforms").LastAction(
-            {key: self.outer(previous_key(key)) for key in self.structure.controls}, primers=primers
+            found[kept] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
+        found[self.outer(KNOWN)] = Unbounded(shape=(1,), dtype=torch.bool, device=value.device)
+        return primers().LastAction(
+            {key: self.outer(previous_key(key)) for key in self.structure.controls}, primers=found
         )
 
     def compile(self, *, chunk: int = 4, **options) -> Filter:
@@ -354,8 +374,7 @@ class Filter(Checked, TensorDictSequential):
             ValueError: if ``chunk`` is negative.
         """
         check_count("chunk", chunk, least=0, cure="It is a number of steps, or 0 for none")
-        steps = import_module("torch_denkf.compilation.compiled").CompiledSteps
-        self.compiled = steps(chunk, options) if chunk else None
+        self.compiled = compiler().CompiledSteps(chunk, options) if chunk else None
         return self
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -370,27 +389,21 @@ class Filter(Checked, TensorDictSequential):
             if previous_key(key) in entries:
                 entries[key] = entries[previous_key(key)]
         check_inputs(structure, type(self).__name__, entries, tensordict)
-        self.messages.ignored_masks(structure, tensordict)
-        self.messages.wrong_start(entries[structure.carry[0]])
         # A mark may be that of a slice of data, which goes on from the belief before it.
         known = entries.get(KNOWN)
         reset = starts_of(tensordict, self.init_key, step=True) if known is None else ~known.reshape(*size, 1)
         if reset is None:
             written = self.take_step(entries, size)
         else:
-            steps, call = self.steps(), Call(size)
-            written = steps.step(entries, call, reset=reset, start=lambda now: self.initial_belief(now, call))
-            steps.blank(written, reset)
+            call = Call(size)
+            written = self.steps.step(entries, call, reset=reset, start=lambda now: self.initial_belief(now, call))
+            self.steps.blank(written, reset)
             # What went before does not count where an episode begins.
             entries.update({key: where_rows(reset, written[key], entries[key]) for key in structure.carry})
-        if self.check_finite and not torch.compiler.is_compiling():
-            unread = None if self.update_at_reset else reset
-            refuse_non_finite(structure, entries, written, self.reject, unread)
         following = {("next", *previous_key(key)): written[key] for key in structure.carry}
         following["next", *KNOWN] = torch.ones(*size, 1, dtype=torch.bool, device=written[structure.carry[0]].device)
-        self.write(tensordict, own({**written, **following}, given))
-        self.messages.mark_carried(tensordict.get(self.outer(("next", *previous_key(structure.carry[0])))))
-        return tensordict
+        record = Record("policy", tensordict, entries, {**written, **following})
+        return self.write(tensordict, self.finished(record, given))
 
     def step(
         self, tensordict: TensorDictBase | Mapping[str, Any], *, without: Sequence[NestedKey] = ()
@@ -402,36 +415,31 @@ class Filter(Checked, TensorDictSequential):
                 numbers, arrays or tensors is one robot's, ``[]``, in the filter's precision; a number is an entry
                 ``[1]``.
             without: keys of readings that are missing on purpose, or are of an earlier step: what reads them is left
-                out, and the belief is the forecast unless another sensor has something to say.
+                out, and the belief is the forecast unless another sensor has something to say. Such a step runs
+                eagerly, also of a compiled filter.
 
         Returns:
             ``tensordict`` (of a dictionary, a new one), with the belief of t.
 
         Raises:
             KeyError: if an entry is missing, or ``without`` names what no module reads.
-            ValueError: with ``check_finite``, if a reading or the new belief is not finite; or if readings are looked
-                at together, and ``without`` names some of them, not all.
+            ValueError: with ``check_finite``, if the new belief is not finite; or if readings are looked at together,
+                and ``without`` names some of them, not all.
         """
-        structure, steps = self.structure, self.steps()
         if not isinstance(tensordict, TensorDictBase):
             tensordict = self.of_one_robot(tensordict)
-        if without:
-            without = refuse_unknown_readings(structure, without)
-            refuse_single_readings(structure, without)
         entries, size = self.entries_of(tensordict, one_step=True), tensordict.batch_size
-        check_inputs(structure, type(self).__name__, entries, tensordict, without)
         if without:
+            without = refuse_unknown_readings(self.structure, without)
+            refuse_single_readings(self.structure, without)
             entries = {key: value for key, value in entries.items() if key not in without}
+        if not entries.keys() >= self.structure.must:
+            check_inputs(self.structure, type(self).__name__, entries, tensordict, without)
+        if without:
+            written = self.steps.step(entries, Call(size), partial=True)
         else:
-            self.messages.ignored_masks(structure, tensordict)
-        if self.compiled is None:
-            written = steps.step(entries, Call(size), missing=structure.lost(without) if without else frozenset())
-        else:
-            written = self.take_step(entries, size, without=without)
-        if self.check_finite and not torch.compiler.is_compiling():
-            refuse_non_finite(structure, entries, written, self.reject)
-        write(tensordict, own(written, entries.values()), None if self.prefix is None else self.outer)
-        return tensordict
+            written = (self.steps if self.compiled is None else self.compiled.of(self)).step(entries, Call(size))
+        return self.write(tensordict, self.finished(Record("step", tensordict, entries, written)))
 
     def predict(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
         """A step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does.
@@ -448,31 +456,37 @@ class Filter(Checked, TensorDictSequential):
         written = [key for key in self.out_keys if out.get(key, None) is not None]
         return tensordict.update(out.select(*written))
 
-    def take_step(
-        self,
-        entries: Entries,
-        batch_size: torch.Size,
-        *,
-        reject: bool | None = None,
-        without: Sequence[NestedKey] = (),
-    ) -> Entries:
-        """What one step writes where ``entries`` are, compiled or not, unchecked; ``reject`` as the filter's."""
-        structure, steps = self.structure, self.steps(reject=reject)
-        missing = structure.lost(without) if without else frozenset()
-        if self.compiled is not None:
-            drawn, complete = self.missing_noise(entries, batch_size, structure.modules)
-            if complete:
-                written = self.compiled.step(steps, {**entries, **drawn}, batch_size, missing)
-                self.messages.ceiling_in(structure, self.variance_ceiling, written)
-                return written
-        return steps.step(entries, Call(batch_size), missing=missing)
+    def take_step(self, entries: Entries, batch_size: torch.Size) -> Entries:
+        """Returns what one step writes where ``entries`` are, unchecked, in the filter's way to run steps."""
+        strategy = self.steps if self.compiled is None else self.compiled.of(self)
+        return strategy.step(entries, Call(batch_size))
+
+    def finished(self, record: Record, given: Iterable[Tensor] | None = None, *, check: bool | None = None) -> Entries:
+        """Ends every way to run: checks the new belief, clones what is not the filter's own, tells the observers.
+
+        Args:
+            record: what was read and written.
+            given: tensors that the caller keeps; those that were read by default.
+            check: whether a belief that is not finite raises; by default as the filter was made, but for a sequence.
+
+        Returns:
+            The entries to write.
+
+        Raises:
+            ValueError: if the new belief is not finite.
+        """
+        if torch.compiler.is_compiling():
+            return record.written
+        if self.check_finite and record.way != "sequence" if check is None else check:
+            check_belief(self.structure, record.entries, record.written)
+        record = record._replace(written=own(record.written, record.entries.values() if given is None else given))
+        for observe in self.observers:
+            if record.way in getattr(observe, "ways", (record.way,)):
+                observe(self, record)
+        return record.written
 
     def initialise(
-        self,
-        tensordict: TensorDictBase | Mapping[str, Any],
-        *,
-        without: Sequence[NestedKey] = (),
-        reject: bool | None = None,
+        self, tensordict: TensorDictBase | Mapping[str, Any], *, without: Sequence[NestedKey] = ()
     ) -> TensorDictBase:
         """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``.
 
@@ -480,46 +494,39 @@ class Filter(Checked, TensorDictSequential):
             tensordict: what the initial belief reads, see :mod:`torch_denkf.modules.belief`.
             without: keys of readings that have not come yet. :class:`~torch_denkf.modules.FromSensor` then starts from
                 its prior.
-            reject: whether readings that cannot be true count as not observed; as the filter's by default.
 
         Raises:
             KeyError: if an entry is missing, or ``without`` names what no module reads.
         """
-        tensordict, structure, steps = self.of_one_robot(tensordict), self.structure, self.steps(reject=reject)
+        tensordict, structure, steps = self.of_one_robot(tensordict), self.structure, self.steps
         entries, call = self.entries_of(tensordict), Call(tensordict.batch_size)
         given, written = list(entries.values()), {}
-        missing = structure.lost(refuse_unknown_readings(structure, without))
-        entries = steps.guarded(entries, call)
+        without = refuse_unknown_readings(structure, without)
+        entries = {key: value for key, value in entries.items() if key not in without}
         if self.update_at_reset or not set(structure.frame_keys).isdisjoint(chain(*reads(self.initial))):
-            written = steps.run(structure.frames, entries, call, missing)
-        entries = {key: value for key, value in entries.items() if key not in missing}
-        start = self.initial_belief(entries, call._replace(missing=missing))
+            written = steps.run(structure.frames, entries, call, bool(without))
+        start = self.initial_belief(entries, call)
         if self.update_at_reset:
-            written.update(steps.first(entries, call, start, in_sequence=False, missing=missing))
+            written.update(steps.begin(entries, call, start, bool(without)))
         else:
             written.update(start)
             written.update({forecast: start[key] for key, forecast in structure.forecast_of.items()})
-        self.write(tensordict, own(written, given))
-        return tensordict
+        return self.write(tensordict, own(written, given))
 
     def summarise(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the other entries of the belief, e.g. mean and variance, from its carry."""
         stored = {key: tensordict.get(self.outer(key), None) for key in self.structure.belief}
         stored = {key: value for key, value in stored.items() if value is not None}
         carry = {key: tensordict.get(self.outer(key)) for key in self.structure.carry}
-        self.write(tensordict, own(summaries(self.structure.belief, self.initial, carry, stored)))
-        return tensordict
+        return self.write(tensordict, own(self.structure.completed(carry, stored)))
 
     def draw_noise(self, tensordict: TensorDictBase, *, generator: torch.Generator | None = None) -> TensorDictBase:
         """Writes the noise that the modules will need on ``tensordict`` (one step or a sequence), drawn in bulk.
 
         Noise that is there already is kept. Noise that depends on a size which only the step knows is drawn there.
         """
-        size, modules = tensordict.batch_size, (*self.structure.modules, ("initial", self.initial))
-        entries = self.entries_of(tensordict)
-        drawn, _ = self.missing_noise(entries, size, modules, time=len(size) > 0, generator=generator, say=False)
-        self.write(tensordict, drawn)
-        return tensordict
+        size, entries = tensordict.batch_size, self.entries_of(tensordict)
+        return self.write(tensordict, self.missing_noise(entries, size, time=len(size) > 0, generator=generator))
 
     def sequence(
         self,
@@ -553,7 +560,7 @@ class Filter(Checked, TensorDictSequential):
                 "A sequence has time as its last batch dimension, and at least one step; this tensordict has "
                 f"batch_size {list(size)}."
             )
-        inner = {self.outer(key): key for key in (*self.structure.frame_keys, *self.steps().step_keys)}
+        inner = {self.outer(key): key for key in (*self.structure.frame_keys, *self.structure.step_keys)}
         kept = list(inner.values()) if keep is None else [inner.get(key, key) for key in map(unravel_key, keep)]
         unknown = [key for key in kept if key not in inner.values()]
         if unknown:
@@ -562,51 +569,38 @@ class Filter(Checked, TensorDictSequential):
         outputs = self._scan(rows, marks, detach_every, kept)
         if rows is not tensordict:
             outputs = {key: value.flatten(0, 1) for key, value in outputs.items()}
-        self.write(tensordict, {key: outputs[key] for key in kept})
-        return tensordict
+        return self.write(tensordict, {key: outputs[key] for key in kept})
 
     def _scan(
         self, rows: TensorDictBase, marks: Tensor | None, detach_every: int | None, keep: Sequence[NestedKey]
     ) -> Entries:
-        """The outputs ``keep`` of sequences ``[*B, T]`` that begin at ``marks``, and at their first element."""
-        structure, steps, size = self.structure, self.steps(), rows.batch_size
+        """Returns the outputs ``keep`` of sequences ``[*B, T]`` that begin at ``marks``, and at their first element."""
+        structure, steps, size = self.structure, self.steps, rows.batch_size
         entries, call = self.entries_of(rows), Call(size, time=True)
         given = list(entries.values())
         check_inputs(structure, type(self).__name__, entries, rows, carry=False)
-        if self.check_finite and not self.reject and not torch.compiler.is_compiling():
-            refuse_far_belief(entries, [name for key in structure.carry for name in (key, previous_key(key))])
-            entries = without_absurd_readings(structure, entries, self._unread(rows))
-        self.messages.ignored_masks(structure, rows)
-        entries = steps.guarded(entries, call)
         with set_recurrent_mode(True):  # for modules that are not this package's
             frames = steps.run(structure.frames, entries, call)
-        gathered = gather_rows(structure, entries, marks, size, self.initial_belief, self.initial)
+        gathered = gather_rows(structure, entries, marks, size, self.initial_belief)
+        later = [place for place, _ in (structure.transition, *structure.update)]
+        gathered.inputs.update(self.missing_noise({**entries, **gathered.starts}, size, places=later, time=True))
+        cuts = [detach_every is not None and t > 0 and t % detach_every == 0 for t in range(size[-1])]
         if gathered.stored:  # these have seen their frame
             steps = steps._replace(update_at_reset=False)
-        later = (structure.transition, *structure.update)
-        drawn, complete = self.missing_noise({**entries, **gathered.starts}, size, later, time=True)
-        if complete:
-            gathered.inputs.update(drawn)
-        step_keys = tuple(key for key in keep if key in steps.step_keys)
-        cuts = [detach_every is not None and t > 0 and t % detach_every == 0 for t in range(size[-1])]
+        strategy = steps if self.compiled is None or gathered.resumed else self.compiled.of(self, steps)
         with set_recurrent_mode(False):
-            if self.compiled is not None and complete and gathered.before is None:
-                outputs = self.compiled.sequence(steps, gathered, cuts, step_keys)
-                self.messages.ceiling_in(structure, self.variance_ceiling, outputs)
-            else:
-                outputs = steps.scan(
-                    gathered.before,
-                    gathered.inputs,
-                    Call(torch.Size(size[:-1])),
-                    gathered.begins,
-                    gathered.starts,
-                    cuts,
-                    step_keys,
-                )[1]
+            outputs = strategy.scan(
+                gathered.before,
+                gathered.inputs,
+                Call(torch.Size(size[:-1])),
+                gathered.begins,
+                gathered.starts,
+                cuts,
+                tuple(key for key in keep if key in structure.step_keys),
+            )[1]
         steps.blank(outputs, gathered.fresh)
-        if not (torch.is_grad_enabled() or torch.compiler.is_compiling()):
-            import_module("torch_denkf.diagnosis.collapse").say_collapse(self.messages, structure, outputs)
-        return {**own({key: frames[key] for key in keep if key in frames}, given), **outputs}
+        outputs.update({key: frames[key] for key in keep if key in frames})
+        return self.finished(Record("sequence", rows, entries, outputs), given)
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:
         """``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
@@ -620,41 +614,16 @@ class Filter(Checked, TensorDictSequential):
         known = tensordict.get(self.outer(KNOWN), None)  # a policy's data: what has a belief before it is a step
         return torch.ones_like(first) if known is None else known.reshape(size)
 
-    def _unread(self, rows: TensorDictBase) -> Tensor | None:
-        """Elements of a sequence whose readings nothing uses, ``[*B, T, 1]``: the belief there is the initial one."""
-        made_of = {*chain(*reads(self.initial))}
-        if self.update_at_reset or not made_of.isdisjoint((*self.structure.frame_keys, *self.structure.readings)):
-            return None
-        return ~self.stepped(rows).unsqueeze(-1)
-
     def like(self) -> Tensor | None:
         """A tensor of the filter's precision and device; ``None`` where it has no parameters or constants."""
         return next((p for p in chain(self.parameters(), self.buffers()) if p.is_floating_point()), None)
-
-    def steps(self, update_at_reset: bool | None = None, reject: bool | None = None) -> Steps:
-        """What one step does, on entries; ``update_at_reset`` and ``reject`` as the filter's by default."""
-        update_at_reset = self.update_at_reset if update_at_reset is None else update_at_reset
-        reject = self.reject if reject is None else reject
-        say = partial(self.messages.ceiling, self.structure, self.variance_ceiling)
-        return Steps(self.structure, update_at_reset, self.variance_ceiling, say, reject)
 
     def entries_of(self, tensordict: TensorDictBase, *, one_step: bool = False) -> Entries:
         """What the modules may read, as far as it is there, and noise; for ``one_step`` not what starts a sequence.
 
         Raises:
             KeyError: if there is noise that no module draws.
-            RuntimeError: if a module was exchanged without :meth:`replace`.
         """
-        if not torch.compiler.is_compiling():
-            same = (self.initial, self.reject, self.prefix) == self._sorted_with
-            for modules, before in self._sorted:
-                same = same and tuple(modules.values()) == before
-            if not same:
-                raise RuntimeError(
-                    f"A module of {type(self).__name__}, its initial belief, reject or prefix was exchanged after it "
-                    "was made. Let the filter do it, which then sorts its modules anew: "
-                    'filter.replace("analysis", module); the two options are arguments of its constructor.'
-                )
         keys = self._step_keys if one_step else self._all_keys
         entries = {}
         for key, outer in keys.items():
@@ -664,35 +633,87 @@ class Filter(Checked, TensorDictSequential):
         given = tensordict.get(self._noise_key, None)
         if given is not None:
             noise = flat_noise(given)
-            refuse_unknown_noise((*self.structure.modules, ("initial", self.initial)), type(self).__name__, noise)
+            refuse_unknown_noise({place for place, _ in self._random}, type(self).__name__, noise)
             entries.update(noise)
         return entries
 
     def initial_belief(self, entries: Entries, call: Call) -> Entries:
-        """The belief at the start of an episode."""
-        belief = self.structure.belief
-        hidden = {key: value for key, value in entries.items() if key not in belief}
-        start = run_module(self.initial, hidden, call.part("initial"))
-        return own(summaries(belief, self.initial, start), entries.values())
+        """Returns the belief at the start of an episode."""
+        structure = self.structure
+        given = {key: value for key, value in entries.items() if key not in structure.belief}
+        start = run_module(self.initial, given, call.part("initial"))
+        return own(structure.completed(start), entries.values())
 
-    def write(self, tensordict: TensorDictBase, written: Entries) -> None:
-        """Sets entries, under the names that they have outside of the filter."""
-        write(tensordict, written, None if self.prefix is None else self.outer)
+    def write(self, tensordict: TensorDictBase, written: Entries) -> TensorDictBase:
+        """Sets entries, under their names outside of the filter; looks each nested tensordict up once."""
+        owners: dict[tuple, Any] = {}
+        for key, value in written.items():
+            if self._options["prefix"] is not None:
+                key = self.outer(key)
+            prefix = () if isinstance(key, str) else key[:-1]
+            owner = tensordict if not prefix else owners.get(prefix)
+            if owner is None:
+                owner = tensordict.get(prefix, None) if type(tensordict) is TensorDict else None
+            if isinstance(owner, TensorDictBase):
+                owners[prefix] = owner
+                owner.set(key[-1] if prefix else key, value)
+            else:  # not there yet
+                tensordict.set(key, value)
+        return tensordict
 
     def options(self) -> FilterOptions:
-        """The options that the filter was made with."""
+        """Returns the options that the filter was made with."""
         return cast(FilterOptions, {key: getattr(self, key) for key in FilterOptions.__annotations__})
 
     def of_one_robot(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
-        """A tensordict as it is; of a dictionary a new one, ``[]``, in the filter's precision and on its device."""
-        if isinstance(tensordict, TensorDictBase):
-            return tensordict
-        return _of_one_robot(type(self).__name__, self.like(), tensordict)
+        """Returns a tensordict as it is; of a dictionary a new one, ``[]``, in the filter's precision and device."""
+        return of_one_robot(type(self).__name__, self.like(), tensordict)
 
     def missing_noise(
-        self, entries: Entries, size: torch.Size, modules: Sequence, *, say: bool = True, **options
-    ) -> tuple[Entries, bool]:
-        """The noise of modules that is not among the entries, and whether that is all of it."""
-        say_eager = self.messages.eager if say and self.compiled is not None else None
-        options |= {"like": self.like(), "say_eager": say_eager}
-        return draw_noise(self.structure, self.initial, entries, size, modules, **options)
+        self,
+        entries: Entries,
+        size: torch.Size,
+        *,
+        places: Sequence[str] | None = None,
+        time: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> Entries:
+        """Draws the noise of some modules, or all, that is not among the entries; one trial step tells the sizes."""
+        if not self._random:
+            return {}
+        shapes = {
+            key: value.shape[len(size) :] for key, value in entries.items() if key[0] not in ("noise", "previous")
+        }
+        kind = tuple(sorted(shapes.items(), key=str))
+        if kind not in self._drawn:
+            self._drawn[kind] = self._trial(entries, size)
+        drawn = self._drawn[kind]
+        return draw_noise(drawn, entries, size, places=places, like=self.like(), time=time, generator=generator)
+
+    def _nothing(self, batch_size: Sequence[int]) -> Entries:
+        """Returns zeros for what the initial belief reads, where its shape alone counts."""
+        told, like = declared(self.initial), self.like()
+        like = torch.zeros(()) if like is None else like
+        zeros = like.new_zeros(*batch_size, told.input_dim or told.state_dim or 1)
+        return {key: zeros.clone() for key in reads(self.initial)[0]}
+
+    @torch.no_grad()
+    def _trial(self, entries: Entries, size: torch.Size) -> Drawn:
+        """Finds which modules draw noise in a step, and of what sizes, by one step of the first element."""
+        row = {key: value for key, value in entries.items() if key[0] != "noise"}
+        if size.numel():
+            row = {key: value.flatten(0, len(size) - 1)[:1] if size else value for key, value in row.items()}
+        else:
+            row = {key: value.new_zeros(1, *value.shape[len(size) :]) for key, value in row.items()}
+        call = Call(torch.Size([1] if size else []))
+        with torch.random.fork_rng(devices=[]), set_recurrent_mode(False), recorded_draws(self, self._random) as drawn:
+            start = run_module(self.initial, {**self._nothing(call.batch_size), **row}, call.part("initial"))
+            self.steps.step({**start, **row}, call)
+        return drawn
+
+
+def _shallow(module: torch.nn.Module) -> Any:
+    """Copies a module whose sub-modules can be exchanged without those of the original."""
+    new = copy(module)
+    new._modules = dict(module._modules)
+    return new

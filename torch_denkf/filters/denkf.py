@@ -67,7 +67,7 @@ class DEnKF(Filter):
         visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.imperfect.Visibility`; the
             update heeds it, see :class:`~torch_denkf.imperfect.Visible`.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
-            ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
+            ``check_finite`` and ``prefix`` of :class:`Filter`.
 
     Raises:
         ValueError: if it is not clear where the reading is.

@@ -1,4 +1,4 @@
-"""What steps read: entries of a tensordict, and where each element of a sequence starts from."""
+"""Gathers what steps read: entries of a tensordict, and the belief that each element of a sequence starts from."""
 
 from __future__ import annotations
 
@@ -7,43 +7,42 @@ from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_denkf.filters.refusals import refuse_missing_actions
-from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.filters.structure import KNOWN, RESUMES, Structure, previous_key
-from torch_denkf.modules._summaries import summaries
 from torch_denkf.submodel import Call, Entries
 
 __all__ = ["Rows", "gather_rows", "of_one_robot"]
 
 
 class Rows(NamedTuple):
-    """What the steps of a sequence read.
+    """Inputs of the steps of a sequence.
 
     Attributes:
         size: ``[*B, T]``.
         inputs: entries ``[*B, T, ...]``.
-        begins: elements that start from ``starts``, ``[*B, T, 1]``; ``None`` for the first alone.
-        starts: initial or stored beliefs ``[*B, T]``, or ``[*B, 1]`` where ``begins`` is ``None``.
+        begins: elements that are reset to ``starts``, ``[*B, T, 1]``; ``[*B, 1, 1]`` where the first alone may be.
+        starts: initial or stored beliefs, ``[*B, T]`` or ``[*B, 1]``.
         stored: whether these beliefs are stored ones, which have seen their frame.
-        before: the belief before the first element, where that is a step, too; ``None`` where it is a start.
+        before: the belief before the first element.
+        resumed: whether elements start from a belief that a policy stored before them.
     """
 
     size: torch.Size
     inputs: Entries
-    begins: Tensor | None
+    begins: Tensor
     starts: Entries
     stored: bool
-    before: Entries | None
+    before: Entries
+    resumed: bool
 
     @property
     def fresh(self) -> Tensor:
-        """Elements that start anew, ``[*B, T, 1]``."""
-        if self.before is not None and self.begins is not None:
+        """Elements that are reset, ``[*B, T, 1]``."""
+        if self.begins.shape[-2] == self.size[-1]:
             return self.begins
-        return _or_first(self.begins, self.size, next(iter(self.starts.values())).device)
+        return _or_first(None, self.size, self.begins.device)
 
 
 def of_one_robot(name: str, like: Tensor | None, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
@@ -67,9 +66,8 @@ def gather_rows(
     marks: Tensor | None,
     size: torch.Size,
     start_of: Callable[[Entries, Call], Entries],
-    initial: TensorDictModuleBase,
 ) -> Rows:
-    """Where each element of a sequence starts from, and what its step reads.
+    """Finds where each element of a sequence starts from, and what its step reads.
 
     Args:
         structure: of the filter.
@@ -77,36 +75,37 @@ def gather_rows(
         marks: first elements, see :func:`torch_denkf._slices.starts_of`.
         size: ``[*B, T]``.
         start_of: the initial beliefs, from entries.
-        initial: the filter's initial belief.
     """
-    time, call = len(size) - 1, Call(size, time=True)
-    carry, begins = structure.carry, marks
+    time, call, carry = len(size) - 1, Call(size, time=True), structure.carry
     resumed = all(previous_key(key) in entries for key in carry)
     stored = not resumed and all(key in entries for key in carry)
-    read = (*structure.needed, *structure.optional, *structure.controls, *structure.frame_keys, REJECTED)
+    read = (*structure.needed, *structure.optional, *structure.controls, *structure.frame_keys)
     inputs = {key: entries[key] for key in read if key in entries}
     inputs.update({key: value for key, value in entries.items() if key[0] == "noise"})
+    head = {key: value.narrow(time, 0, 1) for key, value in entries.items()}
+    one = torch.Size((*size[:-1], 1))
+    if stored:
+        starts = structure.completed({key: entries[key] for key in carry}, entries)
+    elif marks is None and not resumed:  # where only the first element starts, only its initial belief is needed
+        starts = start_of(head, call._replace(batch_size=one))
+    else:
+        starts = start_of(entries, call)
+    device = starts[carry[0]].device
+    begins = torch.ones(*one, 1, dtype=torch.bool, device=device) if marks is None else _or_first(marks, size, device)
     if resumed:  # a policy's data: what is known before an element is where its step begins
         refuse_missing_actions(structure, entries, resumed=True)
-        first = _or_first(marks, size, entries[previous_key(carry[0])].device)
+        first = _or_first(marks, size, device)
         known = entries.get(KNOWN, torch.ones_like(first))
         begins, inputs[RESUMES] = ~known, first & known
         inputs.update({previous_key(key): entries[previous_key(key)] for key in carry})
-    if stored:
-        starts = summaries(structure.belief, initial, {key: entries[key] for key in carry}, entries)
-    elif begins is None:  # where only the first element starts, only its initial belief is needed
-        head = {key: value.narrow(time, 0, 1) for key, value in entries.items()}
-        starts = start_of(head, call._replace(batch_size=torch.Size((*size[:-1], 1))))
-    else:
-        starts = start_of(entries, call)
     for key in structure.controls:  # stored one step earlier than they are read
         if previous_key(key) in entries:
             inputs[key] = entries[previous_key(key)]
         elif key in inputs:
             value = inputs[key]
             inputs[key] = torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, size[-1] - 1)], time)
-    before = {key: starts[key].select(time, 0) for key in carry} if resumed else None
-    return Rows(size, inputs, begins, starts, stored, before)
+    before = {key: starts[key].select(time, 0) for key in carry}
+    return Rows(size, inputs, begins, starts, stored, before, resumed)
 
 
 def _or_first(marks: Tensor | None, size: torch.Size, device: torch.device) -> Tensor:

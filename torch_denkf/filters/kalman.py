@@ -44,7 +44,7 @@ class KalmanFilter(Filter):
         observation_key: readings ``[*B, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         **kwargs: ``control_keys``, of which the first drives the transition where ``control`` is given, ``init_key``,
-            ``update_at_reset``, ``variance_ceiling``, ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
+            ``update_at_reset``, ``variance_ceiling``, ``check_finite`` and ``prefix`` of :class:`Filter`.
 
     Raises:
         ValueError: if the shapes do not fit, a number is not finite, Q, R or ``cov`` is no covariance, or one noise is

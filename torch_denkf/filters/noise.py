@@ -1,107 +1,81 @@
-"""The noise of all modules of a filter, drawn in bulk: for a whole sequence at once, or in front of a compiled step."""
+"""Draws the noise of all modules of a filter in bulk; one trial step tells which module draws what."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
 
 import torch
-from tensordict import unravel_key
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 
-from torch_denkf.filters.structure import Placed, Structure
-from torch_denkf.running import declared, random_parts
 from torch_denkf.submodel import Entries, SubModel, flat_noise
 
-__all__ = ["draw_noise"]
+__all__ = ["Drawn", "draw_noise", "recorded_draws"]
+
+#: The sub-models that draw noise, by place, and the sizes that they asked for.
+Drawn = dict[str, tuple[SubModel, dict[str, Any]]]
+
+
+@contextmanager
+def recorded_draws(filter: nn.Module, parts: Sequence[tuple[str, SubModel]]) -> Iterator[Drawn]:
+    """Records the sizes that sub-models ask for when they draw noise; forward hooks are not called meanwhile.
+
+    Args:
+        filter: whose modules they are.
+        parts: sub-models that draw noise, and their places.
+    """
+    drawn: Drawn = {}
+    hooked = [(part, part._forward_hooks, part._forward_pre_hooks) for part in filter.modules()]
+    try:
+        for part, *_ in hooked:
+            part._forward_hooks, part._forward_pre_hooks = OrderedDict(), OrderedDict()
+        for _, part in parts:
+            part.__dict__["draw_noise"] = partial(_record, drawn, parts, part)
+        yield drawn
+    finally:
+        for _, part in parts:
+            part.__dict__.pop("draw_noise", None)
+        for part, hooks, pre_hooks in hooked:
+            part._forward_hooks, part._forward_pre_hooks = hooks, pre_hooks
+
+
+def _record(drawn: Drawn, parts: Sequence[tuple[str, SubModel]], part: SubModel, batch_size, **options) -> Any:
+    sizes = {name: value for name, value in options.items() if name not in ("time", "device", "dtype", "generator")}
+    drawn.update({place: (part, sizes) for place, other in parts if other is part})
+    return type(part).draw_noise(part, batch_size, **options)
 
 
 def draw_noise(
-    structure: Structure,
-    initial: TensorDictModuleBase,
-    entries: Entries,
+    drawn: Drawn,
+    given: Mapping,
     batch_size: torch.Size,
-    modules: Iterable[Placed],
     *,
+    places: Iterable[str] | None = None,
     like: Tensor | None = None,
     time: bool = False,
     generator: torch.Generator | None = None,
-    say_eager: Callable[[str, str], None] | None = None,
-) -> tuple[Entries, bool]:
-    """The noise of ``modules`` that is not among the entries.
+) -> Entries:
+    """Draws the noise that is not among what is given, of ``batch_size`` elements; of some modules, or of all.
 
     Args:
-        structure: of the filter that they are of.
-        initial: its initial belief.
-        entries: what is known of the step: the carry and the frames' outputs tell sizes.
+        drawn: which module draws what.
+        given: entries, some of which may be noise.
         batch_size: ``[*B]``, or ``[*B, T]``.
-        modules: with their places.
-        like: has the filter's precision.
+        places: of the modules in the filter.
+        like: has the precision and device of the noise.
         time: whether the last of ``batch_size`` is time.
         generator: source of randomness; torch's global one by default.
-        say_eager: told why a noise could not be drawn, and what to do.
-
-    Returns:
-        The noise, as far as its size is known before the step; and whether that is all.
     """
-    parts = [found for place, module in modules for found in random_parts(module, place)]
-    drawn: Entries = {}
-    if not parts:
-        return drawn, True
-    complete = True
-    device = next((value.device for value in entries.values()), None if like is None else like.device)
-    dtype = None if like is None else like.dtype
-    members, state_dim = _sizes(structure, initial, entries)
-    for place, part in parts:
-        keys = [("noise", place, name) if name else ("noise", place) for name in part.noise_names]
-        if not all(key in entries for key in keys):
-            noise = part.draw_noise(
-                batch_size,
-                members=members,
-                state_dim=state_dim,
-                observation_dim=_observation_dim(structure, part, entries),
-                time=time,
-                device=device,
-                dtype=dtype,
-                generator=generator,
-            )
-            if noise is None:
-                complete = False
-                if say_eager is not None:
-                    say_eager(*_undrawn(place, part))
-            drawn.update(flat_noise(noise, place))
-    return drawn, complete
-
-
-def _sizes(structure: Structure, initial: TensorDictModuleBase, entries: Entries) -> tuple[int | None, int | None]:
-    """E and S of the belief."""
-    for key in structure.carry:
-        if key[-1] == "ensemble" and key in entries:
-            members, state_dim = entries[key].shape[-2:]
-            return members, state_dim
-    told = declared(initial)
-    return told.ensemble_size, told.state_dim
-
-
-def _observation_dim(structure: Structure, part: SubModel, entries: Entries) -> int | None:
-    """O of the reading that a sub-model uses: from the entry, or from the module that writes it.
-
-    A sub-model that does not name the entry of its variances is told where all that is known of what it reads agrees.
-    """
-    known = structure.observation_dims
-    key = part.noise_variance_key
-    if key is not None:
-        return entries[key].shape[-1] if key in entries else known.get(key)
-    found = {known[key] for key in map(unravel_key, part.in_keys) if key in known}
-    found |= {entries[key].shape[-1] for key in map(unravel_key, part.reading_keys) if key in entries}
-    return found.pop() if len(found) == 1 else None
-
-
-def _undrawn(place: str, part: SubModel) -> tuple[str, str]:
-    """Why a noise could not be drawn before the step, and what to do."""
-    name = type(part).__name__
-    return (
-        f"{name} at place {place!r} cannot draw its noise before the step.",
-        f"Its draw_noise() must return a tensor from members=, state_dim= and observation_dim=; where {name} needs "
-        "observation_dim, let its attribute noise_variance_key name the entry that holds the variances of its reading.",
-    )
+    out: Entries = {}
+    where: dict[str, Any] = {} if like is None else {"device": like.device, "dtype": like.dtype}
+    chosen = None if places is None else tuple(places)
+    for place, (part, sizes) in drawn.items():
+        if chosen is None or place.split(".")[0] in chosen:
+            keys = [("noise", place, name) if name else ("noise", place) for name in part.noise_names]
+            if not all(key in given for key in keys):
+                noise = part.draw_noise(batch_size, time=time, generator=generator, **where, **sizes)
+                out.update(flat_noise(noise, place))
+    return out

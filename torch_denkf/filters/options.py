@@ -19,5 +19,4 @@ class FilterOptions(TypedDict, total=False):
     forecast_keys: Mapping[NestedKey, NestedKey] | None
     variance_ceiling: float | None
     check_finite: bool
-    reject: bool
     prefix: str | None

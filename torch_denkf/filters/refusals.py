@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
-from torch_denkf.filters.structure import Placed, Structure, previous_key, submodels, takes_reading
-from torch_denkf.running import declared, in_sequences, random_parts, writes
+from torch_denkf.filters.structure import Structure, previous_key, submodels, takes_reading
+from torch_denkf.running import declared, in_sequences, writes
 from torch_denkf.submodel import Entries
 
 __all__ = [
@@ -17,7 +17,6 @@ __all__ = [
     "refuse_nameless_readings",
     "refuse_single_readings",
     "refuse_two_precisions",
-    "refuse_unguarded",
     "refuse_unknown_noise",
     "refuse_unknown_readings",
 ]
@@ -66,24 +65,6 @@ def check_inputs(
         )
 
 
-def refuse_unguarded(structure: Structure, name: str) -> None:
-    """Raises a ``ValueError`` where readings are to be rejected, and one cannot be hidden."""
-    for place, module in structure.unmasked:
-        raise ValueError(
-            f"{name} is to reject readings that cannot be true, and {type(module).__name__} at place {place!r} reads "
-            'no mask that could hide one: name it in optional_keys=["observed"], and say self.observed_key = '
-            '"observed".'
-        )
-    guarded = {key for guard in structure.guards for key in (*guard.whole, *guard.components)}
-    for key in structure.readings:
-        if key not in guarded:
-            readers = [type(part).__name__ for part in structure.readers(key)]
-            raise ValueError(
-                f"{name} is to reject readings that cannot be true, and {', '.join(readers)} does not say which entry "
-                f'is the mask of {key!r}: self.observed_key = "observed", for example.'
-            )
-
-
 def refuse_missing_actions(structure: Structure, entries: Entries, resumed: bool) -> None:
     """Raises a ``KeyError`` where a step resumes from a policy's belief, and the action before it is not there."""
     missing = [key for key in structure.required_controls if previous_key(key) not in entries]
@@ -95,9 +76,8 @@ def refuse_missing_actions(structure: Structure, entries: Entries, resumed: bool
         )
 
 
-def refuse_unknown_noise(modules: Iterable[Placed], name: str, noise: Entries) -> None:
+def refuse_unknown_noise(places: Collection[str], name: str, noise: Entries) -> None:
     """Raises a ``KeyError`` where noise is given for a place that draws none: it would be ignored."""
-    places = {place for inner, module in modules for place, _ in random_parts(module, inner)}
     unknown = [key for key in noise if len(key) < 2 or key[1] not in places]
     if unknown:
         raise KeyError(f"{unknown} is noise of no module of {name}; noise is drawn at {sorted(places)}.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from typing import NamedTuple, TypeGuard
 
@@ -10,19 +10,18 @@ import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
-from torch_denkf.filters.rejection import Guard, guards_of
+from torch_denkf.beliefs import Belief, complete, kinds_of, summary_keys
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.running import (
     declared,
     in_sequences,
     is_sequence,
-    marks_of,
     named_modules_of,
     reads,
     reads_of,
     writes,
 )
-from torch_denkf.submodel import SubModel
+from torch_denkf.submodel import Entries, SubModel
 
 __all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "previous_key", "sequences_in", "submodels"]
 
@@ -33,7 +32,6 @@ Placed = tuple[str, TensorDictModuleBase]
 KNOWN = ("previous", "known")
 #: Whether an element of a sequence begins with the belief that is stored before it.
 RESUMES = ("previous", "resumes")
-_SUMMARIES = ("mean", "var", "cov")
 
 
 def previous_key(key: NestedKey) -> tuple[str, ...]:
@@ -63,49 +61,51 @@ class Structure(NamedTuple):
     """A filter's modules in their order, sorted by what they read.
 
     Attributes:
+        initial: the initial belief.
         frames: modules that read frames alone, and not the belief.
         transition: the module that forecasts the carry: the first that depends on the belief.
         update: the modules between the forecast and the belief, and those that depend on the action alone.
-        needed: keys that must be there beside the carry and the controls.
+        posterior: the same, and the ceiling of variances.
+        needed: keys that must be there in addition to the carry and the controls.
+        must: all keys without which there is no step.
         optional: keys that are used where they are there.
         controls: keys that drive the transition.
         required_controls: those of them that must be there.
         carry: keys of the belief that go on from step to step.
+        carried: the same, each with the kind of belief that knows what finite means there; ``None`` for all others.
         belief: keys of the belief; the carry, and what follows from it.
         forecast_of: the forecast of each carried entry, as far as the transition writes one.
         beside: what else the transition writes.
-        observation_dims: O of each entry that a noise module of the update writes, as far as it is known.
         readings: raw entries that the analyses' readings are made of.
-        plain: those of them that an analysis reads itself.
-        guards: what a mask hides, of those readings.
-        unmasked: modules of the update that take in a reading and read no mask.
         own_info: new names for diagnostics that several analyses would write under one.
         totals: sums of those over the analyses.
         space: in which the state lives; ``None`` for plain numbers.
+        kinds: of the belief, one for each prefix.
         likelihoods: the log-likelihood of each analysis' reading.
         frame_keys: what the frame modules write.
         step_keys: what transition and update write.
     """
 
+    initial: TensorDictModuleBase
     frames: tuple[Placed, ...]
     transition: Placed
     update: tuple[Placed, ...]
+    posterior: tuple[Placed, ...]
     needed: tuple[NestedKey, ...]
+    must: frozenset[NestedKey]
     optional: tuple[NestedKey, ...]
     controls: tuple[NestedKey, ...]
     required_controls: tuple[NestedKey, ...]
     carry: tuple[NestedKey, ...]
+    carried: tuple[tuple[NestedKey, Belief | None], ...]
     belief: tuple[NestedKey, ...]
     forecast_of: dict[NestedKey, NestedKey]
     beside: tuple[NestedKey, ...]
-    observation_dims: dict[NestedKey, int]
     readings: tuple[NestedKey, ...]
-    plain: tuple[NestedKey, ...]
-    guards: tuple[Guard, ...]
-    unmasked: tuple[Placed, ...]
     own_info: dict[str, dict[NestedKey, NestedKey]]
     totals: dict[NestedKey, tuple[NestedKey, ...]]
     space: Space | None
+    kinds: tuple[Belief, ...]
     likelihoods: tuple[NestedKey, ...]
     frame_keys: tuple[NestedKey, ...]
     step_keys: tuple[NestedKey, ...]
@@ -114,23 +114,6 @@ class Structure(NamedTuple):
     def modules(self) -> tuple[Placed, ...]:
         """All modules, in the order in which they run."""
         return (*self.frames, self.transition, *self.update)
-
-    def readers(self, key: NestedKey) -> list[TensorDictModuleBase]:
-        """The sub-models of the update that take in a reading that is made of the entry ``key``."""
-        parts = [part for _, module in self.update for part in submodels(module)]
-        direct = [part for part in parts if key in map(unravel_key, part.reading_keys)]
-        return direct or [part for part in parts if part.reading_keys]
-
-    def lost(self, missing: Iterable[NestedKey]) -> frozenset[NestedKey]:
-        """Without some entries, what is not there: they, and all that is made of them up to an analysis."""
-        lost, written = set(missing), set()
-        for _, module in self.modules:
-            for part in in_sequences(module):
-                if lost.isdisjoint(part.in_keys) or takes_reading(part):
-                    written.update(writes(part))
-                else:  # an entry that another module wrote before stays
-                    lost.update(key for key in writes(part) if key not in written)
-        return frozenset(lost)
 
     def in_keys(self, init_key: NestedKey) -> list[NestedKey]:
         """All that a filter reads: also stored beliefs, those of a policy, and what marks a beginning."""
@@ -142,6 +125,12 @@ class Structure(NamedTuple):
     def out_keys(self) -> list[NestedKey]:
         """All that a filter writes."""
         return [*self.frame_keys, *self.step_keys]
+
+    def completed(self, entries: Entries, stored: Entries | None = None) -> Entries:
+        """Returns entries of a belief with those that follow from them, see :func:`torch_denkf.beliefs.complete`."""
+        lacking = any(key not in entries for key in self.belief)
+        further = self.initial.of_carry(entries) if lacking and isinstance(self.initial, SubModel) else {}
+        return complete({**further, **entries}, self.belief, self.kinds, stored)
 
     @classmethod
     def of(
@@ -165,11 +154,7 @@ class Structure(NamedTuple):
                 f"No module of the filter reads what its initial belief writes ({provided}); the filter reads "
                 f"{needed}. Give both the same keys."
             )
-        _refuse_both([*needed, *optional], carry, modules)
         frames, steps = _sorted(modules, carry, control_keys)
-        _refuse_overwriting([*frames, *steps])
-        _refuse_nesting([*needed, *optional], [key for _, module in modules for key in writes(module)])
-        _refuse_unread_masks(modules)
         own_info, totals = _apart(steps)
         renamed = {name for names in own_info.values() for name in names.values()}
         needed, optional = ([key for key in keys if key not in renamed] for keys in (needed, optional))
@@ -180,36 +165,41 @@ class Structure(NamedTuple):
             raise ValueError(
                 f"The belief holds {still}, which no module writes: a step would lose it. Let one pass it on."
             )
-        belief = [key for key in provided if key in step_keys]
-        for key in step_keys:  # a summary that the analysis writes and the initial belief does not
-            if key not in belief and key[-1] in _SUMMARIES and any(key[:-1] == other[:-1] for other in carry):
-                belief.append(key)
-        _refuse_unused(steps, [*carry, *belief])
+        belief = list(dict.fromkeys([*(key for key in provided if key in step_keys), *summary_keys(carry, step_keys)]))
+        space = declared(initial).space
+        kinds = kinds_of(belief, space, carry)
         forecast_of = _forecasts(carry, writes(steps[0][1]), forecast_keys)
         return cls(
+            initial=initial,
             frames=tuple(frames),
             transition=steps[0],
             update=tuple(steps[1:]),
+            posterior=tuple(steps[1:]),
             needed=tuple(key for key in needed if key not in carry and key not in control_keys),
+            must=frozenset([*needed, *carry]),
             optional=tuple(key for key in optional if key not in carry and key not in control_keys),
             controls=tuple(key for key in (*needed, *optional) if key in control_keys),
             required_controls=tuple(key for key in needed if key in control_keys),
             carry=tuple(carry),
+            carried=tuple((key, _judge_of(key, kinds)) for key in carry),
             belief=tuple(belief),
             forecast_of=forecast_of,
             beside=tuple(key for key in writes(steps[0][1]) if key not in forecast_of.values()),
-            observation_dims=_observation_dims([*frames, *steps[1:]]),
             readings=tuple(_readings(frames, steps[1:], needed)),
-            plain=tuple(_plain(steps[1:], needed)),
-            guards=_guards(frames, steps[1:], needed, initial),
-            unmasked=tuple(_unmasked(steps, carry)),
             own_info=own_info,
             totals=totals,
-            space=declared(initial).space,
+            space=space,
+            kinds=kinds,
             likelihoods=tuple(_likelihoods(steps, own_info, totals)),
             frame_keys=tuple(dict.fromkeys(key for _, module in frames for key in writes(module))),
             step_keys=step_keys,
         )
+
+
+def _judge_of(key: NestedKey, kinds: Sequence[Belief]) -> Belief | None:
+    """Returns the kind of belief that has its own ``finite`` for an entry."""
+    own = (kind for kind in kinds if key in kind.carry and type(kind).finite is not Belief.finite)
+    return next(own, None)
 
 
 def _sorted(
@@ -251,30 +241,6 @@ def _sorted(
     return frames, [*steps[:1], *driven, *steps[1:]]
 
 
-def _refuse_both(read: Sequence[NestedKey], carry: Sequence[NestedKey], modules: Sequence[Placed]) -> None:
-    """Raises where an entry comes from outside and is written, too: the next step would read what this one wrote."""
-    for place, module in modules:
-        both = [key for key in writes(module) if key in read and key not in carry]
-        if both:
-            raise ValueError(
-                f"{place!r} ({type(module).__name__}) writes {both[0]!r}, which the filter also reads from outside: "
-                "the next step would take what this one wrote for a new reading. Write it under another key, and let "
-                "the modules behind it read that one; or carry it from step to step: let the initial belief write it."
-            )
-
-
-def _refuse_unread_masks(modules: Sequence[Placed]) -> None:
-    """Raises where a module marks readings as missing, and no module looks at its mask."""
-    read = {key for _, module in modules for key in chain(*reads(module))}
-    for place, module in modules:
-        for key in marks_of(module):
-            if key not in read:
-                raise ValueError(
-                    f"{place!r} ({type(module).__name__}) marks readings as missing in {key!r}, which no module of the "
-                    f"filter reads: give observed_key={key!r} to the filter or its analysis."
-                )
-
-
 def _forecasts(
     carry: Sequence[NestedKey], written: Sequence[NestedKey], chosen: Mapping[NestedKey, NestedKey]
 ) -> dict[NestedKey, NestedKey]:
@@ -307,18 +273,6 @@ def _forecasts(
     return found
 
 
-def _observation_dims(modules: Sequence[Placed]) -> dict[NestedKey, int]:
-    """How many numbers an entry has, where all modules that write it agree."""
-    sizes: dict[NestedKey, set[int]] = {}
-    for _, module in modules:
-        for part in submodels(module):
-            own = [part] if part.observation_dim is not None else submodels(part)
-            found = {inner.observation_dim for inner in own if inner.observation_dim is not None}
-            for key in map(unravel_key, part.out_keys):
-                sizes.setdefault(key, set()).update(found)
-    return {key: found.pop() for key, found in sizes.items() if len(found) == 1}
-
-
 def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequence[NestedKey]) -> list[NestedKey]:
     """The entries from outside of which the analyses' readings are made, through whatever sensors."""
     found: dict[NestedKey, None] = {}
@@ -330,111 +284,6 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
             found.update(dict.fromkeys(reads(module)[0]))
     made_by_steps = {key for _, module in update for key in writes(module)}
     return [key for key in found if key in needed and key not in made_by_steps]
-
-
-def _plain(update: Sequence[Placed], needed: Sequence[NestedKey]) -> Iterator[NestedKey]:
-    """The readings that come from outside as they are; of an analysis they stand in front of their noise."""
-    for _, module in update:
-        for part in submodels(module):
-            first = [unravel_key(key) for key in part.reading_keys[:1]]
-            yield from (key for key in first if key in needed)
-
-
-def _guards(
-    frames: Sequence[Placed], update: Sequence[Placed], needed: Sequence[NestedKey], initial: TensorDictModuleBase
-) -> tuple[Guard, ...]:
-    """What each mask hides, of the entries from outside that the readings are made of."""
-    parts = [part for module in (*(module for _, module in update), initial) for part in submodels(module)]
-    made_by_steps = {key for _, module in update for key in writes(module)}
-    sources: dict[NestedKey, list[NestedKey]] = {}
-    for key in {unravel_key(key) for part in parts for key in part.reading_keys}:
-        found = {key: None}
-        for _, module in reversed([*frames, *update]):
-            if not found.keys().isdisjoint(writes(module)):
-                found.update(dict.fromkeys(declared(module).source_keys or reads(module)[0]))
-        sources[key] = [source for source in found if source in needed and source not in made_by_steps]
-    return guards_of(_in_front(parts, sources), sources, _made_of(frames, parts))
-
-
-def _made_of(frames: Sequence[Placed], parts: Sequence[SubModel]) -> dict[NestedKey, NestedKey]:
-    """The mask that each mask is made of, where a part reads one and writes another: hidden is what the first hides."""
-    masks = {unravel_key(part.observed_key) for part in parts if part.observed_key is not None}
-    found = {made: given for _, module in frames for made, given in marks_of(module).items()}
-    for part in parts:
-        own = part.observed_key
-        if own is not None:
-            found.update({key: unravel_key(own) for key in writes(part) if key in masks and key != unravel_key(own)})
-    return found
-
-
-def _in_front(parts: Sequence[SubModel], sources: Mapping[NestedKey, Sequence[NestedKey]]) -> list[SubModel]:
-    """The parts but for those whose mask another part makes, if others hide the same entries where they come in."""
-    made = {key for part in parts for key in writes(part) if key != part.observed_key}
-    first = [part for part in parts if part.observed_key not in made]
-
-    def hidden(some: Sequence[SubModel]) -> set[NestedKey]:
-        keys = (unravel_key(key) for part in some for key in part.reading_keys)
-        return {source for key in keys for source in sources[key]}
-
-    covered = hidden(first)
-    return [part for part in parts if part in first or not covered.issuperset(hidden([part]))]
-
-
-def _unmasked(steps: Sequence[Placed], carry: Sequence[NestedKey]) -> Iterator[Placed]:
-    """The modules of the update that take in a reading, but name no optional entry, as a mask would be.
-
-    They say what their reading is, or they write the belief and read an entry that no step makes.
-    """
-    made = {*carry, *(key for _, module in steps for key in writes(module))}
-    for place, module in steps[1:]:
-        for part in in_sequences(module):
-            must, may = reads(part)
-            updates = not made.issuperset(must) and not set(carry).isdisjoint(writes(part))
-            if not may and (updates or declared(part).reading_keys):
-                yield place, part
-
-
-def _refuse_overwriting(modules: Sequence[Placed]) -> None:
-    """Raises where all that a module writes is written again before anybody has read it."""
-    for index, (place, module) in enumerate(modules):
-        info = declared(module).info_prefix
-        unread = {key for key in writes(module) if info is None or key[0] != info}
-        used = False
-        for other_place, other in modules[index + 1 :]:
-            must, may = reads(other)
-            used = used or not unread.isdisjoint((*must, *may))
-            lost = unread.intersection(writes(other))
-            if lost and not used:
-                raise ValueError(
-                    f"{other_place!r} ({type(other).__name__}) writes {sorted(map(str, lost))} over what {place!r} "
-                    f"({type(module).__name__}) wrote, before any module has read it. Give one of them other keys, "
-                    "e.g. out_key=, or belief_prefix= of the first analysis and forecast_key= of the second."
-                )
-
-
-def _refuse_unused(steps: Sequence[Placed], belief: Sequence[NestedKey]) -> None:
-    """Raises where nobody uses what an analysis writes: its reading would be lost."""
-    used = set(belief)
-    for place, module in reversed(steps[1:]):
-        info = declared(module).info_prefix
-        made = [key for key in writes(module) if info is None or key[0] != info]
-        if made and takes_reading(module) and used.isdisjoint(made):
-            raise ValueError(
-                f"{place!r} ({type(module).__name__}) takes in {list(module.reading_keys)} and writes {made}, which no "
-                "module behind it reads and which is not the belief: the reading would be lost. The next analysis goes "
-                "on from there: give it forecast_key= or forecast_prefix= of that name."
-            )
-        used.update(chain(*reads(module)))
-
-
-def _refuse_nesting(read: Sequence[NestedKey], written: Sequence[NestedKey]) -> None:
-    """Raises where a tensor would have to hold another entry."""
-    names = set(read) | set(written)
-    for key in written:
-        for length in range(1, 1 if isinstance(key, str) else len(key)):
-            outer = key[0] if length == 1 else key[:length]
-            if outer in names:
-                raise ValueError(f"{outer!r} is a tensor, so that {key!r} cannot be written: rename one of them.")
 
 
 def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey]], dict]:
@@ -457,10 +306,9 @@ def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey
                 "would be overwritten: give each its own info_prefix."
             )
         for place, module in placed:
-            keys = [key for key in writes(module) if key[0] == info]
-            own_info[place] = {key: (info, place, *key[1:]) for key in keys}
-            for key in keys:
-                if key[-1] in ("nis", "log_likelihood"):
+            own_info[place] = {key: (info, place, *key[1:]) for key in writes(module) if key[0] == info}
+            for key in ((info, "nis"), (info, "log_likelihood")):
+                if key in own_info[place]:
                     totals.setdefault(key, []).append(own_info[place][key])
     return own_info, {key: tuple(values) for key, values in totals.items()}
 
@@ -470,7 +318,7 @@ def _likelihoods(steps: Sequence[Placed], own_info: Mapping, totals: Mapping) ->
     found = []
     for place, module in steps:
         for part in in_sequences(module):
-            for key in writes(part):
-                if key[0] == declared(part).info_prefix and key[-1] == "log_likelihood":
-                    found.append(key if key in totals else own_info.get(place, {}).get(key, key))
+            key = (declared(part).info_prefix, "log_likelihood")
+            if key in writes(part):
+                found.append(key if key in totals else own_info.get(place, {}).get(key, key))
     return list(dict.fromkeys(found))

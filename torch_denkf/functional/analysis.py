@@ -152,23 +152,13 @@ def check_analysis_arguments(
     forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, significance, space
 ) -> None:
     """Refuses arguments of :func:`analyse` that do not fit each other."""
-    check_ensemble("forecast", forecast, min_size=2)
-    check_one_dtype(forecast=forecast, predicted=predicted, observation=observation, noise=noise)
-    if predicted.ndim < 2:
-        raise ValueError(f"predicted must be [*B, E, O], got {list(predicted.shape)}")
-    batch, size, dim = forecast.shape[:-2], forecast.shape[-2], predicted.shape[-1]
-    samples = observation.ndim == forecast.ndim
-    if samples and observation.shape[-2] != size:
-        raise ValueError(
-            f"observation must be [*B, E, O], a sample for each of E = {size} members, got {observation.shape[-2]} "
-            "samples; give the sensor the ensemble_size of the initial belief"
-        )
-    each, single = ((*batch, size, dim), "[*B, E, O]"), ((*batch, dim), "[*B, O]")
-    check_shapes(
-        ("predicted", predicted, *each),
-        ("noise", noise, *single),
-        ("observation", observation, *(each if samples else single)),
-    )
+    batch, size, dim = forecast.shape[:-2], forecast.shape[-2:-1], predicted.shape[-1:]
+    each, single = (*batch, *size, *dim), (*batch, *dim)
+    fits = forecast.ndim > 1 and predicted.shape == each and noise.shape == single and size[0] > 1
+    fits = fits and observation.shape in (each, single) and forecast.is_floating_point()
+    if not fits or not forecast.dtype == predicted.dtype == observation.dtype == noise.dtype:
+        _check_entries(forecast, predicted, observation, noise)
+    (size,), (dim,) = size, dim
     if scheme not in get_args(Scheme):
         raise ValueError(f"scheme must be one of {', '.join(get_args(Scheme))}, got {scheme!r}")
     if space not in get_args(Space):
@@ -194,11 +184,32 @@ def check_analysis_arguments(
                 raise ValueError(f"the {name}'s taper must be [*B, {rows}, {dim}], got {list(value.shape)}")
     if significance is not None and space == "ensemble":
         raise ValueError("significance needs observation space; leave space out")
-    check_significance(significance, size)
+    if significance is not None:
+        check_significance(significance, size)
     if rotation is not None:
         if scheme != "etkf":
             raise ValueError(f"rotation is for scheme 'etkf', not {scheme!r}; leave it out")
         check_shape("rotation", rotation, (*batch, size, size), "[*B, E, E]")
+
+
+def _check_entries(forecast: Tensor, predicted: Tensor, observation: Tensor, noise: Tensor) -> None:
+    check_ensemble("forecast", forecast, min_size=2)
+    check_one_dtype(forecast=forecast, predicted=predicted, observation=observation, noise=noise)
+    if predicted.ndim < 2:
+        raise ValueError(f"predicted must be [*B, E, O], got {list(predicted.shape)}")
+    batch, size, dim = forecast.shape[:-2], forecast.shape[-2], predicted.shape[-1]
+    samples = observation.ndim == forecast.ndim
+    if samples and observation.shape[-2] != size:
+        raise ValueError(
+            f"observation must be [*B, E, O], a sample for each of E = {size} members, got {observation.shape[-2]} "
+            "samples; give the sensor the ensemble_size of the initial belief"
+        )
+    each, single = ((*batch, size, dim), "[*B, E, O]"), ((*batch, dim), "[*B, O]")
+    check_shapes(
+        ("predicted", predicted, *each),
+        ("noise", noise, *single),
+        ("observation", observation, *(each if samples else single)),
+    )
 
 
 def _observation_space(

@@ -56,13 +56,18 @@ def kalman_predict(mean: Tensor, cov: Tensor, transition: Tensor, noise: Tensor)
         (tensor([0.5000, 1.0000]), tensor([[1.2500, 0.5000],
                 [0.5000, 1.0000]]))
     """
-    check_one_dtype(mean=mean, cov=cov, transition=transition)
-    _check_moments(mean, cov, noise)
     square = cov.shape[-2:]
-    check_shapes(
-        ("transition", transition, square if transition.ndim == 2 else cov.shape, "[S, S] or [*B, S, S]"),
-        ("noise", noise, square if noise.ndim == 2 else cov.shape, "[S, S] or [*B, S, S]"),
-    )
+    plain = mean.dtype == cov.dtype == transition.dtype == noise.dtype and transition.shape == noise.shape == square
+    if not (plain and mean.ndim) or cov.shape != (
+        *mean.shape,
+        mean.shape[-1],
+    ):
+        check_one_dtype(mean=mean, cov=cov, transition=transition)
+        _check_moments(mean, cov, noise)
+        check_shapes(
+            ("transition", transition, square if transition.ndim == 2 else cov.shape, "[S, S] or [*B, S, S]"),
+            ("noise", noise, square if noise.ndim == 2 else cov.shape, "[S, S] or [*B, S, S]"),
+        )
     return _apply(transition, mean), transition @ cov @ transition.mT + noise
 
 
@@ -102,16 +107,8 @@ def kalman_update(
         >>> update.mean, update.cov
         (tensor([1.]), tensor([[0.5000]]))
     """
-    check_one_dtype(mean=mean, cov=cov, observation=observation, observation_matrix=observation_matrix)
-    _check_moments(mean, cov, noise)
+    _check_update(mean, cov, observation, observation_matrix, noise)
     batch, state_dim, dim = mean.shape[:-1], mean.shape[-1], observation.shape[-1]
-    matrix_batch = () if observation_matrix.ndim == 2 else batch
-    noise_shape = (*batch, dim) if noise.ndim == mean.ndim else (*batch, dim, dim)
-    check_shapes(
-        ("observation", observation, (*batch, dim), "[*B, O]"),
-        ("observation_matrix", observation_matrix, (*matrix_batch, dim, state_dim), "[O, S] or [*B, O, S]"),
-        ("noise", noise, noise_shape, "variances [*B, O] or covariances [*B, O, O]"),
-    )
     if noise.ndim == mean.ndim:
         noise = noise.diag_embed()
     identity = torch.eye(dim, dtype=mean.dtype, device=mean.device)
@@ -134,6 +131,23 @@ def kalman_update(
     cov = keep @ cov @ keep.mT + gain @ noise @ gain.mT
     log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
     return GaussianUpdate(mean + _apply(gain, innovation), (cov + cov.mT) / 2, innovation, nis, log_likelihood)
+
+
+def _check_update(mean: Tensor, cov: Tensor, observation: Tensor, matrix: Tensor, noise: Tensor) -> None:
+    batch, size, dim = mean.shape[:-1], mean.shape[-1:], observation.shape[-1:]
+    noise_shape = (*batch, *dim) if noise.ndim == mean.ndim else (*batch, *dim, *dim)
+    plain = mean.dtype == cov.dtype == observation.dtype == matrix.dtype == noise.dtype
+    fits = observation.shape == (*batch, *dim) and matrix.shape == (*dim, *size) and noise.shape == noise_shape
+    if plain and fits and size and cov.shape == (*batch, *size, *size):
+        return
+    check_one_dtype(mean=mean, cov=cov, observation=observation, observation_matrix=matrix)
+    _check_moments(mean, cov, noise)
+    matrix_batch = () if matrix.ndim == 2 else batch
+    check_shapes(
+        ("observation", observation, (*batch, *dim), "[*B, O]"),
+        ("observation_matrix", matrix, (*matrix_batch, *dim, *size), "[O, S] or [*B, O, S]"),
+        ("noise", noise, noise_shape, "variances [*B, O] or covariances [*B, O, O]"),
+    )
 
 
 def gaussian_log_prob(value: Tensor, mean: Tensor, cov: Tensor) -> Tensor:

@@ -80,7 +80,7 @@ class FusedFilter(Filter):
             weights ``[*B, 1]`` stand under ``("weight", NAME)``. ``None``: readings count as their noise says.
         lag: L; by default the largest delay.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
-            ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
+            ``check_finite`` and ``prefix`` of :class:`Filter`.
 
     Raises:
         ValueError: if there is no sensor, a delay is negative or beyond the lag, process noise is missing or given

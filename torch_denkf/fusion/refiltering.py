@@ -154,10 +154,7 @@ class Refiltering(Checked):
         row = row.copy()
         carry = {key: belief[key] for key in self.filter.carry_keys}
         entries = {**self.filter.entries_of(row, one_step=True), **carry}
-        drawn, complete = self.filter.missing_noise(entries, row.batch_size, self.filter.structure.modules)
-        if not complete:
-            raise ValueError("A module cannot draw its noise before the step, so that the step cannot be made again.")
-        self.filter.write(row, drawn)
+        self.filter.write(row, self.filter.missing_noise(entries, row.batch_size))
         return row
 
     def _place(self, rows: list[TensorDictBase]) -> int:

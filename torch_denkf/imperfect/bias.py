@@ -28,6 +28,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_values
+from torch_denkf.beliefs import is_samples
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.modules._tensors import as_standard_deviations
@@ -304,7 +305,7 @@ class BiasedBelief(SubModel):
     @property
     def noise_names(self) -> tuple[str, ...]:
         """The draws of an ensemble's biases."""
-        return ("",) if any(key[-1] == "ensemble" for key in self.out_keys) else ()
+        return ("",) if any(map(is_samples, self.out_keys)) else ()
 
     def parts(self):
         """The initial belief of the state."""

@@ -25,10 +25,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.beliefs import Ensemble, complete
 from torch_denkf.functional.manifolds import is_flat
 from torch_denkf.functional.mixture import log_mixture, mix_members, mix_moments, responsibility
-from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import scored_innovation
 from torch_denkf.modules._tensors import mean_of_members
 from torch_denkf.modules.carried import AnalysisAround
@@ -223,13 +222,8 @@ class Visible(AnalysisAround):
         both = mix_members(share, torch.cat(after, -1), torch.cat(before, -1))
         parts = both.split([part.shape[-1] for part in after], -1)
         mixed = {key: part.reshape(out[key].shape) for (_, key), part in zip(pairs, parts, strict=True)}
-        ensemble = mixed[pairs[0][1]]
-        mean = ensemble_mean(ensemble)
-        told = {"mean": mean, "var": ensemble_var(ensemble, mean)}
-        for key in analysis.out_keys[1:]:
-            if key[:-1] == pairs[0][1][:-1] and key[-1] in ("mean", "var", "cov"):
-                mixed[key] = told[key[-1]] if key[-1] in told else ensemble_cov(ensemble)
-        return mixed
+        kind = Ensemble(pairs[0][1][:-1])
+        return complete(mixed, [key for key in analysis.out_keys if key[:-1] == kind.prefix], [kind])
 
     def _particles(
         self, entries: Entries, call: Call, visible: Tensor, mask: Tensor | None, seen: Tensor | None

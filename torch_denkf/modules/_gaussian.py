@@ -81,10 +81,10 @@ class GaussianTransition(SubModel):
 
     def on_entries(self, entries, call):
         """The forecast."""
-        return self.with_cross(entries, call)[0]
+        return self.with_cross(entries, call, wanted=False)[0]
 
-    def with_cross(self, entries: Entries, call: Call, *, wanted: bool = False) -> tuple[Entries, torch.Tensor | None]:
-        """The forecast; and, where wanted, the covariance of the states before and after ``[*B, S, S]``."""
+    def with_cross(self, entries: Entries, call: Call, *, wanted: bool = True) -> tuple[Entries, torch.Tensor | None]:
+        """Returns the forecast; and, where wanted, the covariance of the states before and after ``[*B, S, S]``."""
         mean, cov = (self.required(entries, key) for key in self.in_keys[:2])
         mean, cov, cross = self._forecast(entries, mean, cov, call._replace(sample=False), wanted)
         work = {**entries, self.out_keys[0]: mean}

@@ -10,9 +10,9 @@ from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf._checks import check_count, check_values
+from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.modules._spaces import moments_on
 from torch_denkf.modules._tensors import (
     as_floating,
     as_standard_deviations,
@@ -195,7 +195,7 @@ class FromSensor(_InitialEnsemble):
 
     def on_entries(self, entries, call):
         """The belief; without its reading the prior."""
-        if call.missing.isdisjoint(self.in_keys):
+        if all(key in entries for key in self.in_keys):
             return super().on_entries(entries, call)
         mean, std = (part.expand(*call.batch_size, -1) for part in (self.mean, self.std))
         noise = cast("torch.Tensor | None", self._noise(entries, [], call))

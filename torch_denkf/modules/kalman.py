@@ -167,12 +167,10 @@ class LinearTransition(SubModel):
         return {"noise": self.noise} if isinstance(self.noise, nn.Module) else {}
 
     def on_entries(self, entries, call):
-        """The forecast."""
-        return self.with_cross(entries, call)[0]
-
-    def with_cross(self, entries: Entries, call: Call, *, wanted: bool = False) -> tuple[Entries, torch.Tensor | None]:
-        """The forecast; and, where wanted, the covariance of the states before and after ``[*B, S, S]``."""
-        mean, cov = self.values(entries)[:2]
+        """Returns the forecast."""
+        mean, cov = entries.get(self.in_keys[0]), entries.get(self.in_keys[1])
+        if mean is None or cov is None:
+            mean, cov = self.values(entries)[:2]  # raises, and says what there is
         noise = self.noise
         constant = noise if isinstance(noise, torch.Tensor) else torch.zeros_like(cov)
         # A module's is added below, because it may read the forecast's mean.
@@ -182,8 +180,11 @@ class LinearTransition(SubModel):
         if not isinstance(noise, torch.Tensor):
             written = run_module(noise, {**entries, self.out_keys[0]: forecast}, call.part("noise"))
             forecast_cov = forecast_cov + as_covariance(written[unravel_key(noise.out_keys[0])], mean)
-        cross = cov @ self.matrix.mT if wanted else None
-        return {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}, cross
+        return {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}
+
+    def with_cross(self, entries: Entries, call: Call) -> tuple[Entries, torch.Tensor]:
+        """Returns the forecast, and the covariance of the states before and after, ``[*B, S, S]``."""
+        return self.on_entries(entries, call), self.required(entries, self.in_keys[1]) @ self.matrix.mT
 
 
 class KalmanAnalysis(SubModel):

@@ -21,11 +21,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number
+from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.resampling import effective_sample_size, jitter_copies
 from torch_denkf.functional.weighted import weighted_innovation, weighted_mean, weighted_var
-from torch_denkf.modules._spaces import moments_on
 from torch_denkf.modules.carried import Beside
 from torch_denkf.modules.likelihood import GaussianLikelihood
 from torch_denkf.running import check_module, reads, run_module

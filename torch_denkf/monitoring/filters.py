@@ -7,10 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Unpack
 
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters.base import Filter
+from torch_denkf.filters.structure import submodels
 from torch_denkf.fusion.parts import StateObservation
 from torch_denkf.modules.carried import with_state
 from torch_denkf.monitoring.gate import GatedAnalysis, GateOptions, can_be_gated
@@ -217,11 +218,20 @@ def _with(module: TensorDictModuleBase, old: SubModel, new: SubModel) -> TensorD
     return TensorDictSequential(OrderedDict((name, _with(part, old, new)) for name, part in named_modules_of(module)))
 
 
+def _dims_of(module: TensorDictModuleBase, key: NestedKey) -> Iterator[int]:
+    """The numbers of components that sub-models say of an entry which they write."""
+    for part in submodels(module):
+        if key in map(unravel_key, part.out_keys):
+            own = [part] if part.observation_dim is not None else submodels(part)
+            yield from (inner.observation_dim for inner in own if inner.observation_dim is not None)
+
+
 def _dim(filter: Filter, analysis: SubModel) -> int:
     """How many components an analysis' reading has."""
-    known = [filter.structure.observation_dims.get(unravel_key(key)) for key in analysis.reading_keys[1:]]
-    if known and known[0] is not None:
-        return known[0]
+    for key in map(unravel_key, analysis.reading_keys[1:2]):
+        known = {dim for _, module in filter.structure.modules for dim in _dims_of(module, key)}
+        if len(known) == 1:
+            return known.pop()
     try:
         return analysis.reading_dims({}, Call(torch.Size()))[0]
     except KeyError:

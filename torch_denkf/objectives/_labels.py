@@ -217,7 +217,7 @@ class Truth:
         filter = self.loss.filter
         if self.loss.space is not None:
             return self.loss.space.point_dim
-        values = (self.out.get(key, None) for key in filter.structure.carry if key[-1] in ("ensemble", "mean"))
+        values = (self.out.get(kind.carry[0], None) for kind in filter.structure.kinds if kind.carried)
         sizes = (value.shape[-1] for value in values if value is not None)
         return next(sizes, declared(filter.initial).state_dim)
 

@@ -12,6 +12,7 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from torch_denkf import beliefs
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble, crps_gaussian, crps_weighted, energy_score
 from torch_denkf.functional.gaussian import gaussian_log_prob
@@ -48,7 +49,7 @@ class Members(OfBelief):
 
     def forward(self, out, truth):
         filter = truth.loss.filter
-        weights = [key for key in written_by(filter) if isinstance(key, tuple) and key[-1] == "log_weight"]
+        weights = [kind.key("log_weight") for kind in filter.structure.kinds if isinstance(kind, beliefs.Particles)]
         if weights:
             raise TypeError(
                 f"DEnKFLoss scores members that count alike, but those of this {type(filter).__name__} have weights, "

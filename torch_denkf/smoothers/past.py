@@ -19,10 +19,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_shape
+from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
-from torch_denkf.modules._spaces import moments_on
 from torch_denkf.modules.carried import AnalysisAround, Beside, InPlaceOf
 from torch_denkf.running import declared
 from torch_denkf.submodel import Entries, SubModel

@@ -60,7 +60,7 @@ class CrossTransition(InPlaceOf):
 
     def on_entries(self, entries, call):
         """The forecast and the cross-covariance."""
-        written, cross = self.module.with_cross(entries, call, wanted=True)
+        written, cross = self.module.with_cross(entries, call)
         return {**written, unravel_key(self.out_keys[-1]): cross}
 
     def without_step(self, entries):

@@ -68,8 +68,8 @@ class FilterTrainer(HookPoints):
         seed: of all random numbers of the training, at least 0. The model's initial parameters are yours to seed.
         device: by default the GPU if there is one.
         keep: ``"best"``, or ``"last"``: stages begin and end with the parameters of the last update.
-        max_skipped: so many non-finite updates in a row are left out, those included whose batch has readings that a
-            filter refuses; one more is an error. The first such batch of a stage is logged, with the reading's key.
+        max_skipped: so many updates in a row are left out because the loss or its gradient is not finite; one more is
+            an error. The first one of a stage is logged, with the entries of its batch that are not finite.
         progress: whether a bar, or off a terminal a line every ten seconds, shows how far it is.
 
     Raises:
@@ -216,22 +216,20 @@ class FilterTrainer(HookPoints):
         self._call_hooks("pre_optim_steps")
         batch = self._hooked_batch(stage.sample(generator, length).to(self.processes.device))
         values = self._hooked_values("pre_steps_log", batch) if logged else {}
-        told = bool(updates.refused)
-        updates.step(batch)
-        if updates.refused and not told:
+        if not updates.step(batch) and updates.skipped == 1:
             _LOG.warning(
-                "Stage %r, update %d is left out, as will be all whose batch has such readings; they are counted as "
+                "Stage %r, update %d is left out, as are all whose loss or gradient is not finite; they are counted as "
                 "skipped. %s",
                 stage.name,
                 update + 1,
-                updates.refused,
+                updates.cause,
             )
         self._call_hooks("post_optim")
         if updates.in_a_row > self.max_skipped:
             raise FloatingPointError(
                 f"Stage {stage.name!r}, update {update + 1}: the loss or its gradient was not finite in "
                 f"{updates.in_a_row} updates in a row. Look for NaN in the batches; lower lr or clip. The last save, "
-                f"{self.last_checkpoint}, is sound. {updates.refused}".rstrip()
+                f"{self.last_checkpoint}, is sound. {updates.cause}".rstrip()
             )
         if logged:
             values |= updates.summary() | ({} if length is None else {"length": length})

@@ -11,7 +11,6 @@ import torch
 from tensordict import TensorDictBase
 from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 
-from torch_denkf.filters.finish import AbsurdReading
 from torch_denkf.training.distributed import Processes
 from torch_denkf.training.stage import Stage
 
@@ -53,9 +52,9 @@ class Updates:
         processes: with which the gradient is averaged.
 
     Attributes:
-        skipped: updates of the stage that were left out because the loss, its gradient or a reading was not finite.
+        skipped: updates of the stage that were left out because the loss or its gradient was not finite.
         in_a_row: those of them that were the last ones.
-        refused: what a filter said of the last batch whose readings it refused.
+        cause: names the entries that were not finite in the batch of the last of them; empty where all were finite.
 
     Example:
         >>> net = torch.nn.Linear(1, 1, bias=False)
@@ -72,10 +71,10 @@ class Updates:
         self.parameters = [parameter for group in groups for parameter in group["params"]]
         self.skipped = self.in_a_row = self._count = 0
         self._sums: dict[str, torch.Tensor] = {}
-        self._lr, self.refused = 0.0, ""
+        self._lr, self.cause = 0.0, ""
 
     def step(self, batch: TensorDictBase) -> bool:
-        """Makes one optimiser step, unless the loss, its gradient or a reading is not finite.
+        """Makes one optimiser step, unless the loss or its gradient is not finite.
 
         A step left out leaves parameters, optimiser and schedule as they are. Whether a step is finite is the only
         number that is read back from the device.
@@ -83,14 +82,7 @@ class Updates:
         Returns:
             whether the step was made; the same in all processes.
         """
-        terms: dict[str, torch.Tensor] = {}
-        broken = False
-        try:
-            terms = self._terms(batch)
-        except AbsurdReading as error:  # one row of a recording is not to end a long training
-            broken, self.refused = True, str(error)
-        if self.processes.any(broken):
-            return self._skip()
+        terms = self._terms(batch)
         first, *others = [value for name, value in terms.items() if name.startswith("loss")]
         total = sum(others, first)
         if not total.requires_grad:
@@ -102,7 +94,7 @@ class Updates:
         values = self.processes.average_(self.parameters, values)
         norm = get_total_norm([p.grad for p in self.parameters if p.grad is not None])
         if not bool(torch.isfinite(values[-1] + norm)):
-            return self._skip()
+            return self._skip(batch)
         self.in_a_row = 0
         if self.stage.clip is not None:
             clip_grads_with_norm_(self.parameters, self.stage.clip, norm)
@@ -114,8 +106,12 @@ class Updates:
         self._count += 1
         return True
 
-    def _skip(self) -> bool:
+    def _skip(self, batch: TensorDictBase) -> bool:
+        """Leaves the step out, and says which entries of the batch are not finite."""
         self.skipped, self.in_a_row = self.skipped + 1, self.in_a_row + 1
+        values = batch.items(True, True) if isinstance(batch, TensorDictBase) else batch.items()
+        keys = [key for key, value in values if value.is_floating_point() and not bool(value.isfinite().all())]
+        self.cause = f"{keys} of its batch hold NaN or infinity: RejectReadings hides such readings." if keys else ""
         self.optimiser.zero_grad()
         return False
 

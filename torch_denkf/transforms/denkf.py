@@ -2,36 +2,27 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from importlib import import_module
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.data import Composite, Unbounded
-from torchrl.envs.transforms import Compose, Transform, TransformedEnv
+from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf._arguments import Checked
 from torch_denkf._one_sequence import refuse_unmarked_slices
+from torch_denkf.beliefs import is_summary
 from torch_denkf.filters import Filter
-from torch_denkf.filters.finish import own, refuse_far_belief, refuse_non_finite
-from torch_denkf.filters.refusals import refuse_unguarded
-from torch_denkf.filters.rejection import REJECTED
+from torch_denkf.filters.finish import Record, check_belief
 from torch_denkf.filters.scan import where_rows
 from torch_denkf.submodel import Entries
 from torch_denkf.transforms._packaged import PackagedRun, Step
 from torch_denkf.transforms.primer import refuse_resets_of_groups
 
 __all__ = ["DEnKFTransform"]
-
-#: What to do where an environment emits a reading that is not finite.
-_CURE = (
-    "Where a frame is missing or broken, set {masks} to False for it (it is then not read), or repair it in a "
-    "transform before DEnKFTransform. With check_finite=False such readings count as missing."
-)
 
 
 class DEnKFTransform(Checked, Transform):
@@ -70,10 +61,8 @@ class DEnKFTransform(Checked, Transform):
             collectors leave out of their data. Only outside a ``SerialEnv`` or ``ParallelEnv``.
         no_grad: whether environment steps record no graph (training recomputes the sequence). A graph through a
             rollout grows with every step, so this is on by default.
-        check_finite: whether a reading or a belief that is not finite raises, and a reading larger than 1e18. Costs two
-            synchronisations a step. ``False`` instead counts such readings as not observed in an environment, see
-            ``reject`` of
-            :class:`~torch_denkf.filters.Filter`; ``diagnostics=[("info", "rejected")]`` keeps their number.
+        check_finite: whether a belief that is not finite raises; costs a synchronisation a step. Where an environment
+            emits readings that are not finite, put ``torch_denkf.imperfect.RejectReadings`` in front.
         packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step` (native code:
             load only what you would execute). At B=1 it is ten times as fast as the filter itself. It has the
             parameters of its export, is for environments of the batch size of the export, and not for use inside a
@@ -115,10 +104,7 @@ class DEnKFTransform(Checked, Transform):
             filter = Filter(*filter._module_iter(), initial=initial)
         elif initial is not None:
             raise TypeError("A Filter has its initial belief already; give initial= with a TensorDictSequential only.")
-        structure, self._reject = filter.structure, filter.reject or not check_finite
-        if self._reject:
-            refuse_unguarded(structure, type(filter).__name__)
-        written = [*structure.out_keys, *([REJECTED] if self._reject else [])]
+        structure, written = filter.structure, filter.structure.out_keys
         inner = {filter.outer(key): key for key in written}
         further = [inner.get(key, key) for key in map(unravel_key, diagnostics)]
         unknown = [key for key in further if key not in written]
@@ -126,7 +112,7 @@ class DEnKFTransform(Checked, Transform):
             raise KeyError(f"diagnostics {unknown} are not written by the filter; it writes {list(inner)}.")
         self._keep = [*structure.belief, *further]
         self.store_ensemble, self.no_grad, self.check_finite = store_ensemble, no_grad, check_finite
-        dropped = [] if store_ensemble else [key for key in structure.belief if key[-1] not in ("mean", "var", "age")]
+        dropped = [] if store_ensemble else [key for key in structure.belief if not is_summary(key)]
         super().__init__(
             in_keys=list(structure.needed),
             out_keys=[filter.outer(key) for key in self._keep if key not in dropped],
@@ -140,12 +126,6 @@ class DEnKFTransform(Checked, Transform):
             raise ValueError("A packaged step records no graph; leave out packaged=, or no_grad=False.")
         self._packaged = None
         if packaged is not None:
-            if self._reject and ".".join(REJECTED) not in packaged.outputs:
-                warnings.warn(
-                    "The packaged step rejects no readings: one NaN spoils the belief until the next reset. Export it "
-                    "from a filter with reject=True, or leave check_finite on.",
-                    stacklevel=2,
-                )
             self._packaged = PackagedRun(
                 packaged,
                 carry={key: self._names[key] for key in structure.carry},
@@ -164,9 +144,7 @@ class DEnKFTransform(Checked, Transform):
         if self._packaged is not None:
             kept = self._packaged(tensordict, next_tensordict)
             if kept is not None:  # otherwise what follows says what is missing
-                if self.check_finite:
-                    self._assert_finite(_present(next_tensordict, (*self.in_keys, *self._optional)), kept)
-                return self._emit(kept, next_tensordict)
+                return self._emit({}, kept, next_tensordict)
         entries = {}
         for key in self.filter.structure.carry:
             name = self._names[key]
@@ -183,28 +161,23 @@ class DEnKFTransform(Checked, Transform):
             value = next_tensordict.get(key, None)
             if value is not None:
                 entries[key] = value
-        self.filter.messages.ignored_masks(self.filter.structure, next_tensordict)
         with self._grad_mode(), set_recurrent_mode(False):
-            written = self.filter.take_step(entries, next_tensordict.batch_size, reject=self._reject)
-        if self.check_finite:
-            self._assert_finite(entries, written)
-        return self._emit(written, next_tensordict, entries.values())
+            written = self.filter.take_step(entries, next_tensordict.batch_size)
+        return self._emit(entries, written, next_tensordict)
 
     def _emit(
-        self,
-        written: Mapping[NestedKey, torch.Tensor],
-        next_tensordict: TensorDictBase,
-        given: Iterable[torch.Tensor] = (),
+        self, entries: Entries, written: Mapping[NestedKey, torch.Tensor], next_tensordict: TensorDictBase
     ) -> TensorDictBase:
-        kept = own({key: written[key] for key in self._names}, given)
+        kept = {key: written[key] for key in self._names}
+        record = Record("environment", next_tensordict, entries, kept, self.parent)
+        kept = self.filter.finished(record, check=self.check_finite)
         for key, name in self._names.items():
             next_tensordict.set(name, kept[key])
-        import_module("torch_denkf.diagnosis.messages").mark_up_to_date(kept[self.filter.structure.carry[0]])
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         with self._grad_mode(), set_recurrent_mode(False):
-            start = self.filter.initialise(tensordict_reset.copy(), reject=self._reject)
+            start = self.filter.initialise(tensordict_reset.copy())
             lacking = [key for key in self._keep if start.get(self.filter.outer(key), None) is None]
             if lacking:
                 # Diagnostics of an update that did not take place: zeros of the shapes that an update gives.
@@ -219,9 +192,7 @@ class DEnKFTransform(Checked, Transform):
             start = self.filter.summarise(start.exclude(*(key for key in self.filter.belief_keys if key not in given)))
         if self.check_finite:
             entries = self.filter.entries_of(start, one_step=True)
-            given = {key: value for key, value in entries.items() if key not in self.filter.structure.carry}
-            self._assert_finite(given, entries, used=self.filter.update_at_reset)
-            refuse_far_belief(entries, self.filter.structure.carry)  # one that was given
+            check_belief(self.filter.structure, entries, entries)
         for key, name in self._names.items():
             tensordict_reset.set(name, start.get(self.filter.outer(key)))
         return tensordict_reset
@@ -242,7 +213,7 @@ class DEnKFTransform(Checked, Transform):
         if self._controls:
             actions = self.parent.full_action_spec.zero()
             self._copy(actions, row, self._controls, "the environment's action spec")
-        return self.filter.take_step(self.filter.entries_of(row), row.batch_size, reject=self._reject)
+        return self.filter.take_step(self.filter.entries_of(row), row.batch_size)
 
     def _copy(self, source: TensorDictBase, target: dict | TensorDictBase, keys, owner: str) -> None:
         for key in keys:
@@ -258,10 +229,6 @@ class DEnKFTransform(Checked, Transform):
                 target[key] = value
             else:
                 target.set(key, value)
-
-    def _assert_finite(self, entries: Entries, written: Entries, *, used: bool = True) -> None:
-        """Raises where the belief is not finite, or a reading that was ``used`` is not."""
-        refuse_non_finite(self.filter.structure, entries, written, self._reject or not used, cure=_CURE)
 
     # ------------------------------------------------------------------------------------------------- the specs
 
@@ -301,25 +268,7 @@ class DEnKFTransform(Checked, Transform):
                 f"The environment emits {taken[0]!r} already, as that of another filter: one would start from the "
                 'belief of the other. Give this filter a name of its own, prefix="imu" for example.'
             )
-        self._warn_of_unread_masks()
         return self._add_specs(observation_spec, keys, observation_spec)
-
-    def _warn_of_unread_masks(self) -> None:
-        """Warns where a transform in front drops what the filter reads, and marks that in a mask it does not read."""
-        env, read = self.parent, {*self.in_keys, *self._optional}
-        while isinstance(env, TransformedEnv):
-            transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
-            for transform in transforms:
-                for key, mask in getattr(transform, "hidden_by", {}).items():
-                    if key in read and mask not in read:
-                        self.filter.messages.once(
-                            f"{mask!r} of {key!r}",
-                            f"{type(transform).__name__} marks where {key!r} is missing in {mask!r}, which no module "
-                            f"of {type(self.filter).__name__} reads: a missing reading, zero, counts as observed. Give "
-                            f"observed_key={mask!r} to the filter or its analysis, and to the sensor if there is one; "
-                            f"or leave observed_key= of {type(transform).__name__} at its default.",
-                        )
-            env = env.base_env
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Adds what the filter carries from step to step to the state spec."""
@@ -372,8 +321,3 @@ class DEnKFTransform(Checked, Transform):
 def _cuda_devices(tensordict: TensorDictBase) -> list[torch.device]:
     device = tensordict.device
     return [device] if device is not None and device.type == "cuda" else []
-
-
-def _present(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> dict[NestedKey, torch.Tensor]:
-    """The entries that are there."""
-    return {key: value for key in keys if (value := tensordict.get(key, None)) is not None}

@@ -12,7 +12,7 @@ import torch
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs import TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.damage import finite, leaves, same
@@ -23,6 +23,8 @@ from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.particle_for_tests import bootstrap
 from torch_denkf.baselines import LSTMFilter
 from torch_denkf.filters import Filter
+from torch_denkf.imperfect import RejectReadings
+from torch_denkf.imperfect.rejection import OnBad
 from torch_denkf.transforms import DEnKFTransform
 
 B, T = 3, 4
@@ -99,30 +101,36 @@ def _stepped(filter: Filter, frames: TensorDict) -> TensorDict:
     """Steps through the frames, as a robot does."""
     torch.manual_seed(2)
     rows = frames.exclude("is_init").unbind(1)
-    carry, out = filter.initialise(rows[0].copy()), []
+    carry, out, check = filter.initialise(rows[0].copy()), [], _front(filter, "raise")
     for row in rows[1:]:
         for key in filter.belief_keys:
             row.set(key, carry.get(key))
-        carry = filter.step(row)
+        carry = filter.step(check(row))
         out.append(carry.select(*filter.belief_keys).copy())
     return torch.stack(out, 1)
 
 
+def _front(filter: Any, on_bad: OnBad) -> RejectReadings:
+    """What judges the readings of a filter in front of it."""
+    reading = "measurement" if "measurement" in getattr(filter, "in_keys", ()) else "observation"
+    return RejectReadings({reading: "observed"}, on_bad=on_bad)
+
+
 def _sequence(filter: Filter, frames: TensorDict) -> TensorDict:
     torch.manual_seed(2)
-    return filter.sequence(frames.copy()).select(*filter.belief_keys)
+    return filter.sequence(_front(filter, "raise")(frames.copy())).select(*filter.belief_keys)
 
 
 def _smoothed(smoother: Any, frames: TensorDict) -> TensorDict:
     torch.manual_seed(2)
     keys = getattr(smoother, "smoothed_keys", None) or [key for key in smoother.out_keys if key[0] == "smoothed"]
-    return smoother.sequence(frames.copy()).select(*keys)
+    return smoother.sequence(_front(smoother, "raise")(frames.copy())).select(*keys)
 
 
-def _rollout(filter: Filter, frames: TensorDict, **options: Any) -> TensorDict:
+def _rollout(filter: Filter, frames: TensorDict, on_bad: OnBad = "raise") -> TensorDict:
     torch.manual_seed(2)
     inner = ReplayedFrames(frames)
-    env = TransformedEnv(inner, DEnKFTransform(filter, **options))
+    env = TransformedEnv(inner, Compose(_front(filter, on_bad), DEnKFTransform(filter)))
     out = env.rollout(T - 1, inner.player(), break_when_any_done=False)
     return out["next"].select(*filter.belief_keys)
 
@@ -132,7 +140,7 @@ RUNS: dict[str, Callable[[Any, TensorDict], TensorDict]] = {
     "sequence": _sequence,
     "transform": _rollout,
     "smoothed": _smoothed,
-    "transform without check_finite": partial(_rollout, check_finite=False),
+    "transform that rejects": partial(_rollout, on_bad="mask"),
 }
 
 # ----------------------------------------------------------------------------------------------------- what is right
@@ -419,6 +427,6 @@ def targets() -> Iterator[Target]:
     for fed in FILTERS:
         yield from everything("readings", fed)
         yield from carried("readings", fed)
-        yield fed_with("readings", fed, "transform without check_finite", "reading", GOES_ON)
+        yield fed_with("readings", fed, "transform that rejects", "reading", GOES_ON)
     yield from laid_out("readings", FILTERS[4], LAYOUTS)
     yield fed_with("readings", FILTERS[4], "sequence", "is_init", FLAGS, "is_init")

@@ -8,6 +8,7 @@ from tensordict.nn import TensorDictSequential
 from torch_denkf.applications.car import UnicycleMotion, UnicycleNoise, UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, with_history
 from torch_denkf.filters import EKF, DEnKF
+from torch_denkf.imperfect import RejectReadings
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select, SubModel
 
 DT, Q, R, START = 0.5, (0.3, 0.05), (0.2, 0.02), (0.0, 0.0, 0.0, 0.6, 0.1)
@@ -340,9 +341,7 @@ def test_a_rejected_reading_counts_as_not_observed(float64, masked):
     if not masked:
         del bad["observed"]
     filter, outs = pair_filter(16), []
-    filter.reject = True
-    filter._sort()  # as its constructor would
-    for data in (bad, hidden):
+    for data in (RejectReadings({"y": "observed"}, by_component=["y"])(bad), hidden):
         torch.manual_seed(3)
         outs.append(filter.sequence(data))
     assert outs[0]["info", "rejected"].flatten().tolist() == [0, 0, 0, 2, 0, 0]

@@ -1,0 +1,263 @@
+"""Kinds of belief: which entries each carries from step to step, what follows from them, and how they are limited.
+
+A kind is one class. A new one is a sub-class of :class:`Belief`, which is found by the names that it carries::
+
+    class Mixture(Belief):
+        carried = ("means", "covs", "log_weights")
+
+        def derived(self, name, *carried):
+            means, covs, log_weights = carried
+            ...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from math import sqrt
+from typing import ClassVar
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+
+from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.weighted import weighted_mean, weighted_median, weighted_var
+
+__all__ = [
+    "Belief",
+    "Ensemble",
+    "Moments",
+    "Particles",
+    "complete",
+    "is_samples",
+    "is_summary",
+    "kinds_of",
+    "moments_on",
+    "summary_keys",
+]
+
+#: The mean is clamped within so many of the largest standard deviations that a variance ceiling allows.
+_FARTHEST = 1000.0
+_SUMMARIES = ("mean", "var")
+
+
+def moments_on(space: Space, ensemble: Tensor, log_weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Returns the mean ``[*B, P]`` of members ``[*B, E, P]``, and the variances ``[*B, D]`` of their tangents there."""
+    mean = space.mean(ensemble, None if log_weights is None else log_weights.exp())
+    away = space.minus(ensemble, mean.unsqueeze(-2))
+    return mean, ensemble_var(away) if log_weights is None else weighted_var(away, log_weights)
+
+
+class Belief:
+    """A belief whose entries stand under one prefix; as it is, one of no known kind.
+
+    Args:
+        prefix: of its entries, ``("belief",)`` for example.
+        space: in which the state lives; ``None`` for plain numbers.
+
+    Attributes:
+        carried: names of the entries that go on from step to step; the first holds points of the state's space.
+        carry: their keys.
+
+    Example:
+        >>> kind, = kinds_of([("belief", "mean"), ("belief", "cov"), ("belief", "var")])
+        >>> type(kind).__name__, kind.key("mean")
+        ('Moments', ('belief', 'mean'))
+        >>> kind.derived("var", torch.zeros(2), torch.diag(torch.tensor([1.0, 4.0])))
+        tensor([1., 4.])
+    """
+
+    carried: ClassVar[tuple[str, ...]] = ()
+    _kinds: ClassVar[list[type[Belief]]] = []
+
+    def __init_subclass__(cls, **kwargs):
+        super().__init_subclass__(**kwargs)
+        Belief._kinds = sorted([cls, *Belief._kinds], key=lambda kind: -len(kind.carried))
+
+    def __init__(self, prefix: tuple[str, ...] = ("belief",), space: Space | None = None):
+        self.prefix, self.space = prefix, space
+        self.carry: list[NestedKey] = [(*prefix, name) for name in self.carried]
+
+    def key(self, name: str) -> NestedKey:
+        """Returns the key of an entry."""
+        return (*self.prefix, name)
+
+    def derived(self, name: str, *carried: Tensor) -> Tensor | None:
+        """Computes an entry that is not carried, ``"mean"`` or ``"var"``; ``None`` where it does not follow."""
+        return None
+
+    def finite(self, name: str, value: Tensor) -> Tensor:
+        """Tells whether a carried entry is finite, as a boolean tensor ``[]``."""
+        return value.isfinite().all()
+
+    def limited(self, held: Mapping[str, Tensor], ceiling: float) -> dict[str, Tensor]:
+        """Clamps variances to a ceiling; correlations stay, and the mean stays within reach of zero.
+
+        Args:
+            held: the belief's entries by name, ``"mean"`` and ``"var"`` among them.
+            ceiling: largest variance, in the state's units squared.
+
+        Returns:
+            The entries that change.
+        """
+        factor = self._factor(held, ceiling)
+        out = {"mean": self._within_reach(held["mean"], ceiling), "var": held["var"] * factor.square()}
+        if "cov" in held:
+            out["cov"] = held["cov"] * factor.unsqueeze(-1) * factor.unsqueeze(-2)
+        return out
+
+    def _factor(self, held: Mapping[str, Tensor], ceiling: float) -> Tensor:
+        return (held["var"] / ceiling).clamp(min=1).rsqrt()
+
+    def _within_reach(self, mean: Tensor, ceiling: float) -> Tensor:
+        farthest = _FARTHEST * sqrt(ceiling)
+        return mean.clamp(-farthest, farthest) if self.space is None else mean
+
+
+class Moments(Belief):
+    """A Gaussian: mean ``[*B, S]`` and covariance ``[*B, S, S]``."""
+
+    carried = ("mean", "cov")
+
+    def derived(self, name, *carried):
+        """Computes the variances."""
+        _, cov = carried
+        return cov.diagonal(dim1=-2, dim2=-1) if name == "var" else None
+
+
+class Ensemble(Belief):
+    """Members of one weight, ``[*B, E, S]``."""
+
+    carried = ("ensemble",)
+
+    def derived(self, name, *carried):
+        """Computes mean, variances and covariance of the sample."""
+        (ensemble,) = carried
+        if self.space is not None and name in _SUMMARIES:
+            return moments_on(self.space, ensemble)[_SUMMARIES.index(name)]
+        sample = {"mean": ensemble_mean, "var": ensemble_var, "cov": ensemble_cov}.get(name)
+        return None if sample is None else sample(ensemble)
+
+    def limited(self, held, ceiling):
+        """Moves the members with their mean and variances; where nothing is clamped, not even by rounding."""
+        out, factor, mean = super().limited(held, ceiling), self._factor(held, ceiling), held["mean"].unsqueeze(-2)
+        ensemble, now = held["ensemble"], out["mean"].unsqueeze(-2)
+        if self.space is None:
+            same = (factor.unsqueeze(-2) == 1) & (now == mean)
+            moved = now + (ensemble - mean) * factor.unsqueeze(-2)
+        else:
+            same = (factor == 1).all(-1)[..., None, None]
+            moved = self.space.plus(mean, self.space.minus(ensemble, mean) * factor.unsqueeze(-2))
+        return {**out, "ensemble": torch.where(same, ensemble, moved)}
+
+
+class Particles(Belief):
+    """Weighted particles: points ``[*B, E, S]`` and log-weights ``[*B, E]``, of which ``-inf`` is one of no weight."""
+
+    carried = ("ensemble", "log_weight")
+
+    def derived(self, name, *carried):
+        """Computes the weighted mean and variances."""
+        ensemble, log_weight = carried
+        if name not in _SUMMARIES:
+            return None
+        if self.space is not None:
+            return moments_on(self.space, ensemble, log_weight)[_SUMMARIES.index(name)]
+        return (weighted_mean if name == "mean" else weighted_var)(ensemble, log_weight)
+
+    def finite(self, name, value):
+        """Tells whether points and weights are finite; a weight may be zero."""
+        return (value < torch.inf).all() if name == "log_weight" else super().finite(name, value)
+
+    def limited(self, held, ceiling):
+        """Moves those particles alone that make the variance too large, near the weighted median.
+
+        The others are what is known, and an observation will tell. On a space particles stay.
+        """
+        factor = self._factor(held, ceiling)
+        out = {"var": held["var"] * factor.square()}
+        if self.space is not None:
+            return out
+        points, weights, exceeded = held["ensemble"], held["log_weight"], factor < 1
+        centre = self._within_reach(weighted_median(points, weights), ceiling).unsqueeze(-2)
+        near = points.clamp(centre - sqrt(ceiling), centre + sqrt(ceiling))
+        points = torch.where(exceeded.unsqueeze(-2), near, points)
+        mean = torch.where(exceeded, weighted_mean(points, weights), held["mean"])
+        return {**out, "mean": mean, "ensemble": points}
+
+
+def kinds_of(
+    keys: Iterable[NestedKey], space: Space | None = None, carry: Collection[NestedKey] = ()
+) -> tuple[Belief, ...]:
+    """Returns the kinds of the beliefs that keys are entries of, one for each prefix.
+
+    Args:
+        keys: of entries of beliefs.
+        space: in which the state lives; ``None`` for plain numbers.
+        carry: those that go on from step to step, which alone tell the kind where a prefix has any.
+    """
+    groups: dict[tuple[str, ...], list[NestedKey]] = {}
+    for key in keys:
+        if not isinstance(key, str):
+            groups.setdefault(key[:-1], []).append(key)
+    found = []
+    for prefix, group in groups.items():
+        names = {key[-1] for key in [key for key in group if key in carry] or group}
+        kind = next((kind for kind in Belief._kinds if names.issuperset(kind.carried)), Belief)
+        found.append(kind(prefix, space))
+    return tuple(found)
+
+
+def is_summary(key: NestedKey) -> bool:
+    """Tells whether an entry of a belief is small whatever the number of members: mean, variances, an age."""
+    return not isinstance(key, str) and key[-1] in (*_SUMMARIES, "age")
+
+
+def is_samples(key: NestedKey) -> bool:
+    """Tells whether an entry holds samples by its name, such as ``("sensor", "ensemble")``."""
+    return not isinstance(key, str) and key[-1] in Ensemble.carried
+
+
+def summary_keys(carry: Collection[NestedKey], written: Iterable[NestedKey]) -> list[NestedKey]:
+    """Returns the moments among ``written`` keys that stand beside an entry that is carried."""
+    prefixes = {key[:-1] for key in carry if not isinstance(key, str)}
+    moments = (*_SUMMARIES, "cov")
+    return [key for key in written if not isinstance(key, str) and key[:-1] in prefixes and key[-1] in moments]
+
+
+def complete(
+    entries: dict[NestedKey, Tensor],
+    belief: Iterable[NestedKey],
+    kinds: Iterable[Belief],
+    stored: Mapping[NestedKey, Tensor] | None = None,
+) -> dict[NestedKey, Tensor]:
+    """Returns the entries with those of the belief that are missing and follow from them.
+
+    Args:
+        entries: those that are carried, and others.
+        belief: keys of the belief.
+        kinds: of its prefixes.
+        stored: where an entry is looked for that does not follow.
+
+    Raises:
+        KeyError: if an entry neither follows nor is stored.
+    """
+    out = dict(entries)
+    for key in belief:
+        if key in out:
+            continue
+        value = None
+        for kind in kinds:
+            if key[:-1] == kind.prefix and kind.carried and all(name in out for name in kind.carry):
+                value = kind.derived(key[-1], *(out[name] for name in kind.carry))
+        if value is None and stored is not None:
+            value = stored.get(key)
+        if value is None:
+            raise KeyError(
+                f"{key!r} does not follow from {list(entries)}: let the initial belief write it, or store it with the "
+                "belief."
+            )
+        out[key] = value
+    return out

@@ -1,0 +1,64 @@
+"""A ceiling on the variances of a belief, so that a system that nobody observes stays finite."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict import NestedKey
+from torch import nn
+
+from torch_denkf._checks import check_number, flag_value
+from torch_denkf.beliefs import Belief
+from torch_denkf.submodel import SubModel
+
+__all__ = ["VarianceCeiling"]
+
+
+class VarianceCeiling(SubModel):
+    """Clamps the variances of a belief to a ceiling; correlations stay.
+
+    It is the last module of a filter's update. An ensemble moves as a whole; of weighted particles only those move
+    that make the variance too large.
+
+    Args:
+        kinds: of the belief, see :func:`torch_denkf.beliefs.kinds_of`.
+        keys: of the belief, as far as a step writes them.
+        ceiling: largest variance, in the state's units squared.
+
+    Attributes:
+        reached: whether variances were clamped, as far as that was looked at; for warnings.
+
+    Raises:
+        ValueError: if ``ceiling`` is not positive.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.beliefs import kinds_of
+        >>> keys = [("belief", name) for name in ("mean", "cov", "var")]
+        >>> belief = {"mean": torch.zeros(1), "cov": torch.full((1, 1), 9.0), "var": torch.full((1,), 9.0)}
+        >>> VarianceCeiling(kinds_of(keys), keys, 4.0)(TensorDict({"belief": belief}))["belief", "cov"]
+        tensor([[4.]])
+    """
+
+    def __init__(self, kinds: Sequence[Belief], keys: Sequence[NestedKey], ceiling: float):
+        check_number("variance_ceiling", ceiling, above=0, cure="None is for no ceiling")
+        super().__init__(nn.Identity(), [], list(keys), optional_keys=keys)
+        self.ceiling = ceiling
+        self.kinds = [(kind.key("var"), kind) for kind in kinds if {kind.key("mean"), kind.key("var")} <= {*keys}]
+        self.reached = False
+
+    def on_entries(self, entries, call):
+        """The entries that change."""
+        out = {}
+        for key, kind in self.kinds:
+            variance = entries.get(key)
+            # Whether anything is to be clamped is not looked at where that would wait for a device.
+            above = None if variance is None or variance.is_cuda else flag_value((variance > self.ceiling).any())
+            if variance is None or above is False:
+                continue
+            if above:
+                self.reached = True
+            length = len(kind.prefix)
+            held = {key[-1]: entries[key] for key in self.out_keys if key[:length] == kind.prefix and key in entries}
+            out.update({kind.key(name): value for name, value in kind.limited(held, self.ceiling).items()})
+        return out
