@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch_denkf._arguments import Checked
 from torch_denkf.functional.manifolds import Space
 
-__all__ = ["EXPLAINED", "Call", "Entries", "Noise", "SubModel", "flat_noise"]
+__all__ = ["EXPLAINED", "RECORDERS", "Call", "Entries", "Noise", "SubModel", "flat_noise"]
 
 #: Tensors by unravelled key: what a step of a filter works on.
 Entries: TypeAlias = dict[NestedKey, Tensor]
@@ -408,7 +408,10 @@ class SubModel(Checked, TensorDictModule):
                 if value is not None and value.is_floating_point():
                     where = {"device": value.device, "dtype": value.dtype}
                     break
-            where.update(self.noise_sizes(*values))
+            sizes = self.noise_sizes(*values)
+            for record in RECORDERS:
+                record(call.place, self, sizes)
+            where.update(sizes)
             given = self.draw_noise(call.batch_size, time=call.time, **where)
             if given is None:  # it would run as if no noise were wanted
                 raise ValueError(
@@ -439,6 +442,8 @@ class SubModel(Checked, TensorDictModule):
             ) from error
 
 
+#: Told, in a trial step, the place of each sub-model that draws noise, the sub-model, and the sizes it asks for.
+RECORDERS: list[Callable[[str, SubModel, dict[str, int]], None]] = []
 #: Errors that can be raised again with more words.
 EXPLAINED = (RuntimeError, TypeError, ValueError, IndexError)
 

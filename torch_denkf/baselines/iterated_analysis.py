@@ -20,7 +20,7 @@ from torch_denkf.modules.carried import Beside
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.running import check_module, random_parts, run_module
 from torch_denkf.smoothers.past import moments_of
-from torch_denkf.submodel import Call, Entries, SubModel
+from torch_denkf.submodel import Call, Entries, SubModel, flat_noise
 
 __all__ = ["IteratedAnalysis", "with_smoothed"]
 
@@ -197,17 +197,7 @@ class IteratedAnalysis(SubModel):
         if not call.sample:
             return noise
         for place, part in random_parts(self.module["transition"], call.part("transition").place):
-            value: object = entries.get(("noise", place))
-            if value is None:
-                value = part.draw_noise(
-                    call.batch_size,
-                    members=ensemble.shape[-2],
-                    state_dim=ensemble.shape[-1],
-                    device=ensemble.device,
-                    dtype=ensemble.dtype,
-                )
-            assert isinstance(value, torch.Tensor)
-            noise["noise", place] = value
+            noise.update(flat_noise(part._noise(entries, [ensemble], call._replace(place=place)), place))
         return noise
 
     def _after(self, smoothed, observed, rotation) -> torch.Tensor:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from itertools import chain
 from typing import Any, Unpack, cast
@@ -46,7 +47,7 @@ from torch_denkf.filters.scan import Steps, where_rows
 from torch_denkf.filters.structure import KNOWN, Structure, previous_key, submodels
 from torch_denkf.modules.variance_ceiling import VarianceCeiling
 from torch_denkf.running import check_module, declared, named_modules_of, random_parts, reads, run_module
-from torch_denkf.submodel import Call, Entries, flat_noise
+from torch_denkf.submodel import EXPLAINED, Call, Entries, flat_noise
 
 __all__ = ["Filter"]
 
@@ -170,7 +171,8 @@ class Filter(Checked, TensorDictSequential):
             structure = structure._replace(posterior=(*structure.update, ("variance_ceiling", ceiling)))
         self.structure, self.steps = structure, Steps(structure, self.update_at_reset)
         self._drawn: dict[tuple, Drawn] = {}
-        placed = (*modules, ("initial", self.initial))
+        self._sizes: Drawn = {}
+        placed = (*structure.modules, ("initial", self.initial))
         self._random = [found for place, module in placed for found in random_parts(module, place)]
         written = structure.out_keys
         self._own_keys = {*written, *map(unravel_key, self.initial.out_keys)}
@@ -708,8 +710,11 @@ class Filter(Checked, TensorDictSequential):
         call = Call(torch.Size([1] if size else []))
         with torch.random.fork_rng(devices=[]), set_recurrent_mode(False), recorded_draws(self, self._random) as drawn:
             start = run_module(self.initial, {**self._nothing(call.batch_size), **row}, call.part("initial"))
-            self.steps.step({**start, **row}, call)
-        return drawn
+            # Where an entry has not come yet, what reads it asks for what it did before; the step itself raises.
+            with suppress(KeyError, *EXPLAINED):
+                self.steps.step({**start, **row}, call, partial=True)
+        self._sizes |= drawn
+        return {place: self._sizes[place] for place, _ in self._random if place in self._sizes}
 
 
 def _shallow(module: torch.nn.Module) -> Any:

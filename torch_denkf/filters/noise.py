@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torch_denkf.submodel import Entries, SubModel, flat_noise
+from torch_denkf.submodel import RECORDERS, Entries, SubModel, flat_noise
 
 __all__ = ["Drawn", "draw_noise", "recorded_draws"]
 
@@ -28,24 +27,22 @@ def recorded_draws(filter: nn.Module, parts: Sequence[tuple[str, SubModel]]) -> 
         parts: sub-models that draw noise, and their places.
     """
     drawn: Drawn = {}
+    places = dict(parts)
+
+    def record(place: str, part: SubModel, sizes: dict[str, Any]) -> None:
+        own = [place] if place in places else [name for name, other in parts if other is part]  # in its own forward
+        drawn.update(dict.fromkeys(own, (part, sizes)))
+
     hooked = [(part, part._forward_hooks, part._forward_pre_hooks) for part in filter.modules()]
+    RECORDERS.append(record)
     try:
         for part, *_ in hooked:
             part._forward_hooks, part._forward_pre_hooks = OrderedDict(), OrderedDict()
-        for _, part in parts:
-            part.__dict__["draw_noise"] = partial(_record, drawn, parts, part)
         yield drawn
     finally:
-        for _, part in parts:
-            part.__dict__.pop("draw_noise", None)
+        RECORDERS.remove(record)
         for part, hooks, pre_hooks in hooked:
             part._forward_hooks, part._forward_pre_hooks = hooks, pre_hooks
-
-
-def _record(drawn: Drawn, parts: Sequence[tuple[str, SubModel]], part: SubModel, batch_size, **options) -> Any:
-    sizes = {name: value for name, value in options.items() if name not in ("time", "device", "dtype", "generator")}
-    drawn.update({place: (part, sizes) for place, other in parts if other is part})
-    return type(part).draw_noise(part, batch_size, **options)
 
 
 def draw_noise(

@@ -318,6 +318,10 @@ class BiasedBelief(SubModel):
             return None
         return torch.randn((*batch_size, members, len(self.bias)), device=device, dtype=dtype, generator=generator)
 
+    def noise_sizes(self, ensemble, *_):
+        """E, from the ensemble of the state."""
+        return {"members": ensemble.shape[-2]}
+
     def on_entries(self, entries, call):
         """The belief of both."""
         written = dict(run_module(self.module, entries, call.part("initial")))
@@ -325,9 +329,7 @@ class BiasedBelief(SubModel):
         std, size = self.bias.std, call.batch_size
         if "ensemble" in names:
             ensemble = written[names["ensemble"]]
-            noise = entries.get(("noise", call.place))
-            if noise is None:
-                noise = torch.randn((*ensemble.shape[:-1], len(std)), dtype=ensemble.dtype, device=ensemble.device)
+            noise = self._noise(entries, [ensemble], call._replace(sample=True))
             ensemble = torch.cat([ensemble, std.to(ensemble.dtype) * noise.to(ensemble.dtype)], -1)
             mean = ensemble_mean(ensemble)
             now = {"ensemble": ensemble, "mean": mean, "var": ensemble_var(ensemble, mean)}

@@ -99,6 +99,10 @@ class NoisyTransition(SubModel):
         shape = (*batch_size, members, size)
         return torch.randn(shape, device=device, dtype=dtype, generator=generator)
 
+    def noise_sizes(self, ensemble, *_):
+        """E, and the state's size."""
+        return {"members": ensemble.shape[-2], "state_dim": ensemble.shape[-1]}
+
     def parts(self):
         """The transition and the noise module."""
         return dict(self.module.items())
@@ -138,12 +142,10 @@ class NoisyTransition(SubModel):
                 f"The noise model writes {covariance.shape[-1]} variances in {model.out_keys[0]!r} for {size} dims; "
                 f"give it an output for each of dims={dims}."
             )
-        if not call.sample:
-            return ensemble
-        normal = entries.get(("noise", call.place))
+        normal = self._noise(entries, [ensemble], call)
         if normal is None:
-            normal = torch.randn((*ensemble.shape[:-1], size), device=ensemble.device, dtype=ensemble.dtype)
-        normal = normal[..., :size]  # drawn for a state that has more dimensions than this transition's part of it
+            return ensemble
+        normal = normal[..., :size]  # a point may have more numbers than its tangent
         if covariance.ndim == len(call.batch_size) + 1:
             noise = covariance.sqrt().unsqueeze(-2) * normal
         else:
