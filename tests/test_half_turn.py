@@ -15,10 +15,10 @@ from torch import nn
 
 import torch_denkf
 from tests.filters.factories import FixedEnsemble, NoisyLinear
-from torch_denkf.baselines import BackpropKF
+from torch_denkf.baselines import BackpropKF, IEnKS
 from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter, ParticleFilter
 from torch_denkf.functional.localisation import Neighbours
-from torch_denkf.functional.manifolds import Circle, Euclidean, Product
+from torch_denkf.functional.manifolds import Circle, Euclidean, Flat, Opposite
 from torch_denkf.fusion import FusedFilter, FusedSensor, SensorAttention
 from torch_denkf.imperfect import Visible
 from torch_denkf.modules import (
@@ -45,6 +45,7 @@ from torch_denkf.objectives import (
 from torch_denkf.smoothers import FixedLag
 
 B, T, E = 3, 14, 12
+PLANE = Flat(2, circular=[0])
 MOVE = torch.tensor([[1.0, 0.1], [0.0, 0.9]], dtype=torch.float64)
 Q, R = torch.tensor([0.05, 0.1], dtype=torch.float64), torch.tensor([0.3, 0.4], dtype=torch.float64)  # standard dev.
 NEAR = Neighbours(torch.arange(2).expand(2, 2), torch.tensor([[1.0, 0.5], [0.5, 1.0]], dtype=torch.float64))
@@ -125,22 +126,22 @@ def denkf(analysis, turn, reads="observation"):
 
 
 def ensemble(scheme="etkf", reads="observation", **options):
-    return lambda turn: denkf(EnsembleAnalysis(scheme, angles=[0], **options), turn, reads)
+    return lambda turn: denkf(EnsembleAnalysis(scheme, reading_space=PLANE, **options), turn, reads)
 
 
 def local(**options):
-    return lambda turn: denkf(LocalEnsembleAnalysis(NEAR, angles=[0], **options), turn, "samples")
+    return lambda turn: denkf(LocalEnsembleAnalysis(NEAR, reading_space=PLANE, **options), turn, "samples")
 
 
 def kalman(turn):
     both = torch.eye(2)
     prior = {"mean": ahead(turn), "cov": 0.2 * both}
-    return KalmanFilter(MOVE, both, process_noise=Q, noise=R, **prior, angles=[0])
+    return KalmanFilter(MOVE, both, process_noise=Q, noise=R, **prior, reading_space=PLANE)
 
 
 def gaussian(kind):
     def make(turn):
-        options = {"initial": moments(turn), "angles": [0]}
+        options = {"initial": moments(turn), "reading_space": PLANE}
         if kind is BackpropKF:
             return BackpropKF(
                 MOVE, Sensor("samples"), torch.eye(2), noise(), process_noise_cov=Q.square().diag(), **options
@@ -153,17 +154,22 @@ def gaussian(kind):
 
 def particles(likelihood=None):
     def make(turn):
-        options = {"angles": [0]} if likelihood is None else {"likelihood": likelihood()}
+        options = {"reading_space": PLANE} if likelihood is None else {"likelihood": likelihood()}
         parts = NoisyLinear(MOVE, Q.diag()), Sensor("observation"), Heading()
         return ParticleFilter(*parts, noise=noise(), initial=members(turn), **options)
 
     return make
 
 
+def iterated(turn):
+    parts = NoisyLinear(MOVE), Sensor("observation"), Heading(), noise()
+    return IEnKS(*parts, initial=members(turn), process_noise=Q, reading_space=PLANE)
+
+
 def learned_likelihood():
     torch.manual_seed(3)
     keys = {"encoding_key": "encoding", "observation_key": ("sensor", "ensemble")}
-    return LearnedLikelihood(3, 2, num_cells=(8,), angles=[0], scale=[0.3, 0.4], **keys)
+    return LearnedLikelihood(3, 2, num_cells=(8,), reading_space=PLANE, scale=[0.3, 0.4], **keys)
 
 
 def fused(motion, *, delay=0, weights=False, joint=False, analysis=None):
@@ -171,7 +177,7 @@ def fused(motion, *, delay=0, weights=False, joint=False, analysis=None):
 
     def make(turn):
         sensors = {
-            "compass": FusedSensor(Heading(1), R[:1], sensor=Sensor("compass"), angles=[0], delay=delay),
+            "compass": FusedSensor(Heading(1), R[:1], sensor=Sensor("compass"), reading_space=Circle(), delay=delay),
             "other": FusedSensor(Select([1]), R[1:]),
         }
         torch.manual_seed(4)
@@ -223,6 +229,7 @@ FILTERS = {
     "local with a lag": lambda turn: FixedLag(local()(turn), 3),
     "Kalman": kalman,
     **{kind.__name__: gaussian(kind) for kind in (EKF, UKF, BackpropKF)},
+    "IEnKS": iterated,
     "particles": particles(),
     "particles, learned": particles(learned_likelihood),
     **{
@@ -310,9 +317,9 @@ def test_a_gate_that_spreads_members_over_more_than_a_turn_takes_their_angles_fo
     )
     entries[1]["ensemble"][:, 1] += 20.0  # so far off that the gate rejected it long enough, and opens
     out = []
-    for angles in ([0], []):
+    for space in (PLANE, None):
         options = {"response": "reject", "window": 1, "adapt_inflation": 0.1, **OF_ENSEMBLES[parts]}
-        gate = GatedAnalysis(EnsembleAnalysis("etkf", angles=angles), 2, **options)
+        gate = GatedAnalysis(EnsembleAnalysis("etkf", reading_space=space), 2, **options)
         td = TensorDict(dict(zip(("forecast", "sensor"), entries, strict=True)), [B])
         td.update(dict(zip(gate.state_keys, gate.initial_state([B]), strict=True)))
         td["gate", "shut"] += gate.patience
@@ -324,10 +331,8 @@ def test_a_gate_that_spreads_members_over_more_than_a_turn_takes_their_angles_fo
         torch.testing.assert_close(out[0][key], out[1][key], rtol=1e-11, atol=1e-11, msg=lambda m, k=key: f"{k}: {m}")
 
 
-ANGLES = {"angles": [0]}
-BOTH = {**ANGLES, "observation_angles": [0]}
-PLANE = Product(Circle(), Euclidean(1))
-
+STATE = {"space": PLANE}
+BOTH = {**STATE, "reading_space": PLANE}
 
 SAMPLED = ensemble("sensor", "samples")  # a filter whose sensor draws samples
 
@@ -336,17 +341,14 @@ LOSSES = {
     "DEnKFLoss, nll": (DEnKFLoss, SAMPLED, {**BOTH, "nll": 1.0, "observation": 1.0}),
     **{f"GaussianLoss, {score}": (GaussianLoss, gaussian(EKF), {**BOTH, "score": score}) for score in ("crps", "nll")},
     "GaussianLoss, dims": (GaussianLoss, gaussian(UKF), {**BOTH, "dims": [1, 0]}),
-    **{
-        f"MixtureLoss, {score}": (MixtureLoss, particles(), {**ANGLES, "score": score}) for score in ("mixture", "crps")
-    },
-    "DEnKFLoss, space": (DEnKFLoss, SAMPLED, {"space": PLANE, "observation_angles": [0]}),
-    "GaussianLoss, space": (GaussianLoss, gaussian(EKF), {"space": PLANE, "observation_angles": [0], "score": "nll"}),
-    "MixtureLoss, space": (MixtureLoss, particles(), {"space": PLANE}),
-    "TransitionLoss, space": (TransitionLoss, SAMPLED, {"space": PLANE, "spread": [0.1, 0.1]}),
-    "TransitionLoss": (TransitionLoss, SAMPLED, ANGLES),
-    "TransitionLoss of moments": (TransitionLoss, gaussian(EKF), ANGLES),
-    "SensorLoss": (SensorLoss, SAMPLED, {"observation_angles": [0]}),
-    "ObservationLoss": (ObservationLoss, SAMPLED, {"observation_angles": [0]}),
+    **{f"MixtureLoss, {score}": (MixtureLoss, particles(), {**STATE, "score": score}) for score in ("mixture", "crps")},
+    "DEnKFLoss, product": (DEnKFLoss, SAMPLED, {"space": Circle() * Euclidean(1), "reading_space": PLANE}),
+    "MixtureLoss, Opposite": (MixtureLoss, particles(), {"space": Opposite(PLANE)}),
+    "TransitionLoss, spread": (TransitionLoss, SAMPLED, {"space": PLANE, "spread": [0.1, 0.1]}),
+    "TransitionLoss": (TransitionLoss, SAMPLED, STATE),
+    "TransitionLoss of moments": (TransitionLoss, gaussian(EKF), STATE),
+    "SensorLoss": (SensorLoss, SAMPLED, {"reading_space": PLANE}),
+    "ObservationLoss": (ObservationLoss, SAMPLED, {"reading_space": PLANE}),
 }
 
 
@@ -362,20 +364,22 @@ def test_losses_do_not_turn(name):
         torch.testing.assert_close(values[1][key], value, rtol=1e-9, atol=1e-9, msg=lambda m, k=key: f"{k}: {m}")
 
 
-def know_of_angles():
-    """The classes of modules whose code speaks of angles, or of entries in which they are aligned."""
+def know_of_spaces():
+    """The classes of modules that take the space of a reading, or that change entries which an analysis aligned."""
     found, root = set(), Path(torch_denkf.__file__).parent
     for file in sorted(root.rglob("*.py")):
         for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.ClassDef) and any(map(_speaks_of_angles, ast.walk(node))):
+            if isinstance(node, ast.ClassDef) and any(map(_speaks_of_spaces, ast.walk(node))):
                 place = ".".join(["torch_denkf", *file.relative_to(root).with_suffix("").parts])
                 found.add(getattr(importlib.import_module(place), node.name))
-    return {kind for kind in found if issubclass(kind, nn.Module)}
+    # Readings of motions say which space they are in, and what rejects readings looks at each by itself.
+    others = ("torch_denkf.motions.", "torch_denkf.imperfect.rejection")
+    return {kind for kind in found if issubclass(kind, nn.Module) and not kind.__module__.startswith(others)}
 
 
-def _speaks_of_angles(node):
+def _speaks_of_spaces(node):
     words = {getattr(node, name, None) for name in ("arg", "attr", "id")}
-    return any(isinstance(word, str) and ("angles" in word or word == "aligned") for word in words)
+    return bool(words & {"reading_space", "spaces", "aligned"})
 
 
 def test_every_module_that_knows_of_angles_is_turned():
@@ -383,6 +387,6 @@ def test_every_module_that_knows_of_angles_is_turned():
         kind(make(0.0), **options) for kind, make, options in LOSSES.values()
     ]
     turned = {kind for each in made for part in each.modules() for kind in type(part).__mro__}
-    found = know_of_angles()
+    found = know_of_spaces()
     assert {EnsembleAnalysis, LearnedLikelihood} < found
     assert not found - turned, "add them to FILTERS or LOSSES"

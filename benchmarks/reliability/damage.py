@@ -85,8 +85,8 @@ CELLS = Wrong(
 )
 
 
-def angles(size: int) -> Wrong:
-    """Indices of components, none of which fits ``size`` of them; an angle that is there twice is wrapped twice."""
+def indices(size: int) -> Wrong:
+    """Indices of components, none of which fits ``size`` of them."""
     beyond = st.integers(min_value=size, max_value=99) | st.integers(-99, -size - 1)
     named = {"beyond the end": [size], "far before the start": [-size - 1], "fraction": [0.5], "text": ["x"]}
     return Wrong(named, drawn(beyond.map(lambda index: [0, index])))
@@ -94,7 +94,7 @@ def angles(size: int) -> Wrong:
 
 def dims(size: int) -> Wrong:
     """Likewise, of components that are read: each at most once."""
-    return angles(size) | {"twice the same": [0, 0]}
+    return indices(size) | {"twice the same": [0, 0]}
 
 
 def vector(size: int, *, positive: bool = False, negative: bool = True, length: bool = True) -> Wrong:

@@ -160,7 +160,6 @@ OF_NAMES: dict[str, d.Wrong] = {
     **dict.fromkeys(("resampling", "layer", "scheme", "score", "reduction"), d.CHOICE),
     "variance_ceiling": d.POSITIVE.but("inf"),
     "process_noise": d.vector(2, negative=False),
-    "angles": d.angles(2),
     "mean": d.vector(2),
     "loc": d.vector(2),
     "scale": d.vector(2, positive=True).but("inf"),  # infinity hides an input

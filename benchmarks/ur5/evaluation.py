@@ -20,11 +20,13 @@ from benchmarks.ur5.tables import BLACKOUT
 from benchmarks.ur5.training import filter_error, joint_coverage, run_filter
 from torch_denkf.applications.ur5 import UR5ExperienceReplay
 from torch_denkf.filters import Filter
+from torch_denkf.functional.manifolds import Flat
 from torch_denkf.metrics import interval_coverage, state_errors
 from torch_denkf.modules import ImageSensor
 from torch_denkf.training import hold_last
 
 TIMED = 100  # steps to time a filter on
+SPACE = Flat(10, circular=range(6))  # all joints but the gripper's opening wrap
 AFTER = 15  # steps after a blackout at which the spread is taken again
 
 
@@ -34,7 +36,7 @@ def errors(mean: Tensor, truth: Tensor) -> dict[str, float]:
     Joints: mean over J1..J7 in degrees, J6 and the others wrapped, J7 the gripper's opening as the angle it is stored
     as. Place: mean over the absolute errors of x, y and z, in cm.
     """
-    mae = state_errors(mean[:, 1:].flatten(0, 1), truth[:, 1:].flatten(0, 1), angles=range(6)).mae
+    mae = state_errors(mean[:, 1:].flatten(0, 1), truth[:, 1:].flatten(0, 1), space=SPACE).mae
     joints = mae[:JOINTS].rad2deg()
     named = {f"J{number + 1}_deg": float(value) for number, value in enumerate(joints)}
     return {"joint_mae_deg": float(joints.mean()), "ee_mae_cm": 100 * float(mae[JOINTS:].mean()), **named}
@@ -47,7 +49,7 @@ def blackout(mean: Tensor, var: Tensor, truth: Tensor, begin: Tensor) -> dict[st
     step = begin.unsqueeze(-1) + torch.arange(BLACK)
     step = step.clamp(max=mean.shape[1] - 1)
     error = state_errors(
-        mean[rows.unsqueeze(-1), step].flatten(0, 1), truth[rows.unsqueeze(-1), step].flatten(0, 1), angles=range(6)
+        mean[rows.unsqueeze(-1), step].flatten(0, 1), truth[rows.unsqueeze(-1), step].flatten(0, 1), space=SPACE
     )
     last, after = (begin + BLACK - 1, begin + BLACK + AFTER)
     at = [value.clamp(0, mean.shape[1] - 1) for value in (begin - 1, last, after)]

@@ -24,7 +24,7 @@ import torch
 from tensordict import TensorDict
 
 from torch_denkf import FusedFilter, FusedSensor
-from torch_denkf.functional.manifolds import SO3, rotate
+from torch_denkf.functional.manifolds import SO3, Flat, rotate
 from torch_denkf.modules import AroundState, EnsembleAnalysis
 from torch_denkf.motions import AttitudeMotion, Gravity, Magnetic
 from torch_denkf.plots import plot_bands
@@ -113,8 +113,7 @@ figure, axes = plt.subplots(3, 1, figsize=(8, 6), sharex=True, layout="constrain
 plot_bands(
     shown,
     names=["roll, degrees", "pitch, degrees", "yaw, degrees"],
-    factors=[180 / torch.pi] * 3,
-    angles=[0, 1, 2],
+    space=Flat(3, circular=[0, 1, 2]),
     time=DT,
     ax=axes,
 )

@@ -14,6 +14,7 @@ from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.baselines.lstm_cell import LSTMUpdate
 from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.filters import DEnKF, KalmanFilter
+from torch_denkf.functional.manifolds import Circle, Flat
 from torch_denkf.modules import (
     AroundState,
     CholeskyNoise,
@@ -94,7 +95,7 @@ KALMAN = [
     ],
     ("control", torch.ones(3, 1), "[3, 1]"),
     ("control", NAN * torch.ones(2, 1), "nan"),
-    ("angles", [2], "got 2"),
+    ("reading_space", Circle(), "2 rows of matrix"),
 ]
 
 
@@ -159,7 +160,7 @@ REFUSED = {
     "relaxation 2": (lambda: EnsembleAnalysis(relaxation=2), "relaxation", "at most 1", "got 2"),
     "relaxation -0.1": (lambda: EnsembleAnalysis(relaxation=-0.1), "relaxation", "got -0.1"),
     "taper": (lambda: EnsembleAnalysis("sakov", taper=(NAN * EYE, EYE)), "state's taper", "nan at [0, 0]"),
-    "angles": (lambda: EnsembleAnalysis(angles=[-1]), "angles", "got -1"),
+    "circular": (lambda: Flat(2, circular=[-1]), "circular", "got -1"),
     "E = -3": (lambda: GaussianPrior([0.0], [1.0], ensemble_size=-3), "ensemble_size", "got -3"),
     "E = 1": (lambda: AroundState([1.0], ensemble_size=1), "ensemble_size", "got 1"),
     "prior's mean": (lambda: GaussianPrior([NAN], [1.0]), "mean", "nan at [0]"),

@@ -8,7 +8,7 @@ from torch import nn
 
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.filters import EKF, UKF
-from torch_denkf.functional import wrap_angles
+from torch_denkf.functional.manifolds import Circle, Euclidean, Flat
 from torch_denkf.modules import ConstantNoise, GaussianAround, LearnedObservation
 
 LANDMARKS = [[-12.0, 0.0], [5.0, 15.0]]  # m; the first is behind the vehicle, so that its direction passes pi
@@ -65,7 +65,7 @@ def range_bearing(make):
         process_noise=q,
         initial=GaussianAround(START_STD, state_key="start"),
         observation_key="reading",
-        angles=[2, 3],
+        reading_space=Euclidean(2) * Circle() * Circle(),
     )
 
 
@@ -80,7 +80,7 @@ def simulate_range_bearing(rows, steps):
         states.append(state)
     states = torch.stack(states, 1)
     readings = RangeBearing()(states) + torch.tensor(READING_STD) * torch.randn(rows, steps, 4)
-    readings = wrap_angles(readings, [2, 3])
+    readings = Flat(4, circular=[2, 3]).normalise(readings)
     return TensorDict(
         {"state": states, "reading": readings, "start": start.unsqueeze(1).expand_as(states)}, [rows, steps]
     )

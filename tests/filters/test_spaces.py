@@ -17,7 +17,7 @@ from torch_denkf.baselines import BackpropKF
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.diagnosis import check_analysis
 from torch_denkf.filters import EKF, UKF, DEnKF, ParticleFilter
-from torch_denkf.functional.manifolds import SO3, Circle, Euclidean, Product
+from torch_denkf.functional.manifolds import SO3, Circle, Euclidean, Opposite, Product
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import FadingBias, Visibility
 from torch_denkf.modules import (
@@ -303,14 +303,14 @@ def test_a_circle_is_an_angle():
     wraps = Product(Circle(), Euclidean(1))
     for filter in (EKF, UKF):
         options = {"process_noise": [0.1, 0.2], "observation_key": "pose", "initial": start}
-        one = filter(*parts, angles=[0], **options).sequence(data.clone())
-        other = filter(*parts, reading_space=wraps, **options).sequence(data.clone())
+        one = filter(*parts, reading_space=wraps, **options).sequence(data.clone())
+        other = filter(*parts, reading_space=Opposite(wraps), **options).sequence(data.clone())  # not in closed form
         close(one, other, [MEAN, ("belief", "cov"), ("info", "nis")])
     around = AroundState([0.5, 0.6], ensemble_size=E, state_key="start")
     options = {"process_noise": [0.1, 0.2], "initial": around}
     one, other = (
         DEnKF(*parts, EnsembleAnalysis("etkf", observation_key="pose", **told), **options)
-        for told in ({"angles": [0]}, {"reading_space": wraps})
+        for told in ({"reading_space": wraps}, {"reading_space": Opposite(wraps)})
     )
     noisy = with_noise(one, data)
     close(one.sequence(noisy.clone()), other.sequence(noisy.clone()), [MEAN, VAR, ("info", "nis")])
@@ -509,8 +509,6 @@ def test_what_does_not_fit_is_refused():
         AroundState([0.1] * 4, space=SO3())
     with pytest.raises(ValueError, match=r"mean has shape \[3\]; a point of SO3\(\) is \[\*, 4\]"):
         MomentPrior(torch.zeros(3), torch.eye(3), space=SO3())
-    with pytest.raises(ValueError, match="says what is an angle"):
-        make("EKF", angles=[0])
     matrices = (torch.eye(7), None, torch.eye(4, 7), ConstantNoise([0.1] * 4, in_key="pose"))
     start = GaussianAround(STD, state_key="start", space=SPACE)
     with pytest.raises(ValueError, match="Give the same sensor and noise to an EKF"):
@@ -519,7 +517,7 @@ def test_what_does_not_fit_is_refused():
         make("EKF", sensor_error=FadingBias([0.1], time=10.0))
     parts = (Turning(), None, Orientation(), ConstantNoise(R, in_key="pose"))
     plain = {"process_noise": [0.1] * 7, "sensor_error": FadingBias([0.1] * 4, time=10.0)}
-    error, around = "sensor_error is added to readings of plain numbers", AroundState([0.1] * 7, ensemble_size=E)
+    error, around = "sensor_error is added to readings of numbers and angles", AroundState([0.1] * 7, ensemble_size=E)
     for filter in (EKF, UKF):
         with pytest.raises(ValueError, match=error):
             filter(*parts, initial=GaussianAround([0.1] * 7), reading_space=SO3(), observation_key="pose", **plain)

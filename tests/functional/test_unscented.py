@@ -7,6 +7,7 @@ import torch
 
 from tests.functional.checks import assert_compiled_is_eager, assert_refused
 from torch_denkf.functional import kalman_update, sigma_points, wrap_angles
+from torch_denkf.functional.manifolds import Circle
 from torch_denkf.functional.unscented import unscented_moments, unscented_update, unscented_weights
 
 F64 = torch.float64
@@ -143,13 +144,15 @@ def test_gradients_through_points_moments_and_update():
 
 def test_angles_are_averaged_and_compared_across_pi():
     mean, cov = torch.tensor([math.pi - 0.1], dtype=F64), torch.tensor([[0.25]], dtype=F64)
-    wrap = lambda x: wrap_angles(x, [0])  # noqa: E731
-    got_mean, got_cov = transform(mean, cov, wrap, angles=[0])
+    wrap = wrap_angles
+    got_mean, got_cov = transform(mean, cov, wrap, space=Circle())
     torch.testing.assert_close(got_mean, mean, **EXACT)
     torch.testing.assert_close(got_cov, cov, **EXACT)
     points = sigma_points(mean, cov)
     one = torch.ones(1, dtype=F64)
-    update = unscented_update(points, wrap(points), wrap(mean + 0.2), one, unscented_weights(1, dtype=F64), angles=[0])
+    update = unscented_update(
+        points, wrap(points), wrap(mean + 0.2), one, unscented_weights(1, dtype=F64), space=Circle()
+    )
     torch.testing.assert_close(update.innovation, 0.2 * one, **EXACT)
     torch.testing.assert_close(update.mean, mean + 0.2 * 0.25 / 1.25, **EXACT)
 

@@ -16,6 +16,7 @@ from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_kalman, l
 from tests.filters.gaussian_for_tests import directional_check
 from torch_denkf.filters import EKF, DEnKF, Filter, KalmanFilter
 from torch_denkf.functional import wrap_angles
+from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
 from torch_denkf.fusion.parts import JoinedReading
 from torch_denkf.imperfect import FadingBias, RejectReadings
@@ -507,8 +508,8 @@ def test_a_fused_filter_is_what_one_would_compose_by_hand(float64):
 def test_angles_side_by_side(float64):
     """A heading near pi, read a full turn away: both ways to update take the shorter way round."""
     turns = {
-        "compass": FusedSensor(Select([0]), [0.3], angles=[0]),
-        "pair": FusedSensor(Select([1, 0]), [0.5, 0.4], angles=[1]),
+        "compass": FusedSensor(Select([0]), [0.3], reading_space=Circle()),
+        "pair": FusedSensor(Select([1, 0]), [0.5, 0.4], reading_space=Euclidean(1) * Circle()),
     }
     F = torch.eye(2)
     frames = TensorDict({"compass": torch.full((3, 1), -3.1), "pair": torch.tensor([[0.2, -3.0]] * 3)}, [3])
@@ -525,9 +526,9 @@ def test_of_sampled_angles_side_by_side_the_mean_is_that_of_directions(float64):
     samples = torch.tensor([torch.pi - 0.1, 0.3 - torch.pi, 0.1 - torch.pi]).unsqueeze(-1)  # by 0.1 beyond pi
     numbers = torch.tensor([[1.0], [2.0], [6.0]])
     td = TensorDict({"a": numbers, "b": samples, "qa": torch.ones(1), "qb": torch.ones(1)})
-    found = JoinedReading(["a", "b"], ["qa", "qb"], [(), (0,)], observation_key="c", noise_key="qc")(td)["c"]
+    found = JoinedReading(["a", "b"], ["qa", "qb"], [None, Circle()], observation_key="c", noise_key="qc")(td)["c"]
     assert_close(found[0], torch.tensor(3.0))
-    assert_close(wrap_angles(found[1:] - torch.pi - 0.1, [0]), torch.zeros(1), rtol=0, atol=1e-12)
+    assert_close(wrap_angles(found[1:] - torch.pi - 0.1), torch.zeros(1), rtol=0, atol=1e-12)
 
 
 def test_covariances_of_readings_side_by_side(float64):

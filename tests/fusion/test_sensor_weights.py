@@ -9,6 +9,7 @@ from torch.testing import assert_close
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_system
 from tests.filters.gaussian_for_tests import directional_check
 from torch_denkf import DEnKFLoss
+from torch_denkf.functional.manifolds import Circle
 from torch_denkf.fusion import FusedFilter, FusedSensor, SensorAttention
 from torch_denkf.modules import (
     ConstantNoise,
@@ -114,7 +115,7 @@ def test_an_innovation_of_angles_is_the_shorter_way_round(float64, kind, samples
     assert (members.max(), members.min()) > (torch.pi, 0)
     network, one = Constant(1.0), torch.eye(1)
     sensor = Given("compass") if samples else None  # one that draws samples, or the reading itself
-    compass = {"compass": FusedSensor(LearnedObservation(Folded()), [0.3], sensor=sensor, angles=[0])}
+    compass = {"compass": FusedSensor(LearnedObservation(Folded()), [0.3], sensor=sensor, reading_space=Circle())}
     if kind == "Kalman":
         motion, initial = LinearTransition(one, 0 * one), MomentPrior(members.mean(0), members.var(0).diag())
     else:

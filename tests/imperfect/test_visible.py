@@ -10,6 +10,7 @@ from torch.testing import assert_close
 
 from torch_denkf.diagnosis import check_analysis
 from torch_denkf.functional.localisation import Neighbours
+from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.imperfect import Visibility, Visible
 from torch_denkf.modules import (
     EKFAnalysis,
@@ -324,10 +325,10 @@ def test_what_cannot_be_is_refused():
 
 @pytest.mark.parametrize("name", ["etkf", "UKF", "particles"])
 def test_a_turn_more_is_the_same_reading(name):
-    likelihood = GaussianLikelihood(observation_key=KEY, angles=[0])
+    likelihood = GaussianLikelihood(observation_key=KEY, reading_space=Circle() * Euclidean(1))
     inner = {
-        "etkf": lambda: EnsembleAnalysis("etkf", observation_key=KEY, angles=[0]),
-        "UKF": lambda: UKFAnalysis(Select([0, 1]), observation_key=KEY, angles=[0]),
+        "etkf": lambda: EnsembleAnalysis("etkf", observation_key=KEY, reading_space=Circle() * Euclidean(1)),
+        "UKF": lambda: UKFAnalysis(Select([0, 1]), observation_key=KEY, reading_space=Circle() * Euclidean(1)),
         "particles": lambda: ParticleAnalysis(likelihood),
     }[name]()
     update = TensorDictSequential(*([likelihood] if name == "particles" else []), Visible(inner))

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from tests.functional.checks import assert_refused
+from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.metrics import ensemble_interval_coverage, interval_coverage
 
 
@@ -33,7 +34,7 @@ def test_gaussian_interval_of_a_calibrated_belief(level):
 
 def test_gaussian_interval_of_angles():
     mean, truth = torch.tensor([[3.1, 3.1]]), torch.tensor([[-3.1, -3.1]])
-    share = interval_coverage(mean, torch.full((1, 2), 0.1**2), truth, angles=(1,))
+    share = interval_coverage(mean, torch.full((1, 2), 0.1**2), truth, space=Euclidean(1) * Circle())
     assert share.tolist() == [0.0, 1.0]
 
 
@@ -53,7 +54,7 @@ def test_ensemble_interval_of_angles():
     ensemble = torch.linspace(math.pi - 0.1, math.pi + 0.1, 19).unsqueeze(-1)
     ensemble = torch.remainder(ensemble + math.pi, 2 * math.pi) - math.pi  # on both sides of the cut
     for truth, inside in ((math.pi - 0.05, 1.0), (-math.pi + 0.05, 1.0), (3 * math.pi, 1.0), (0.0, 0.0), (3.0, 0.0)):
-        share = ensemble_interval_coverage(ensemble, torch.tensor([truth]), angles=(0,))
+        share = ensemble_interval_coverage(ensemble, torch.tensor([truth]), space=Circle())
         assert share.tolist() == [inside]
     # Taken as numbers, members at both ends of [-pi, pi) span all directions.
     assert ensemble_interval_coverage(ensemble, torch.tensor([0.0])).tolist() == [1.0]

@@ -8,6 +8,7 @@ import torch
 from scipy import stats
 
 from tests.functional.checks import assert_refused
+from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.metrics import nees
 from torch_denkf.metrics.consistency import _chi_square_quantile, gaussian_nll
 
@@ -36,9 +37,13 @@ def test_angles_are_wrapped():
     turn = 2 * math.pi - 6.2
     expected = 0.5 * turn**2 / 0.04 + math.log(0.2) + 0.5 * math.log(2 * math.pi)
     variance = torch.tensor([[1.0, 0.04]], dtype=torch.float64)
-    torch.testing.assert_close(gaussian_nll(mean, variance, truth, angles=(1,))[0, 1].item(), expected)
+    torch.testing.assert_close(
+        gaussian_nll(mean, variance, truth, space=Euclidean(1) * Circle())[0, 1].item(), expected
+    )
     for covariance in (variance, torch.diag_embed(variance)):
-        torch.testing.assert_close(nees(mean, covariance, truth, angles=(1,)).mean.item(), turn**2 / 0.04)
+        torch.testing.assert_close(
+            nees(mean, covariance, truth, space=Euclidean(1) * Circle()).mean.item(), turn**2 / 0.04
+        )
 
 
 def test_nees_by_inverse():

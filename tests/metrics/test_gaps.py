@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.functional.checks import assert_refused
+from torch_denkf.functional.manifolds import Flat
 from torch_denkf.metrics import (
     ensemble_interval_coverage,
     interval_coverage,
@@ -25,7 +26,9 @@ def problem():
 
 METRICS = {
     "coverage": lambda e, x: interval_coverage(e.mean(-2), e.var(-2), x, level=0.8),
-    "coverage of angles": lambda e, x: interval_coverage(e.mean(-2), e.var(-2), x, level=0.8, angles=[0]),
+    "coverage of angles": lambda e, x: interval_coverage(
+        e.mean(-2), e.var(-2), x, level=0.8, space=Flat(x.shape[-1], circular=[0])
+    ),
     "coverage of members": lambda e, x: ensemble_interval_coverage(e, x, level=0.8),
     "rmse": lambda e, x: state_errors(e.mean(-2), x).rmse,
     "mae": lambda e, x: state_errors(e.mean(-2), x).mae,

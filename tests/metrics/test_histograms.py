@@ -9,6 +9,7 @@ from scipy import stats
 
 from tests.functional.checks import assert_refused
 from torch_denkf.functional import wrap_angles
+from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.metrics import pit, spread_skill_ratio
 from torch_denkf.metrics.calibration import ensemble_interval, histogram_band, rank_histogram, spread_error
 
@@ -36,7 +37,7 @@ def test_pit_is_uniform_under_the_right_distribution_and_known_under_a_wrong_one
 
 
 def test_pit_of_angles_and_of_no_spread():
-    got = pit(torch.tensor([[3.1]]), torch.tensor([[1.0]]), torch.tensor([[-3.1]]), angles=(0,))
+    got = pit(torch.tensor([[3.1]]), torch.tensor([[1.0]]), torch.tensor([[-3.1]]), space=Circle())
     assert got.item() == pytest.approx(stats.norm.cdf(2 * math.pi - 6.2), abs=1e-6)
     mean = torch.zeros(3, 1)
     assert pit(mean, mean, torch.tensor([[-1.0], [0.0], [1.0]])).flatten().tolist() == [0.0, 0.5, 1.0]
@@ -63,27 +64,27 @@ def test_ranks_by_hand_with_ties():
 
 def test_ranks_of_angles_on_both_sides_of_the_cut():
     members = torch.tensor([[[3.0], [-3.0], [3.1]]])  # around 3.12
-    assert rank_histogram(members, torch.tensor([[-3.1]]), angles=(0,)).tolist() == [[0, 0, 1, 0]]
+    assert rank_histogram(members, torch.tensor([[-3.1]]), space=Circle()).tolist() == [[0, 0, 1, 0]]
     assert rank_histogram(members, torch.tensor([[-3.1]])).tolist() == [[1, 0, 0, 0]]
 
 
-@pytest.mark.parametrize("angles", [(), (0,)])
-def test_a_particle_counts_as_often_as_its_weight_says(angles):
+@pytest.mark.parametrize("space", [None, Circle() * Euclidean(1)])
+def test_a_particle_counts_as_often_as_its_weight_says(space):
     draw = rng()
     members, truth = (torch.randn(500, *shape, generator=draw, dtype=torch.float64) for shape in ((6, 2), (2,)))
     members[:100, 3], members[100:150, 0] = truth[:100], truth[100:150]  # ties
     often = torch.tensor([3, 1, 0, 2, 0, 0])
     repeated = members.repeat_interleave(often, 1)
     weights = (often / 6).log().expand(500, 6)
-    if angles:
+    if space is not None:
         for part in (members, repeated, truth):
             part[..., 0] = wrap_angles(part[..., 0] + 3)
-    counts = rank_histogram(members, truth, log_weight=weights, angles=angles)
-    torch.testing.assert_close(counts, rank_histogram(repeated, truth, angles=angles))
-    torch.testing.assert_close(counts, rank_histogram(members, truth, log_weight=weights + 7, angles=angles))
+    counts = rank_histogram(members, truth, log_weight=weights, space=space)
+    torch.testing.assert_close(counts, rank_histogram(repeated, truth, space=space))
+    torch.testing.assert_close(counts, rank_histogram(members, truth, log_weight=weights + 7, space=space))
     # Equal weights are none.
-    equal = rank_histogram(members, truth, log_weight=torch.zeros(500, 6), angles=angles)
-    torch.testing.assert_close(equal, rank_histogram(members, truth, angles=angles))
+    equal = rank_histogram(members, truth, log_weight=torch.zeros(500, 6), space=space)
+    torch.testing.assert_close(equal, rank_histogram(members, truth, space=space))
 
 
 def test_a_truth_between_two_ranks_counts_in_both():

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.functional.checks import assert_refused
+from torch_denkf.functional.manifolds import Circle, Flat
 from torch_denkf.metrics import state_errors
 from torch_denkf.metrics.state import state_difference
 
@@ -15,9 +16,10 @@ def test_by_hand():
     truth = torch.tensor([[[0.0, 3.0, 1.0], [0.0, -3.0, 1.0]]], dtype=torch.float64)
     estimated = torch.tensor([[[3.0, -3.0, 1.0], [-1.0, -2.5, 1.0]]], dtype=torch.float64)
     turn = 2 * math.pi - 6  # from 3 to -3 rad, to the left
-    difference = state_difference(estimated, truth, angles=(1,))
+    space = Flat(3, circular=[1])
+    difference = state_difference(estimated, truth, space=space)
     torch.testing.assert_close(difference, torch.tensor([[[3.0, turn, 0.0], [-1.0, 0.5, 0.0]]]).double())
-    errors = state_errors(estimated, truth, angles=(-2,))
+    errors = state_errors(estimated, truth, space=space)
     torch.testing.assert_close(errors.mae, torch.tensor([2.0, (turn + 0.5) / 2, 0.0]).double())
     torch.testing.assert_close(errors.rmse, torch.tensor([math.sqrt(5), math.sqrt((turn**2 + 0.25) / 2), 0.0]).double())
     # Without angles 6 rad is 6 rad.
@@ -28,7 +30,7 @@ def test_all_batch_dims_and_numpy():
     rng = torch.Generator().manual_seed(0)
     estimated, truth = torch.randn(2, 4, 5, 7, 3, generator=rng, dtype=torch.float64).unbind(0)
     before = estimated.clone()
-    errors = state_errors(estimated, truth, angles=(0,))
+    errors = state_errors(estimated, truth, space=Flat(3, circular=[0]))
     assert estimated.equal(before)
     difference = (estimated - truth).numpy().reshape(-1, 3)
     difference[:, 0] = np.angle(np.exp(1j * difference[:, 0]))
@@ -39,12 +41,14 @@ def test_all_batch_dims_and_numpy():
 
 def test_gradients_go_through_wrapped_angles():
     estimated = torch.tensor([[1.0, 3.0]], dtype=torch.float64, requires_grad=True)
-    state_difference(estimated, torch.tensor([[0.0, -3.0]]).double(), angles=(1,)).square().sum().backward()
+    state_difference(
+        estimated, torch.tensor([[0.0, -3.0]]).double(), space=Flat(2, circular=[1])
+    ).square().sum().backward()
     torch.testing.assert_close(estimated.grad, torch.tensor([[2.0, 2 * (6 - 2 * math.pi)]]).double())
 
 
 def test_errors_say_what_to_do():
     assert_refused(ValueError, "for ensembles pass the mean", state_errors, torch.zeros(4, 8, 3), torch.zeros(4, 3))
-    with pytest.raises(ValueError, match="angles are components of 3"):
-        state_errors(torch.zeros(4, 3), torch.zeros(4, 3), angles=(3,))
+    with pytest.raises(ValueError, match="point has shape"):
+        state_errors(torch.zeros(4, 3), torch.zeros(4, 3), space=Circle())
     assert_refused(ValueError, "no states", state_errors, torch.zeros(0, 3), torch.zeros(0, 3))

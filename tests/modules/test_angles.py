@@ -1,4 +1,4 @@
-"""Readings that are angles. Oracle: the same problem turned by half a circle, where nothing wraps, without angles."""
+"""Readings that are angles. Oracle: the same problem turned by half a circle, where nothing wraps, in plain numbers."""
 
 import math
 
@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from torch_denkf.functional.localisation import Neighbours
+from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.modules import (
     EnsembleAnalysis,
     GaussianLikelihood,
@@ -18,6 +19,7 @@ from torch_denkf.modules import (
 pytestmark = pytest.mark.usefixtures("float64")
 
 E, S, OBS = 12, 3, 2
+SPACE = Circle() * Euclidean(1)
 SCHEMES = ["sensor", "perturbed", "etkf", "sakov"]
 INFO = [("info", name) for name in ("innovation", "nis", "log_likelihood")]
 BELIEF = [("belief", name) for name in ("ensemble", "mean", "var")]
@@ -60,7 +62,7 @@ def assert_same(first, second, keys):
 def test_ensemble_analysis(scheme, samples, batch):
     here, there = ensembles(batch, samples)
     options = {"inflation": 1.1, "relaxation": 0.2}
-    found = EnsembleAnalysis(scheme, angles=[0], **options)(here.copy())
+    found = EnsembleAnalysis(scheme, reading_space=SPACE, **options)(here.copy())
     assert_same(found, EnsembleAnalysis(scheme, **options)(there.copy()), [*BELIEF, *INFO])
     ignored = EnsembleAnalysis(scheme, **options)(here.copy())
     assert not ignored["belief", "mean"].allclose(found["belief", "mean"], atol=1e-3), "it matters"
@@ -72,7 +74,7 @@ def test_ensemble_analysis_of_what_is_observed(scheme):
     for td in (here, there):
         td["observed"] = torch.tensor([[True, True], [False, True], [False, False]])
         td["sensor", "ensemble"] = torch.where(td["observed"].unsqueeze(-2), td["sensor", "ensemble"], torch.nan)
-    found = EnsembleAnalysis(scheme, angles=[0])(here.copy())
+    found = EnsembleAnalysis(scheme, reading_space=SPACE)(here.copy())
     assert_same(found, EnsembleAnalysis(scheme)(there.copy()), [*BELIEF, *INFO])
     assert found["belief", "ensemble"][2].equal(here["forecast", "ensemble"][2])
 
@@ -82,7 +84,7 @@ def test_ensemble_analysis_of_what_is_observed(scheme):
 def test_local_analysis(samples, batch):
     here, there = ensembles(batch, samples)
     near = Neighbours(torch.arange(OBS).expand(S, OBS), torch.tensor([[1.0, 0.5], [0.5, 1.0], [0.2, 0.2]]))
-    found = LocalEnsembleAnalysis(near, angles=[0], inflation=1.1)(here.exclude("noise"))
+    found = LocalEnsembleAnalysis(near, reading_space=SPACE, inflation=1.1)(here.exclude("noise"))
     assert_same(found, LocalEnsembleAnalysis(near, inflation=1.1)(there.exclude("noise")), [*BELIEF, *INFO])
 
 
@@ -96,7 +98,7 @@ def test_kalman_analysis(samples, batch):
     for td, at in ((here, mean), (there, mean - turn)):
         td["forecast"] = TensorDict({"mean": at, "cov": root @ root.mT + torch.eye(S)}, batch)
     keys = {"observation_key": ("sensor", "ensemble")}
-    found = KalmanAnalysis(matrix, None, angles=[0], **keys)(here.copy())
+    found = KalmanAnalysis(matrix, None, reading_space=SPACE, **keys)(here.copy())
     expected = KalmanAnalysis(matrix, None, **keys)(there.copy())
     expected["belief", "mean"] = expected["belief", "mean"] + turn
     assert_same(found, expected, [("belief", name) for name in ("mean", "cov", "var")] + INFO)
@@ -107,11 +109,11 @@ def test_kalman_analysis(samples, batch):
 @pytest.mark.parametrize("samples", [True, False])
 def test_likelihoods(samples, batch):
     here, there = ensembles(batch, samples)
-    learned = LearnedLikelihood(4, OBS, num_cells=(8,), angles=[0], observation_key=("sensor", "ensemble"))
+    learned = LearnedLikelihood(4, OBS, num_cells=(8,), reading_space=SPACE, observation_key=("sensor", "ensemble"))
     plain = LearnedLikelihood(4, OBS, num_cells=(8,), observation_key=("sensor", "ensemble"))
     plain.load_state_dict(learned.state_dict())
     here["sensor", "encoding"] = there["sensor", "encoding"] = torch.randn(*batch, 4)
-    for model, oracle in ((GaussianLikelihood(angles=[0]), GaussianLikelihood()), (learned, plain)):
+    for model, oracle in ((GaussianLikelihood(reading_space=SPACE), GaussianLikelihood()), (learned, plain)):
         found = model(here.copy())
         assert_same(found, oracle(there.copy()), [("forecast", "log_likelihood")])
         assert not oracle(here.copy())["forecast", "log_likelihood"].allclose(found["forecast", "log_likelihood"])

@@ -11,6 +11,7 @@ from tests.filters.gaussian_for_tests import directional_check
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import ClonedTransition, PairObservation
 from torch_denkf.functional import kalman_update
+from torch_denkf.functional.manifolds import Flat
 from torch_denkf.modules import (
     ConstantNoise,
     DiagonalNoise,
@@ -240,7 +241,7 @@ def test_inflation_acts_where_something_is_observed(float64, Analysis):
 def test_angles_are_compared_across_pi(float64, Analysis):
     td = forecast(1)
     td["forecast", "mean"][0, 0], td["sensor", "ensemble"][..., 0] = 3.1, -3.1
-    innovation = Analysis(Select([0, 1]), angles=[0])(td.copy())["info", "innovation"]
+    innovation = Analysis(Select([0, 1]), reading_space=Flat(2, circular=[0]))(td.copy())["info", "innovation"]
     torch.testing.assert_close(innovation[0, 0], torch.tensor(2 * torch.pi - 6.2), rtol=0, atol=1e-12)
 
 

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
+from torch_denkf.functional.manifolds import Circle
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules import (
     AroundState,
@@ -268,7 +269,7 @@ def test_a_tempered_likelihood_is_that_of_more_noise(float64):
 
 
 def test_the_innovation_of_angles_is_the_shorter_way_round():
-    likelihood = GaussianLikelihood(angles=[0], observation_key="y")
+    likelihood = GaussianLikelihood(reading_space=Circle(), observation_key="y")
     predicted, weights = torch.tensor([[3.0], [-3.0]]), torch.tensor([0.25, 0.75]).log()
     forecast = {"ensemble": predicted, "observation": predicted, "log_weight": weights}
     td = TensorDict({"forecast": forecast, "y": torch.tensor([-2.5]), "sensor": {"noise": torch.tensor([0.01])}})

@@ -11,6 +11,7 @@ from torch import nn
 
 from tests.filters.gaussian_for_tests import directional_check
 from torch_denkf.applications.car import UnicycleTransition
+from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.modules import (
     ConstantNoise,
     LearnedObservation,
@@ -56,7 +57,11 @@ def test_a_step_equals_the_textbook(float64, parameters):
     td = TensorDict({"belief": {"mean": mean, "cov": cov}, "reading": torch.randn(2, 2), "R": torch.rand(2, 2)}, [2])
     out = UKFTransition(LearnedTransition(bend, residual=False), constant_noise(3), **keys)(td)
     analysis = UKFAnalysis(
-        LearnedObservation(range_bearing), **keys, observation_key="reading", noise_variance_key="R", angles=[1]
+        LearnedObservation(range_bearing),
+        **keys,
+        observation_key="reading",
+        noise_variance_key="R",
+        reading_space=Euclidean(1) * Circle(),
     )
     out = analysis(out)
     for row in range(2):

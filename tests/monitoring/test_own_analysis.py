@@ -26,7 +26,6 @@ class Own(Update):
         noise_variance_key=("sensor", "noise"),
         observed_key="observed",
         belief_prefix="belief",
-        angles=(),
     ):
         writes = [(belief_prefix, name) for name in ("ensemble", "mean", "var")]
         writes += [("info", name) for name in ("innovation", "nis", "log_likelihood")]

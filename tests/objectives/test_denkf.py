@@ -10,6 +10,7 @@ from tests.filters.factories import linear_kalman, toy_denkf
 from tests.filters.test_kalman import joint_gaussian
 from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, TERMS, score_by_hand
 from tests.objectives.problem_for_tests import only, problem, stepped
+from torch_denkf.functional.manifolds import Flat
 from torch_denkf.modules import StochasticMLP
 from torch_denkf.objectives import DEnKFLoss
 
@@ -78,14 +79,14 @@ def test_angles_wrap(float64, score):
     frames, out = problem(filter)
     frames["state"] = out["belief", "ensemble"][..., 0, :].detach() + 0.1  # near: no error exceeds pi
     assert (out["belief", "ensemble"] - frames["state"].unsqueeze(-2)).abs().max() < math.pi
-    near = DEnKFLoss(filter, score=score, **ONLY_STATE, angles=[1])(frames)["loss_state"]
+    near = DEnKFLoss(filter, score=score, **ONLY_STATE, space=Flat(3, circular=[1]))(frames)["loss_state"]
     expected = score_by_hand(score, out["belief", "ensemble"], frames["state"])[stepped(frames)].mean()
     torch.testing.assert_close(near, expected, **CLOSE)
     turned = frames.clone()
     turned["state"][..., 1] += 2 * math.pi * torch.randint(-3, 4, (2, 7))
-    far = DEnKFLoss(filter, score=score, **ONLY_STATE, angles=[1])(turned)["loss_state"]
+    far = DEnKFLoss(filter, score=score, **ONLY_STATE, space=Flat(3, circular=[1]))(turned)["loss_state"]
     torch.testing.assert_close(far, near, rtol=1e-9, atol=1e-12)  # 6 pi costs a digit
     plain = DEnKFLoss(filter, score=score, **ONLY_STATE)(turned)["loss_state"]
     assert plain > near + 1
     turned["state"][..., 0] += 2 * math.pi  # not an angle
-    assert DEnKFLoss(filter, score=score, **ONLY_STATE, angles=[1])(turned)["loss_state"] > near + 0.5
+    assert DEnKFLoss(filter, score=score, **ONLY_STATE, space=Flat(3, circular=[1]))(turned)["loss_state"] > near + 0.5

@@ -11,6 +11,7 @@ from tests.filters.gaussian_for_tests import learned_filter, learned_frames, lin
 from torch_denkf.applications.car.modules.pairs import ClonedPrior
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble
+from torch_denkf.functional.manifolds import Flat
 from torch_denkf.modules import GaussianAround, KalmanAnalysis
 from torch_denkf.objectives import GaussianLoss
 
@@ -55,7 +56,7 @@ def test_a_truth_with_fewer_dimensions_than_the_belief(float64):
     error = (out["belief", "mean"][..., :5] - frames["state"])[:, 1:]
     loss = GaussianLoss(filter, **{**OFF, "state": 1.0}, score="mse")
     torch.testing.assert_close(loss(frames)["loss_state"], error.square().mean())
-    loss = GaussianLoss(filter, **{**OFF, "state": 1.0}, score="mse", dims=(2, 4), angles=[2, 3])
+    loss = GaussianLoss(filter, **{**OFF, "state": 1.0}, score="mse", dims=(2, 4), space=Flat(9, circular=[2, 3]))
     error = error[..., [2, 4]]
     error[..., 0] = torch.remainder(error[..., 0] + math.pi, 2 * math.pi) - math.pi
     torch.testing.assert_close(loss(frames)["loss_state"], error.square().mean())

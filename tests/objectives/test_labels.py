@@ -14,6 +14,7 @@ from tests.objectives.problem_for_tests import problem, stepped
 from tests.objectives.test_parts import forecasts_by_hand
 from torch_denkf.data import Recording, RecordingReplay, Table
 from torch_denkf.filters import DEnKF, KalmanFilter, ParticleFilter
+from torch_denkf.functional.manifolds import Circle, Flat
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianLikelihood, LinearObservation, Select
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from torch_denkf.objectives._labels import Truth
@@ -134,7 +135,7 @@ def test_one_label_of_two_dimensions_is_not_that_of_both():
 
 @pytest.mark.parametrize("name", ["members-crps", "members-mse", "particles-crps", "particles-mixture"])
 def test_angles_beyond_the_labels_and_members_on_both_sides_of_pi(name):
-    _, frames, _, loss = case(name, terms=["state"], angles=[0, 2])
+    _, frames, _, loss = case(name, terms=["state"], space=Flat(3, circular=[0, 2]))
     frames["state"] = frames["state"][..., :2]
     before = loss(frames)["loss_state"]
     frames["state"][..., 0] += 2 * math.pi
@@ -153,7 +154,7 @@ def test_the_mean_of_particles_on_both_sides_of_pi():
     )
     frames = TensorDict({"y": torch.zeros(4, 1), "observed": torch.zeros(4, 1, dtype=torch.bool)}, [4])
     frames["state"] = torch.full((4, 1), math.pi)
-    value = MixtureLoss(filter, state=0.0, mean=1.0, angles=[0])(frames)["loss_mean"]
+    value = MixtureLoss(filter, state=0.0, mean=1.0, space=Circle())(frames)["loss_mean"]
     torch.testing.assert_close(value, torch.tensor(0.01))
 
 
@@ -346,7 +347,7 @@ def test_the_masks_of_renamed_labels_are_those_that_data_sets_write():
 
 @pytest.mark.parametrize("name", ["members-crps", "members-energy", "moments-nll", "particles-mixture"])
 def test_scores_of_labels_with_gaps_compile_without_a_break(name):
-    _, frames, out, loss = case(name, terms=["state"], state_scale=SCALE, dims=[0, 1, 2], angles=[1])
+    _, frames, out, loss = case(name, terms=["state"], state_scale=SCALE, dims=[0, 1, 2], space=Flat(3, circular=[1]))
     frames = hidden(frames, gaps()[1], "NaN")
     term = lambda: loss.terms[0](out, Truth(loss, frames, out))  # noqa: E731
     expected, rows = term()

@@ -20,6 +20,7 @@ from tests.filters.particle_for_tests import toy_filter
 from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, TERMS, score_by_hand
 from tests.objectives.problem_for_tests import only, problem, stepped
 from torch_denkf.filters import Filter
+from torch_denkf.functional.manifolds import Flat
 from torch_denkf.modules import Initial, SubModel
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 
@@ -50,7 +51,9 @@ def test_a_dimension_with_infinite_scale_does_not_count(score):
     torch.testing.assert_close(alone, expected, **CLOSE)
     # What does not count may hold anything, and an angle keeps its place.
     frames["state"][..., 1] = math.inf
-    again = DEnKFLoss(filter, score=score, **ONLY_STATE, state_scale=scale, angles=[1])(frames)["loss_state"]
+    again = DEnKFLoss(filter, score=score, **ONLY_STATE, state_scale=scale, space=Flat(3, circular=[1]))(frames)[
+        "loss_state"
+    ]
     assert again.equal(losses["loss_state"])
     again.backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in filter.parameters())

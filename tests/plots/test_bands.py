@@ -8,6 +8,7 @@ from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import DT, ensemble_run, kalman_runs
 from torch_denkf.functional import wrap_angles
+from torch_denkf.functional.manifolds import Circle
 from torch_denkf.plots import plot_bands
 
 NORMAL_90 = 1.6448536
@@ -122,7 +123,7 @@ def test_angles_stay_beside_the_mean():
     ensemble = theta[:, None, None] + 0.1 * torch.randn(30, 19, 1, generator=rng)
     belief = {"mean": wrap(ensemble.mean(1)), "ensemble": wrap(ensemble)}
     run = TensorDict({"belief": belief, "state": wrap(theta).unsqueeze(-1)}, [30])
-    (axes,) = plot_bands(run, angles=[0], readings={0: wrap(theta + 0.2)})
+    (axes,) = plot_bands(run, space=Circle(), factors=[1.0], readings={0: wrap(theta + 0.2)})
     _, low, high = band(axes)
     np.testing.assert_allclose(line(axes, "truth")[1], theta, atol=1e-5)
     np.testing.assert_allclose(line(axes, "belief")[1], ensemble.mean(1)[:, 0], atol=1e-5)

@@ -129,7 +129,6 @@ def test_readings_of_angles_are_in_radians_beside_the_mean():
 
 def test_wrong_calls_are_refused():
     run = turning_run()
-    assert_refused(ValueError, "pass one of the two", plot_bands, run, space=SPACE, angles=[0])
     assert_refused(ValueError, "mean has shape", plot_bands, run, space=SO3())
     with pytest.raises(IndexError, match="dimension 5 of a state of 5"):
         plot_bands(run, space=SPACE, dims=[5])

@@ -100,5 +100,4 @@ def test_the_truth_of_a_leading_part_and_of_some_rows():
 
 def test_what_is_no_space_is_refused():
     for plot in (plot_spread_error, plot_calibration):
-        assert_refused(ValueError, "pass one of the two", plot, beliefs(), space=SPACE, angles=[4])
         assert_refused(ValueError, r"a point of SO3\(\)", plot, beliefs(), space=SO3())

@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import ensemble_run, kalman_runs
+from torch_denkf.functional.manifolds import Circle
 from torch_denkf.plots import belief_video, plot_bands, plot_calibration, plot_path, plot_spread_error
 
 LAG = 6
@@ -68,7 +69,7 @@ def test_each_state_is_taken_from_the_latest_row_of_its_episode():
     age = torch.tensor([3, 3, 0, 1, 2, 3, 3, 0, 1])  # cut out of an episode; a new one at 2, and one at 7
     mean = torch.arange(9.0).unsqueeze(-1)
     run = TensorDict({"smoothed": {"mean": mean, "var": mean + 1, "age": age.unsqueeze(-1)}}, [9])
-    (axes,) = plot_bands(run, belief="smoothed", angles=[0])
+    (axes,) = plot_bands(run, belief="smoothed", space=Circle(), factors=[1.0])
     turns = np.unwrap([5.0, 6.0, 8.0])
     wanted = np.full(9, np.nan)
     wanted[[2, 3, 7]] = turns

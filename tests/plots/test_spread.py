@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import ensemble_run, kalman_runs
+from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.plots import plot_spread_error
 
 
@@ -56,8 +57,10 @@ def test_the_axes_say_each_unit():
 
 def test_angles_are_wrapped():
     belief = TensorDict({"mean": torch.tensor([[0.0, 3.1]]), "var": torch.ones(1, 2)}, [1])
-    axes = plot_spread_error(belief, torch.tensor([[0.0, -3.1]]), dims=[1], angles=[1], bins=1)
-    assert data(axes)["state 1"][1, 0] == pytest.approx(2 * np.pi - 6.2, abs=1e-6)
+    axes = plot_spread_error(
+        belief, torch.tensor([[0.0, -3.1]]), dims=[1], space=Euclidean(1) * Circle(), factors=[1.0], bins=1
+    )
+    assert data(axes)["heading, deg"][1, 0] == pytest.approx(2 * np.pi - 6.2, abs=1e-6)
 
 
 def test_errors_say_what_to_do():

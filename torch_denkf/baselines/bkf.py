@@ -39,8 +39,8 @@ class BackpropKF(GaussianFilter):
             :class:`~torch_denkf.modules.GaussianAround`.
         control: B, ``[S, A]``; ``None`` for none.
         trainable: whether A and B are parameters.
-        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key``, ``visibility`` and what every
-            filter takes, see :class:`GaussianOptions`. Of ``control_keys`` the first drives the transition
+        **options: ``inflation``, ``reading_space``, ``observation_key``, ``observed_key``, ``visibility`` and what
+            every filter takes, see :class:`GaussianOptions`. Of ``control_keys`` the first drives the transition
             where ``control`` is given.
 
     Raises:
@@ -78,11 +78,11 @@ class BackpropKF(GaussianFilter):
         check_square("transition", a)
         check_shape("observation", c, (len(c) if c.ndim else 0, len(a)), "[O, S]")
         check_one_dtype(transition=a, observation=c)
-        spaces = [one for one in (role(initial, Initial).space, options.get("reading_space")) if one is not None]
-        if spaces:
+        space = role(initial, Initial).space
+        if space is not None:
             raise ValueError(
-                f"BackpropKF moves and observes plain numbers by matrices, and there are points of {spaces[0]}. Give "
-                "the same sensor and noise to an EKF, with a motion and an observation model of points."
+                f"BackpropKF moves plain numbers by a matrix, and the initial belief is of points of {space}. Give the "
+                "same sensor and noise to an EKF, with a motion and an observation model of points."
             )
         check_values("transition", a)
         check_values("observation", c)

@@ -13,9 +13,8 @@ from torch import nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import analyse
 from torch_denkf.functional.inflation import inflate, random_rotation
-from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.smoothing.iterated import iterated_smoothing
-from torch_denkf.modules._spaces import checked_spaces, reading_about
 from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.gaussian import further_keys
 from torch_denkf.modules.motion_noise import NoisyTransition
@@ -118,7 +117,7 @@ class IteratedAnalysis(Update):
             optional_keys=[observed_key, *optional],
         )
         self.iterations, self.inflation, self.rotate = iterations, inflation, rotate
-        self.space, self.reading_space = checked_spaces(space, reading_space, ())
+        self.space, self.reading_space = check_space("space", space), check_space("reading_space", reading_space)
         self.info_prefix, self.observed_key = info_prefix, unravel_key(observed_key)
         self.reading_keys = self.in_keys[1:3]
 
@@ -170,7 +169,7 @@ class IteratedAnalysis(Update):
             predicted = written[unravel_key(observation.out_keys[0])]
             if on is None:
                 return predicted
-            about, read = reading_about(on, predicted, reading, observed)
+            about, read = on.align(predicted, reading, observed)
             return about - read.unsqueeze(-2)  # as seen from the reading: each iteration has tangents of its own
 
         due = reading if on is None else torch.zeros_like(variance)

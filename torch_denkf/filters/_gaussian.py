@@ -29,9 +29,8 @@ class GaussianOptions(FilterOptions, total=False):
     Attributes:
         inflation: factor on the belief's standard deviations, where anything is observed; 1 by default. What is never
             observed grows by it without bound.
-        angles: components of the observation that are angles in radians; none by default.
-        reading_space: in which the reading lives, in the place of ``angles``. That of the state is the initial
-            belief's.
+        reading_space: in which the reading lives, such as ``Circle()`` for an angle; ``None`` by default, for plain
+            numbers. That of the state is the initial belief's.
         observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``; ``("sensor", "ensemble")`` by default.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, by default ``"observed"``; a nonlinear observation model
             may write it.
@@ -40,7 +39,6 @@ class GaussianOptions(FilterOptions, total=False):
     """
 
     inflation: float
-    angles: Sequence[int]
     reading_space: Space | None
     observation_key: NestedKey
     observed_key: NestedKey
@@ -54,7 +52,7 @@ class GaussianFilter(Filter):
         sensor: writes the reading; ``None`` where it is in the tensordict.
         noise: writes R.
         transition: forecasts mean and covariance.
-        analysis: makes the module that updates them, from ``inflation``, ``angles``, ``observation_key``,
+        analysis: makes the module that updates them, from ``inflation``, ``reading_space``, ``observation_key``,
             ``observed_key`` and ``noise_variance_key``.
         initial: the initial belief.
         **options: see :class:`GaussianOptions`.
@@ -72,7 +70,6 @@ class GaussianFilter(Filter):
         *,
         initial: TensorDictModuleBase,
         inflation: float = 1.0,
-        angles: Sequence[int] = (),
         reading_space: Space | None = None,
         observation_key: NestedKey = ("sensor", "ensemble"),
         observed_key: NestedKey = "observed",
@@ -83,11 +80,10 @@ class GaussianFilter(Filter):
         check_module("initial", initial)
         refuse_other_beliefs(type(self).__name__, initial, transition.in_keys[:2])
         space = role(initial, Initial).space
-        spaces = {} if space is None and reading_space is None else {"space": space, "reading_space": reading_space}
+        spaces = {"space": space, "reading_space": reading_space}
         update = analysis(
-            **spaces,
+            **{name: space for name, space in spaces.items() if space is not None},
             inflation=inflation,
-            angles=angles,
             observation_key=observation_key,
             noise_variance_key=noise.out_keys[0],
             observed_key=observed_key,

@@ -58,8 +58,8 @@ class DEnKF(Filter):
         process_noise: Q of the motion, beside the noise of the transition's network: standard deviations ``[S]`` (a
             number for all, 0 for none), or a module that writes Q, see :mod:`torch_denkf.modules.process_noise`. An
             ensemble without any process noise collapses. ``None``: the transition's own noise alone.
-        angles: components of the observation that are angles in radians, for the default ``analysis``.
-        reading_space: in which the reading lives, in the place of ``angles``. The initial belief has that of the state.
+        reading_space: in which the reading lives, such as ``Circle()`` for an angle, for the default ``analysis``;
+            ``None`` for plain numbers. The initial belief has that of the state.
         observation_key: the reading ``[*B, O]``, for the default ``analysis`` without a sensor.
         observed_key: its mask ``[*B, 1]`` or ``[*B, O]``, for the default ``analysis``; ``"observed"`` by default.
         sensor_error: coloured errors of the sensor, such as a ``FadingBias``: they become part of the state, behind its
@@ -95,7 +95,6 @@ class DEnKF(Filter):
         *,
         initial: TensorDictModuleBase,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
-        angles: Sequence[int] = (),
         reading_space: Space | None = None,
         observation_key: NestedKey | None = None,
         observed_key: NestedKey | None = None,
@@ -114,11 +113,11 @@ class DEnKF(Filter):
         if process_noise is not None:
             q = as_process_noise(process_noise, initial)
             transition = NoisyTransition(transition, q, space=role(initial, Initial).space)
-        told = angles or reading_space is not None or observation_key is not None or observed_key is not None
+        told = reading_space is not None or observation_key is not None or observed_key is not None
         if analysis is not None and told:
             raise ValueError(
-                "angles, reading_space, observation_key and observed_key are for the default analysis; give them to "
-                "yours instead."
+                "reading_space, observation_key and observed_key are for the default analysis; give them to yours "
+                "instead."
             )
         if analysis is None:
             if observation_key is None and sensor is None:
@@ -128,7 +127,6 @@ class DEnKF(Filter):
             keys = {"observation_key": reading, "noise_variance_key": noise.out_keys[0], "observed_key": mask}
             analysis = EnsembleAnalysis(
                 "perturbed" if sensor is None else "sensor",
-                angles=angles,
                 space=role(initial, Initial).space,
                 reading_space=reading_space,
                 **keys,

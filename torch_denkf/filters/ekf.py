@@ -39,8 +39,8 @@ class EKF(GaussianFilter):
             S components, of transition, process noise, observation and initial belief. All these are given for the
             state alone.
         stop_jacobian_gradient: the transition's Jacobian is a constant to the gradient.
-        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key``, ``visibility`` and what every
-            filter takes, see :class:`GaussianOptions`.
+        **options: ``inflation``, ``reading_space``, ``observation_key``, ``observed_key``, ``visibility`` and what
+            every filter takes, see :class:`GaussianOptions`.
 
     Reference:
         Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.

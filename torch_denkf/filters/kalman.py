@@ -13,9 +13,10 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_covariance, check_one_dtype, check_shape, check_square, check_values
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import KalmanAnalysis, LinearTransition, MomentPrior
-from torch_denkf.modules.tensors import as_floating, check_dims
+from torch_denkf.modules.tensors import as_floating
 
 __all__ = ["KalmanFilter"]
 
@@ -36,7 +37,8 @@ class KalmanFilter(Filter):
         mean: of the initial belief, ``[S]``.
         cov: of the initial belief, ``[S, S]``.
         control: B, ``[S, A]``, of the action; ``None`` for none.
-        angles: components of the observation that are angles in radians.
+        reading_space: in which the reading lives, one of numbers and angles such as ``Euclidean(1) * Circle()``;
+            ``None`` for plain numbers.
         sensor_error: errors of the readings that last, :class:`~torch_denkf.imperfect.FadingBias`: they become part of
             the state, behind its S components, as large and as long as they are now.
         observation_key: readings ``[*B, O]``.
@@ -69,7 +71,7 @@ class KalmanFilter(Filter):
         mean: torch.Tensor,
         cov: torch.Tensor,
         control: torch.Tensor | None = None,
-        angles: Sequence[int] = (),
+        reading_space: Space | None = None,
         sensor_error: FadingBias | None = None,
         observation_key: NestedKey = "observation",
         observed_key: NestedKey = "observed",
@@ -95,7 +97,6 @@ class KalmanFilter(Filter):
             b = as_floating(control, "control")
             check_shape("control", b, (size, b.shape[-1] if b.ndim else 0), "[S, A]")
             check_values("control", b)
-        check_dims("angles", angles, readings)
         if sensor_error is not None:
             f, h, q, m, p = _with_biases(sensor_error, f, h, q, m, p)
             control = None if control is None else nn.functional.pad(as_floating(control), (0, 0, 0, len(sensor_error)))
@@ -109,7 +110,7 @@ class KalmanFilter(Filter):
                 r,
                 observation_key=observation_key,
                 observed_key=observed_key,
-                angles=angles,
+                reading_space=reading_space,
             ),
         )
         super().__init__(modules, initial=MomentPrior(m, p), **kwargs)

@@ -51,8 +51,8 @@ class ParticleFilter(Filter):
         initial: the initial belief, which also fixes the number of particles; weights are added where it has none.
         process_noise: Q of the motion, beside the transition's own noise: standard deviations ``[S]`` (a number for
             all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
-        angles: components of the observation that are angles in radians, for the default likelihood.
-        reading_space: in which the reading lives, in the place of ``angles``. The initial belief has that of the state.
+        reading_space: in which the reading lives, such as ``Circle()`` for an angle, for the default likelihood;
+            ``None`` for plain numbers. The initial belief has that of the state.
         observation_key: the reading ``[*B, O]``, for the default likelihood without a sensor.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` that resampling and the default likelihood heed.
         visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.imperfect.Visibility`; the
@@ -98,7 +98,6 @@ class ParticleFilter(Filter):
         ess_threshold: float | None = None,
         jitter: float = 0.0,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
-        angles: Sequence[int] = (),
         reading_space: Space | None = None,
         observation_key: NestedKey | None = None,
         observed_key: NestedKey = "observed",
@@ -123,11 +122,11 @@ class ParticleFilter(Filter):
             reading = reading_of(sensor) if sensor is not None and observation_key is None else observation_key
             keys = {} if noise is None else {"noise_variance_key": noise.out_keys[0]}
             likelihood = GaussianLikelihood(
-                angles=angles, reading_space=reading_space, observation_key=reading, observed_key=observed_key, **keys
+                reading_space=reading_space, observation_key=reading, observed_key=observed_key, **keys
             )
-        elif angles or reading_space is not None or observation_key is not None:
+        elif reading_space is not None or observation_key is not None:
             raise ValueError(
-                "angles, reading_space and observation_key are for the default likelihood; give them to yours instead, "
+                "reading_space and observation_key are for the default likelihood; give them to yours instead, "
                 "the key as observation_key= of a GaussianLikelihood, or as encoding_key= or observation_key= of a "
                 "LearnedLikelihood."
             )

@@ -40,8 +40,8 @@ class UKF(GaussianFilter):
         alpha: spread of the sigma points.
         beta: extra weight of the central point in the covariance.
         kappa: their secondary spread. Covariances stay positive where no weight is negative, as by default.
-        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key``, ``visibility`` and what every
-            filter takes, see :class:`GaussianOptions`.
+        **options: ``inflation``, ``reading_space``, ``observation_key``, ``observed_key``, ``visibility`` and what
+            every filter takes, see :class:`GaussianOptions`.
 
     Reference:
         Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.

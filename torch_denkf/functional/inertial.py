@@ -9,16 +9,8 @@ from __future__ import annotations
 from torch import Tensor, cat
 
 from torch_denkf._checks import check_shape
-from torch_denkf.functional.manifolds import (
-    SE23,
-    SO3,
-    _bend,
-    _fourth,
-    _half_versine,
-    _one_minus_sinc,
-    _series,
-    rotate,
-)
+from torch_denkf.functional.manifolds import SE23, SO3, rotate
+from torch_denkf.functional.manifolds.rotations import bend, fourth, half_versine, one_minus_sinc, series
 
 __all__ = ["move_inertially"]
 
@@ -64,9 +56,9 @@ def move_inertially(pose: Tensor, rate: Tensor, force: Tensor, dt: float | Tenso
     orientation, velocity, position = pose[..., :4], pose[..., 4:7], pose[..., 7:]
     angles = rate * dt
     square = angles.square().sum(-1, keepdim=True)
-    third = _series(square, _one_minus_sinc)
-    once = _bend(angles, force * dt, _series(square, _half_versine), third)
-    twice = _bend(angles, 0.5 * force * dt, 2 * third, 2 * _series(square, _fourth))
+    third = series(square, one_minus_sinc)
+    once = bend(angles, force * dt, series(square, half_versine), third)
+    twice = bend(angles, 0.5 * force * dt, 2 * third, 2 * series(square, fourth))
     fall = pose.new_tensor([0.0, 0.0, -gravity]) * dt
     turned = SO3().compose(orientation, SO3().exp(angles))
     moved = position + (velocity + 0.5 * fall + rotate(orientation, twice)) * dt

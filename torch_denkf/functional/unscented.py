@@ -7,16 +7,15 @@ for alpha, beta and kappa; Särkkä 2013, section 5.5.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
-from torch_denkf.functional.angles import wrap_angles
 from torch_denkf.functional.gaussian import GaussianUpdate, _check_moments, solve_for_gain
 from torch_denkf.functional.linalg import semidefinite_root
+from torch_denkf.functional.manifolds import Space, check_space
 
 
 class UnscentedWeights(NamedTuple):
@@ -99,20 +98,20 @@ def sigma_points(mean: Tensor, cov: Tensor, *, alpha: float = 1.0, kappa: float 
 
 
 def unscented_moments(
-    points: Tensor, weights: UnscentedWeights, *, angles: Sequence[int] = ()
+    points: Tensor, weights: UnscentedWeights, *, space: Space | None = None
 ) -> tuple[Tensor, Tensor]:
     """Mean and covariance of sigma points after a function (Särkkä 2013, eq. 5.75).
 
     Args:
         points: ``[*B, 2 S + 1, N]``.
         weights: see :func:`unscented_weights`.
-        angles: components that are angles in radians: they are averaged on the side of the central point.
+        space: one of numbers and angles; these are averaged on the side of the central point. ``None`` for numbers.
 
     Returns:
         The mean ``[*B, N]`` and the covariance ``[*B, N, N]``.
 
     Raises:
-        ValueError: if there are not as many points as weights.
+        ValueError: if there are not as many points as weights, or for another space.
 
     Examples:
         >>> points = sigma_points(torch.zeros(1), torch.eye(1))
@@ -120,7 +119,7 @@ def unscented_moments(
         >>> mean.round(decimals=4)  # E x^2
         tensor([1.])
     """
-    mean, deviations = _deviations(points, weights, angles)
+    mean, deviations = _deviations(points, weights, space)
     return mean, _weighted_gram(deviations, weights.cov, deviations)
 
 
@@ -144,7 +143,7 @@ def unscented_cross(points: Tensor, images: Tensor, weights: UnscentedWeights) -
         tensor([[3.]])
     """
     # The points lie evenly around their mean, so that the mean of the images need not be taken off, but for digits.
-    deviations = _deviations(images, weights, ())[1]
+    deviations = _deviations(images, weights, None)[1]
     return (points - points[..., :1, :]).mT @ (weights.cov.unsqueeze(-1) * deviations)
 
 
@@ -156,7 +155,7 @@ def unscented_update(
     weights: UnscentedWeights,
     *,
     observed: Tensor | None = None,
-    angles: Sequence[int] = (),
+    space: Space | None = None,
 ) -> GaussianUpdate:
     r"""Condition a Gaussian on an observation, by its sigma points (Särkkä 2013, eqs. 5.86 and 5.87).
 
@@ -170,7 +169,7 @@ def unscented_update(
         noise: R, variances ``[*B, O]`` or covariances ``[*B, O, O]``.
         weights: see :func:`unscented_weights`.
         observed: mask ``[*B, 1]`` or ``[*B, O]``, see :func:`torch_denkf.functional.kalman_update`.
-        angles: components of the observation that are angles in radians.
+        space: of the observation, one of numbers and angles; ``None`` for plain numbers.
 
     Returns:
         A :class:`torch_denkf.functional.gaussian.GaussianUpdate`.
@@ -187,7 +186,7 @@ def unscented_update(
     """
     check_one_dtype(points=points, predicted=predicted, observation=observation, noise=noise)
     check_mask("observed", observed)
-    expected, deviations = _deviations(predicted, weights, angles)
+    expected, deviations = _deviations(predicted, weights, space)
     check_ensemble("points", points)
     batch, dim = expected.shape[:-1], expected.shape[-1]
     check_shape("points", points, (*batch, len(weights.mean), points.shape[-1]), "[*B, 2 S + 1, S]")
@@ -197,7 +196,7 @@ def unscented_update(
         noise = noise.diag_embed()
     else:
         check_shape("noise", noise, (*batch, dim, dim), "variances [*B, O] or covariances [*B, O, O]")
-    innovation = wrap_angles(observation - expected, angles)
+    innovation = observation - expected if space is None else space.minus(observation, expected)
     count: int | Tensor = dim
     if observed is not None:
         width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
@@ -229,7 +228,7 @@ def _spread(dim: int, alpha: float, kappa: float) -> float:
     return spread
 
 
-def _deviations(points: Tensor, weights: UnscentedWeights, angles: Sequence[int]) -> tuple[Tensor, Tensor]:
+def _deviations(points: Tensor, weights: UnscentedWeights, space: Space | None) -> tuple[Tensor, Tensor]:
     """Weighted mean ``[*B, N]`` and deviations from it ``[*B, 2 S + 1, N]``; differences first, for the digits."""
     check_ensemble("points", points)
     if points.shape[-2] != len(weights.mean):
@@ -238,7 +237,8 @@ def _deviations(points: Tensor, weights: UnscentedWeights, angles: Sequence[int]
             "points are [*B, 2 S + 1, N], and the weights are those of S dimensions"
         )
     center = points[..., :1, :]
-    deviations = wrap_angles(points - center, angles)
+    space = check_space("space", space, flat=True)
+    deviations = points - center if space is None else space.minus(points, center)
     shift = (weights.mean.unsqueeze(-1) * deviations).sum(-2)
     return center.squeeze(-2) + shift, deviations - shift.unsqueeze(-2)
 

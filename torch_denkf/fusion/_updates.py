@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import cast
 
 from tensordict import unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.manifolds import Euclidean, Product, Space, check_space, is_flat
 from torch_denkf.fusion.parts import JoinedObservation, JoinedReading, StateObservation
 from torch_denkf.fusion.sensor import FusedSensor, Wired, noise_key_of
 from torch_denkf.fusion.sensor_weights import SensorWeights, WeightedNoise
@@ -50,9 +50,7 @@ class Updates:
             keys = {"reading": wired[name].reading, "noise": wired[name].noise, "observed": wired[name].observed}
             if model.state_dim is not None:
                 keys["observed"] = model.out_keys[1]
-            told: dict[str, Any] = {"angles": list(sensor.angles)}
-            if self.space is not None or sensor.reading_space is not None:
-                told |= {"space": self.space, "reading_space": sensor.reading_space}
+            told = self._spaces(sensor.reading_space)
             modules.update(self._update(name, model, prefix, to, told, sensor.analysis, **keys))
             prefix = to
         return modules
@@ -62,34 +60,30 @@ class Updates:
         own = [name for name, sensor in sensors.items() if sensor.analysis is not None]
         if own:
             raise ValueError(f"A joint update is one for all sensors, and {own} have an analysis of their own.")
-        spaces = [name for name, sensor in sensors.items() if sensor.reading_space is not None]
-        if spaces:
-            raise ValueError(f"A joint update is for plain numbers, and {spaces} read points: leave joint=True away.")
         models = {name: self._model(prefix, name, sensor, wired[name]) for name, sensor in sensors.items()}
         keys = {
             "reading": ("sensor", "joint"),
             "noise": ("sensor", "joint_noise"),
             "observed": ("forecast", "observed"),
         }
+        spaces = _flat_spaces(sensors, "A joint update", "joint=True")
         sizes = [_observation_dim(sensor) for sensor in sensors.values()]
         join = JoinedReading(
             [wired[name].reading for name in sensors],
             [wired[name].noise for name in sensors],
-            [sensor.angles for sensor in sensors.values()],
+            list(spaces.values()),
             observation_key=keys["reading"],
             noise_key=keys["noise"],
             observation_dim=None if None in sizes else sum(size for size in sizes if size is not None),
         )
         model = JoinedObservation(models, predicted_key=("forecast", "observation"), observed_key=keys["observed"])
-        told = {"angles": _joint_angles(sensors)} | ({} if self.space is None else {"space": self.space})
+        told = self._spaces(_side_by_side(spaces, sizes))
         return {"readings": join, **self._update("analysis", model, prefix, last, told, None, **keys)}
 
     def weighted(self, prefix, sensors, wired, weights):
         """The sensors' weights, and their noise after them."""
-        spaces = {name: sensor.reading_space for name, sensor in sensors.items() if sensor.reading_space is not None}
-        if spaces or (self.gaussian and self.space is not None):
-            on = f"{self.space}, a mean and a covariance" if not spaces else f"readings {spaces}"
-            raise ValueError(f"weights= compares plain numbers, and there are points, of {on}: leave weights= away.")
+        if self.gaussian and self.space is not None:
+            raise ValueError(f"weights= takes no mean and covariance of points of {self.space}: leave weights= away.")
         models = {name: self._model(prefix, name, sensor, wired[name]) for name, sensor in sensors.items()}
         modules = {
             "weights": SensorWeights(
@@ -98,7 +92,7 @@ class Updates:
                 {name: wired[name].reading for name in sensors},
                 {name: wired[name].noise for name in sensors},
                 {name: wired[name].features for name in sensors if wired[name].features is not None},
-                {name: sensor.angles for name, sensor in sensors.items()},
+                _flat_spaces(sensors, "weights=", "weights="),
                 state_key=(prefix, "ensemble"),
                 moments=prefix if self.gaussian else None,
             )
@@ -108,6 +102,11 @@ class Updates:
             modules[f"{name}_weighted"] = WeightedNoise(wired[name].noise, ("weight", name), key, observation_dim=size)
             wired[name] = replace(wired[name], noise=key)
         return modules
+
+    def _spaces(self, reading_space: Space | None) -> dict[str, Space]:
+        """The spaces that an update is told: none of plain numbers."""
+        spaces = {"space": self.space, "reading_space": reading_space}
+        return {name: space for name, space in spaces.items() if space is not None}
 
     def _model(self, prefix: str, name: str, sensor: FusedSensor, wired: Wired) -> StateObservation:
         ensemble = (prefix, "ensemble")
@@ -146,18 +145,24 @@ class Updates:
         return modules
 
 
-def _joint_angles(sensors: Mapping[str, FusedSensor]) -> list[int]:
-    """The angles among the readings side by side."""
-    found, begin = [], 0
-    for name, sensor in sensors.items():
-        if not any(other.angles for other in sensors.values()):
-            return []
-        size = _observation_dim(sensor)
-        if size is None:
-            raise ValueError(f"The size of {name!r}'s readings is not known, so angles cannot be found side by side.")
-        found += [begin + dim for dim in sensor.angles]
-        begin += size
-    return found
+def _flat_spaces(sensors: Mapping[str, FusedSensor], owner: str, cure: str) -> dict[str, Space | None]:
+    """The spaces of the readings, all of numbers and angles."""
+    others = [name for name, sensor in sensors.items() if not is_flat(sensor.reading_space)]
+    if others:
+        raise ValueError(f"{owner} takes readings of numbers and angles, and {others} read points: leave {cure} away.")
+    return {name: check_space("reading_space", sensor.reading_space) for name, sensor in sensors.items()}
+
+
+def _side_by_side(spaces: Mapping[str, Space | None], sizes: Sequence[int | None]) -> Space | None:
+    """The space of all readings side by side; ``None`` where none has one."""
+    if not any(spaces.values()):
+        return None
+    parts: list[Space] = []
+    for (name, space), size in zip(spaces.items(), sizes, strict=True):
+        if space is None and size is None:
+            raise ValueError(f"The size of {name!r}'s readings is not known: give it reading_space=Euclidean(...).")
+        parts.append(Euclidean(cast(int, size)) if space is None else space)
+    return Product(*parts)
 
 
 def _observation_dim(sensor: FusedSensor) -> int | None:

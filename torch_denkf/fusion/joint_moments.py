@@ -11,7 +11,7 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf.functional.manifolds import Repeated, Space
+from torch_denkf.functional.manifolds import Repeated, Space, check_space
 from torch_denkf.fusion.joint_forecast import joint_forecast
 from torch_denkf.smoothers.past import Past
 from torch_denkf.submodel import Entries, SubModel
@@ -42,7 +42,7 @@ def _ends(mean: torch.Tensor, cov: torch.Tensor, count: int) -> tuple[torch.Tens
 
 def joint_space(space: Space | None, lag: int) -> Space | None:
     """That of the present and the last L states; ``None`` for plain numbers."""
-    return None if space is None else Repeated(space, lag + 1)
+    return None if space is None else check_space("space", Repeated(space, lag + 1))
 
 
 _MOMENTS = ("mean", "cov", "var")

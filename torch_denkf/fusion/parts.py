@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torch_denkf._checks import check_mask
-from torch_denkf.functional.angles import mean_observation
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules.around import Wrapper, passes_on
 from torch_denkf.running import check_module, marks_of, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, Sensor, SubModel, Update
@@ -210,7 +210,7 @@ class JoinedReading(Sensor):
     Args:
         reading_keys: readings ``[*B, O]``, or samples ``[*B, E, O]``, whose mean is taken.
         noise_keys: variances ``[*B, O]`` or covariances ``[*B, O, O]``, in the same order.
-        angles: components of each reading that are angles in radians.
+        spaces: in which each reading lives, of numbers and angles; ``None`` for plain numbers.
         observation_key: all readings, ``[*B, O]``.
         noise_key: all variances ``[*B, O]``, or one covariance ``[*B, O, O]`` if any sensor has one.
         observation_dim: O of all, where it is known.
@@ -218,7 +218,7 @@ class JoinedReading(Sensor):
     Example:
         >>> from tensordict import TensorDict
         >>> td = TensorDict({"a": torch.ones(4, 2), "b": torch.zeros(1), "qa": torch.ones(2), "qb": torch.ones(1)})
-        >>> join = JoinedReading(["a", "b"], ["qa", "qb"], [(), ()], observation_key="c", noise_key="qc")
+        >>> join = JoinedReading(["a", "b"], ["qa", "qb"], [None, None], observation_key="c", noise_key="qc")
         >>> join(td)["c"]
         tensor([1., 1., 0.])
     """
@@ -229,7 +229,7 @@ class JoinedReading(Sensor):
         self,
         reading_keys: Sequence[NestedKey],
         noise_keys: Sequence[NestedKey],
-        angles: Sequence[Sequence[int]],
+        spaces: Sequence[Space | None],
         *,
         observation_key: NestedKey,
         noise_key: NestedKey,
@@ -237,14 +237,14 @@ class JoinedReading(Sensor):
     ):
         super().__init__(nn.Identity(), [*reading_keys, *noise_keys], [observation_key, noise_key])
         self.observation_dim = observation_dim
-        self.angles = [list(dims) for dims in angles]
+        self.spaces = list(spaces)
 
     def compute(self, *values, batch_size):
         """The readings and their noise."""
-        count, size = len(self.angles), len(batch_size)
+        count, size = len(self.spaces), len(batch_size)
         readings = [
-            value if value.ndim == size + 1 else mean_observation(value, dims)
-            for value, dims in zip(values[:count], self.angles, strict=True)
+            value if value.ndim == size + 1 else value.mean(-2) if space is None else space.mean(value)
+            for value, space in zip(values[:count], self.spaces, strict=True)
         ]
         noises, total, begin = list(values[count:]), sum(reading.shape[-1] for reading in readings), 0
         if any(noise.ndim > size + 1 for noise in noises):

@@ -40,8 +40,8 @@ class FusedSensor(Checked):
         delay: by how many steps its readings come late. Each then corrects the state that it belongs to, and through
             the covariances all since.
         late_key: an entry ``[*B, 1]``, int64, that says it for each reading, 0 to ``delay``, where delays vary.
-        angles: components of the reading that are angles in radians.
-        reading_space: in which the reading lives, in the place of ``angles``; R is of tangents.
+        reading_space: in which the reading lives, such as ``Circle()`` for an angle; ``None`` for plain numbers. R is
+            of tangents.
         features_key: an entry ``[*B, F]`` that tells how good a reading is, for the filter's ``weights``: one of the
             data, or one that ``sensor`` writes, such as its encoding, under the sensor's own key.
         analysis: makes the sensor's own update, see :class:`FusedFilter`; ``None`` for the filter's.
@@ -57,7 +57,6 @@ class FusedSensor(Checked):
     observed_key: NestedKey | None = None
     delay: int = 0
     late_key: NestedKey | None = None
-    angles: Sequence[int] = ()
     reading_space: Space | None = None
     features_key: NestedKey | None = None
     analysis: Callable[..., TensorDictModuleBase] | None = None

@@ -3,7 +3,7 @@ r"""Learned weights between sensors: how much each reading counts, from its feat
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import torch
 from tensordict import NestedKey, unravel_key
@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.functional.angles import align_angles
 from torch_denkf.functional.linalg import semidefinite_root
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import StateObservation
 from torch_denkf.modules.tensors import mean_of_members
 from torch_denkf.running import reads
@@ -140,7 +140,7 @@ class SensorWeights(Sensor):
         readings: readings ``[*B, O]``, or samples ``[*B, E, O]``.
         noises: variances ``[*B, O]`` or covariances ``[*B, O, O]``.
         features: entries ``[*B, F]`` of the sensors that have any.
-        angles: components of each reading that are angles.
+        spaces: in which each reading lives, of numbers and angles; ``None`` for plain numbers.
         state_key: the forecast's ensemble; or, with ``moments``, where its sigma points are put.
         moments: prefix of the forecast's ``mean`` and ``cov``; ``None`` for an ensemble.
         weight_key: prefix of the weights ``[*B, 1]``, by the sensors' names.
@@ -155,7 +155,7 @@ class SensorWeights(Sensor):
         readings: Mapping[str, NestedKey],
         noises: Mapping[str, NestedKey],
         features: Mapping[str, NestedKey],
-        angles: Mapping[str, Sequence[int]],
+        spaces: Mapping[str, Space | None],
         *,
         state_key: NestedKey,
         moments: str | None = None,
@@ -179,7 +179,7 @@ class SensorWeights(Sensor):
         self.readings, self.noises, self.features = (
             {name: unravel_key(key) for name, key in keys.items()} for keys in (readings, noises, features)
         )
-        self.angles, self.moments, self.state_key = dict(angles), moments, unravel_key(state_key)
+        self.spaces, self.moments, self.state_key = dict(spaces), moments, unravel_key(state_key)
 
     def on_entries(self, entries, call):
         """The weights."""
@@ -194,7 +194,8 @@ class SensorWeights(Sensor):
             noise = self.required(entries, self.noises[name])
             variance = noise if noise.ndim == size + 1 else noise.diagonal(dim1=-2, dim2=-1)
             predicted, observed = model.seen(entries, call._replace(sample=False).part(name))
-            predicted, reading = align_angles(predicted, reading, self.angles[name], observed)
+            if (space := self.spaces[name]) is not None:
+                predicted, reading = space.align(predicted, reading, observed)
             reading, mean = mean_of_members(reading, call.batch_size), ensemble_mean(predicted)
             observed = (
                 torch.ones_like(reading, dtype=torch.bool) if observed is None else observed.expand(reading.shape)

@@ -30,7 +30,7 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_values
 from torch_denkf.beliefs import is_samples
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.modules.around import AroundInitial, Wrapper
 from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.modules.tensors import as_standard_deviations
@@ -366,8 +366,8 @@ def biased_parts(
             f"sensor_error is for states of plain numbers, not for {role(initial, Initial).space}: put the biases into "
             "the state, Product(..., Euclidean(K))."
         )
-    if reading_space is not None:
-        raise ValueError(f"sensor_error is added to readings of plain numbers, not to points of {reading_space}.")
+    if not is_flat(reading_space):
+        raise ValueError(f"sensor_error is added to readings of numbers and angles, not to points of {reading_space}.")
     of_state = as_process_noise(
         torch.zeros_like(bias.std[0]).detach() if process_noise is None else process_noise, initial
     )

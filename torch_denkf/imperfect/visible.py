@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.beliefs import Ensemble, complete
-from torch_denkf.functional.angles import align_angles
+from torch_denkf.functional.manifolds import is_flat
 from torch_denkf.functional.mixture import log_mixture, mix_members, mix_moments, responsibility
 from torch_denkf.functional.weighted import scored_innovation
 from torch_denkf.modules.around import Around
@@ -147,8 +147,8 @@ class Visible(Around):
     def __init__(self, analysis: Update, *, broad: float = 10.0, visible_key: NestedKey = ("sensor", "visible")):
         check_number("broad", broad, above=1)
         self_made = _kind(analysis)
-        if analysis.space is not None or analysis.reading_space is not None:
-            raise TypeError(f"Visible is for plain numbers; {type(analysis).__name__} is on a space.")
+        if analysis.space is not None or not is_flat(analysis.reading_space):
+            raise TypeError(f"Visible is for numbers, and readings of angles; {type(analysis).__name__} is on a space.")
         super().__init__(
             analysis,
             [*analysis.in_keys, visible_key],
@@ -211,7 +211,8 @@ class Visible(Around):
         """What the analysis makes of likelihoods that are mixtures."""
         prior, likelihood = (self.required(entries, key) for key in self.module.in_keys[1:3])
         predicted, reading, variance = (self.required(entries, key) for key in self.module.in_keys[3:6])
-        predicted, reading = align_angles(predicted, reading, self.module.angles, mask)
+        if self.module.reading_space is not None:
+            predicted, reading = self.module.reading_space.align(predicted, reading, mask)
         if reading.ndim == predicted.ndim:
             reading = reading.mean(-2)
         innovation, nis, log_det = scored_innovation(predicted, prior, reading, variance, observed=mask)

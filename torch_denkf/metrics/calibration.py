@@ -6,13 +6,11 @@ truth that is NaN is not known, and does not count.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.metrics.state import known_tangents, mean_of_known, state_difference
 
@@ -77,7 +75,7 @@ def spread_skill_ratio(
         >>> spread_skill_ratio(members.mean(1), members.var(1), truth, 8).round(decimals=1)
         tensor([1.])
     """
-    check_space(space)
+    space = check_space("space", space)
     shape = mean.shape if space is None else (*mean.shape[:-1], space.tangent_dim)
     if mean.shape != truth.shape or variance.shape != shape:
         shapes = [list(part.shape) for part in (mean, variance, truth)]
@@ -95,7 +93,6 @@ def interval_coverage(
     truth: Tensor,
     *,
     level: float = 0.9,
-    angles: Sequence[int] = (),
     space: Space | None = None,
 ) -> Tensor:
     """Share of the truth inside the central interval of a Gaussian, ``mean ± z sqrt(variance)``.
@@ -107,8 +104,7 @@ def interval_coverage(
         variance: ``[*B, S]``.
         truth: ``[*B, S]``, in the same units; what is NaN does not count.
         level: probability of the interval.
-        angles: dimensions that are angles in rad, whose errors are wrapped.
-        space: whose points ``[*B, P]`` mean and truth are, in place of ``angles``; the variance is one of tangents.
+        space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. The variance is one of tangents.
 
     Returns:
         One share a state dimension, ``[S]``.
@@ -121,7 +117,7 @@ def interval_coverage(
         >>> interval_coverage(torch.zeros(4, 1), torch.ones(4, 1), truth, level=0.9)  # z = 1.645
         tensor([0.7500])
     """
-    error = state_difference(mean, truth, angles=angles, space=space)
+    error = state_difference(mean, truth, space=space)
     _check_variance(variance, error)
     _check_level(level)
     quantile = torch.special.ndtri(torch.tensor(0.5 + level / 2, dtype=torch.float64)).item()
@@ -133,7 +129,6 @@ def ensemble_interval_coverage(
     truth: Tensor,
     *,
     level: float = 0.9,
-    angles: Sequence[int] = (),
     space: Space | None = None,
 ) -> Tensor:
     """Share of the truth inside the central interval of the members: ``level`` if calibrated, Gaussian or not.
@@ -146,15 +141,14 @@ def ensemble_interval_coverage(
         ensemble: ``[*B, E, S]``.
         truth: ``[*B, S]``, in the same units; what is NaN does not count.
         level: probability of the interval, at most (E-1)/(E+1), which is what all members span.
-        angles: dimensions that are angles in rad; members are taken around their mean direction.
-        space: whose points members and truth are, in place of ``angles``; tangents at the members' mean are ranked.
+        space: whose points members and truth are; ``None`` for plain numbers. Tangents at the members' mean are ranked.
 
     Returns:
         One share a state dimension, ``[S]``.
 
     Raises:
         ValueError: if the shapes do not fit, ``level`` is not in (0, 1) or more than the members can tell, or
-            ``angles`` names no dimension.
+            points of another space.
 
     Reference:
         Hyndman & Fan 1996, "Sample quantiles in statistical packages", Am. Stat. 50, definition 6.
@@ -164,7 +158,7 @@ def ensemble_interval_coverage(
         >>> ensemble_interval_coverage(members, torch.tensor([[0.5], [18.5]]), level=0.9)  # from 0 to 18
         tensor([0.5000])
     """
-    members, offset = _around_mean(ensemble, truth, angles, space)
+    members, offset = _around_mean(ensemble, truth, space)
     lower, upper = ensemble_interval(members, level=level)
     return _share((lower <= offset) & (offset <= upper), known_tangents(truth, space))
 
@@ -206,9 +200,7 @@ def ensemble_interval(ensemble: Tensor, *, level: float = 0.9) -> tuple[Tensor, 
     return lower, upper
 
 
-def pit(
-    mean: Tensor, variance: Tensor, truth: Tensor, *, angles: Sequence[int] = (), space: Space | None = None
-) -> Tensor:
+def pit(mean: Tensor, variance: Tensor, truth: Tensor, *, space: Space | None = None) -> Tensor:
     r"""Probability integral transform of the truth, :math:`\Phi((x - \bar x) / \sqrt{s^2})`.
 
     It is uniform in [0, 1] for a calibrated Gaussian belief. An overconfident one gathers it at both ends, a timid one
@@ -218,8 +210,7 @@ def pit(
         mean: ``[*B, S]``.
         variance: ``[*B, S]``.
         truth: ``[*B, S]``, in the same units.
-        angles: dimensions that are angles in rad, whose errors are wrapped.
-        space: whose points ``[*B, P]`` mean and truth are, in place of ``angles``; the variance is one of tangents.
+        space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. The variance is one of tangents.
 
     Returns:
         ``[*B, S]`` in [0, 1]. Where the variance is zero: 0 or 1, and 0.5 for a truth that equals the mean. NaN where
@@ -235,7 +226,7 @@ def pit(
         >>> pit(torch.zeros(3, 1), torch.ones(3, 1), torch.tensor([[-1.2816], [0.0], [1.2816]])).flatten()
         tensor([0.1000, 0.5000, 0.9000])
     """
-    error = state_difference(truth, mean, angles=angles, space=space)
+    error = state_difference(truth, mean, space=space)
     _check_variance(variance, error)
     score = error / variance.sqrt()
     return torch.special.ndtr(torch.where((error == 0) & (variance == 0), 0.0, score))
@@ -246,7 +237,6 @@ def rank_histogram(
     truth: Tensor,
     *,
     log_weight: Tensor | None = None,
-    angles: Sequence[int] = (),
     space: Space | None = None,
 ) -> Tensor:
     """How often the truth falls into each of the E+1 gaps between and beyond the sorted members.
@@ -259,14 +249,13 @@ def rank_histogram(
         truth: ``[*B, S]``, in the same units.
         log_weight: of particles, ``[*B, E]``. A particle of weight w counts as E w members of equal weight, and a truth
             between two ranks in both. Without it, all members weigh the same.
-        angles: dimensions that are angles in rad; members are taken around their mean direction.
-        space: whose points members and truth are, in place of ``angles``; tangents at the members' mean are ranked.
+        space: whose points members and truth are; ``None`` for plain numbers. Tangents at the members' mean are ranked.
 
     Returns:
         Counts, ``[S, E+1]`` float64; each row sums to the number of states in ``*B``.
 
     Raises:
-        ValueError: if the shapes do not fit, if a value is not finite, or if ``angles`` names no dimension.
+        ValueError: if the shapes do not fit, if a value is not finite, or for points of another space.
 
     Reference:
         Hamill 2001, "Interpretation of rank histograms for verifying ensemble forecasts", Mon. Weather Rev. 129.
@@ -281,7 +270,7 @@ def rank_histogram(
         if log_weight.shape != ensemble.shape[:-1]:
             raise ValueError(f"log_weight must be [*B, E], {list(ensemble.shape[:-1])}; got {list(log_weight.shape)}")
         count = log_weight.shape[-1] * log_weight.double().softmax(-1).unsqueeze(-1)
-    members, offset = _around_mean(ensemble, truth, angles, space, count)
+    members, offset = _around_mean(ensemble, truth, space, count)
     if not bool(members.isfinite().all() and offset.isfinite().all()):
         raise ValueError("ensemble and truth must be finite; leave out the rows that are not")
     offset, size = offset.unsqueeze(-2), members.shape[-2]
@@ -338,7 +327,6 @@ def spread_error(
     *,
     bins: int = 8,
     ensemble_size: int | None = None,
-    angles: Sequence[int] = (),
     space: Space | None = None,
 ) -> SpreadError:
     """Predicted spread and actual error, in bins of states with similar spread.
@@ -352,8 +340,7 @@ def spread_error(
         bins: of equal size up to one state, by the rank of the spread.
         ensemble_size: E, which scales the variance with (E+1)/E, see :func:`spread_skill_ratio`; ``None`` for a
             distribution whose moments are exact.
-        angles: dimensions that are angles in rad, whose errors are wrapped.
-        space: whose points ``[*B, P]`` mean and truth are, in place of ``angles``; the variance is one of tangents.
+        space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. The variance is one of tangents.
 
     Returns:
         A :class:`SpreadError`, in the units of the state.
@@ -366,7 +353,7 @@ def spread_error(
         >>> spread_error(mean, torch.tensor([[1.0], [1.0], [4.0], [4.0]]), truth, bins=2)
         SpreadError(spread=tensor([[1., 2.]]), error=tensor([[1., 3.]]))
     """
-    difference = state_difference(mean, truth, angles=angles, space=space)
+    difference = state_difference(mean, truth, space=space)
     _check_variance(variance, difference)
     truth = known_tangents(truth, space)
     known = ~truth.isnan().flatten(0, -2)
@@ -384,9 +371,9 @@ def spread_error(
 
 
 def _around_mean(
-    ensemble: Tensor, truth: Tensor, angles: Sequence[int], space: Space | None, count: Tensor | float = 1.0
+    ensemble: Tensor, truth: Tensor, space: Space | None, count: Tensor | float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """Members and truth relative to the members' mean, in which angles are wrapped: ``[*B, E, S]`` and ``[*B, S]``.
+    """Members and truth relative to the members' mean: ``[*B, E, S]`` and ``[*B, S]``.
 
     Of points of a space they are tangents: members and truth that are drawn alike are so in these axes, too.
     """
@@ -394,18 +381,14 @@ def _around_mean(
         raise ValueError(
             f"ensemble must be [*B, E, S] and truth [*B, S]; got {list(ensemble.shape)} and {list(truth.shape)}."
         )
-    check_space(space, angles)
+    space = check_space("space", space)
     if space is not None:
         size = ensemble.shape[-2]
         share = torch.full_like(ensemble[..., 0], 1 / size) if isinstance(count, float) else count.squeeze(-1) / size
         centre = space.mean(ensemble, share.to(ensemble.dtype))
         return space.minus(ensemble, centre.unsqueeze(-2)), space.minus(truth, centre)
     centre = (count * ensemble).mean(-2)
-    for dim in angles:
-        sine, cosine = ((count * part).mean(-2) for part in (ensemble.sin(), ensemble.cos()))
-        centre[..., dim] = torch.atan2(sine[..., dim], cosine[..., dim])
-    offset = state_difference(truth, centre, angles=angles)
-    return wrap_angles(ensemble - centre.unsqueeze(-2), angles), offset
+    return ensemble - centre.unsqueeze(-2), truth - centre
 
 
 def _check_variance(variance: Tensor, error: Tensor) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -31,17 +30,15 @@ class NEES(NamedTuple):
     values: Tensor
 
 
-def gaussian_nll(
-    mean: Tensor, covariance: Tensor, truth: Tensor, *, angles: Sequence[int] = (), space: Space | None = None
-) -> Tensor:
+def gaussian_nll(mean: Tensor, covariance: Tensor, truth: Tensor, *, space: Space | None = None) -> Tensor:
     """Negative log-likelihood of the truth under a Gaussian belief, in nats: lower is better.
 
     Args:
         mean: ``[*B, S]``.
         covariance: ``[*B, S, S]``, or the variances ``[*B, S]``.
         truth: ``[*B, S]``, in the same units.
-        angles: dimensions that are angles in rad; their errors are wrapped, which suits spreads well below π.
-        space: whose points ``[*B, P]`` mean and truth are, in place of ``angles``. The covariance, and the density, is
+        space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. Errors of angles are wrapped,
+            which suits spreads well below π. The covariance, and the density, is
             then one of tangents at the mean, S their number.
 
     Returns:
@@ -57,7 +54,7 @@ def gaussian_nll(
         >>> gaussian_nll(torch.zeros(2), torch.tensor([[1.0, 0.0], [0.0, 4.0]]), torch.tensor([1.0, 0.0]))
         tensor(3.0310)
     """
-    error = state_difference(truth, mean, angles=angles, space=space)
+    error = state_difference(truth, mean, space=space)
     scale = _scale(error, covariance)
     zero = torch.zeros_like(error)
     if covariance.ndim == error.ndim:
@@ -70,7 +67,6 @@ def nees(
     covariance: Tensor,
     truth: Tensor,
     *,
-    angles: Sequence[int] = (),
     space: Space | None = None,
     level: float = 0.95,
     dim: int | None = None,
@@ -89,8 +85,7 @@ def nees(
         mean: ``[*B, S]``.
         covariance: P, ``[*B, S, S]``, or the variances ``[*B, S]`` where the errors are uncorrelated.
         truth: ``[*B, S]``, in the same units.
-        angles: dimensions that are angles in rad, whose errors are wrapped.
-        space: whose points ``[*B, P]`` mean and truth are, in place of ``angles``. The covariance is then one of
+        space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. The covariance is then one of
             tangents at the mean, S their number.
         level: probability of the bounds.
         dim: batch dimension to average over; all of them by default.
@@ -116,7 +111,7 @@ def nees(
         raise ValueError(f"level is the probability of the bounds, in (0, 1); got {level}")
     if bool(truth.isnan().any()):
         raise ValueError("the truth is NaN in places, where it is not known; leave out the rows that are not whole")
-    error = state_difference(mean, truth, angles=angles, space=space)
+    error = state_difference(mean, truth, space=space)
     scale = _scale(error, covariance)
     if covariance.ndim == error.ndim:
         whitened = error / scale

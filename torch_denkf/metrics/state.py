@@ -3,20 +3,19 @@
 A truth that is NaN is not known: it counts nowhere. Of data with a mask of labels that is
 ``truth.where(data["state_observed"], torch.nan)``.
 
-States may be points of a space, such as ``Product(SO3(), Euclidean(3))``: pass ``space=`` in place of ``angles=``.
+States may be points of a space, such as ``Product(SO3(), Euclidean(3))``: pass ``space=``, of numbers of
+which some are angles :class:`~torch_denkf.functional.manifolds.Flat`.
 Errors, variances and covariances are then those of tangents, ``[*B, D]``, and each figure is one of a component of
 tangents. A part of the space whose truth is NaN in places is not known.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.manifolds import Space, check_space, places_of, whole_parts
 
 __all__ = ["StateErrors", "known_tangents", "mean_of_known", "rotation_error", "state_difference", "state_errors"]
@@ -34,9 +33,7 @@ class StateErrors(NamedTuple):
     mae: Tensor
 
 
-def state_difference(
-    estimated: Tensor, truth: Tensor, *, angles: Sequence[int] = (), space: Space | None = None
-) -> Tensor:
+def state_difference(estimated: Tensor, truth: Tensor, *, space: Space | None = None) -> Tensor:
     """Estimate minus truth, where headings that differ by whole turns are the same.
 
     From the truth to the estimate and back leads a tangent and its negative: it is the error at either.
@@ -44,18 +41,20 @@ def state_difference(
     Args:
         estimated: states, ``[*B, S]``.
         truth: the true states, of the same shape.
-        angles: dimensions that are angles in rad; (2,) of KITTI's (x, y, θ, v, θ_dot). Turn rates are none.
-        space: whose points the states are, in place of ``angles``.
+        space: whose points the states are, such as ``Flat(5, circular=[2])`` of KITTI's (x, y, θ, v, θ_dot); ``None``
+            for plain numbers. Turn rates are no angles.
 
     Returns:
         The differences, ``[*B, S]``; angles in [-π, π). Of points of a space the tangents, ``[*B, D]``.
 
     Raises:
-        ValueError: if the shapes differ, for angles beside a space, or if there is no such dimension.
+        ValueError: if the shapes differ, or for points of another space.
 
     Examples:
         >>> import torch
-        >>> state_difference(torch.tensor([1.0, 3.0]), torch.tensor([0.0, -3.0]), angles=(1,))
+        >>> from torch_denkf.functional.manifolds import Circle, Euclidean
+        >>> space = Euclidean(1) * Circle()
+        >>> state_difference(torch.tensor([1.0, 3.0]), torch.tensor([0.0, -3.0]), space=space)
         tensor([ 1.0000, -0.2832])
     """
     if estimated.ndim < 1 or estimated.shape != truth.shape:
@@ -63,15 +62,11 @@ def state_difference(
             f"estimate and truth must both be [*B, S], got {list(estimated.shape)} and {list(truth.shape)}; for "
             "ensembles pass the mean"
         )
-    check_space(space, angles)
-    if space is not None:
-        return space.minus(estimated, truth)
-    return wrap_angles(estimated - truth, angles)
+    space = check_space("space", space)
+    return estimated - truth if space is None else space.minus(estimated, truth)
 
 
-def state_errors(
-    estimated: Tensor, truth: Tensor, *, angles: Sequence[int] = (), space: Space | None = None
-) -> StateErrors:
+def state_errors(estimated: Tensor, truth: Tensor, *, space: Space | None = None) -> StateErrors:
     """Root mean square and mean absolute error of each dimension, over all batch dims.
 
     Dimensions are kept apart: a mean over metres, radians and metres per second, as the reference script of the DEnKF
@@ -80,23 +75,24 @@ def state_errors(
     Args:
         estimated: states, ``[*B, S]``, such as the mean of a belief.
         truth: the true states, of the same shape; NaN where they are not known, which does not count.
-        angles: dimensions that are angles in rad, see :func:`state_difference`.
-        space: whose points the states are, in place of ``angles``; see :func:`rotation_error` for angles between
-            orientations.
+        space: whose points the states are, see :func:`state_difference`; ``None`` for plain numbers. See
+            :func:`rotation_error` for angles between orientations.
 
     Returns:
         A :class:`StateErrors`; NaN in a dimension whose truth is nowhere known.
 
     Raises:
-        ValueError: if the shapes differ, there are no states, or ``angles`` names no dimension.
+        ValueError: if the shapes differ, there are no states, or for points of another space.
 
     Examples:
         >>> import torch
-        >>> errors = state_errors(torch.tensor([[3.0, 6.0], [1.0, 0.0]]), torch.zeros(2, 2), angles=(1,))
+        >>> from torch_denkf.functional.manifolds import Circle, Euclidean
+        >>> space = Euclidean(1) * Circle()
+        >>> errors = state_errors(torch.tensor([[3.0, 6.0], [1.0, 0.0]]), torch.zeros(2, 2), space=space)
         >>> errors.rmse, errors.mae
         (tensor([2.2361, 0.2002]), tensor([2.0000, 0.1416]))
     """
-    difference = state_difference(estimated, truth, angles=angles, space=space)
+    difference = state_difference(estimated, truth, space=space)
     if difference.numel() == 0:
         raise ValueError(f"there are no states to average over, got {list(truth.shape)}")
     truth = known_tangents(truth, space)

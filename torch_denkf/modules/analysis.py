@@ -10,9 +10,9 @@ import torch
 from torch_denkf._checks import check_values
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
-from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.functional.moments import ensemble_cov
-from torch_denkf.modules._spaces import mean_and_tangents, reading_about
+from torch_denkf.modules._spaces import mean_and_tangents
 from torch_denkf.modules.ensemble import EnsembleAnalysisKeys, EnsembleUpdate
 from torch_denkf.modules.tensors import as_floating, check_dims
 
@@ -39,11 +39,10 @@ class EnsembleAnalysis(EnsembleUpdate):
         threshold: of ``"significance"``, in standard deviations: one number or ``[S]``; a ``Parameter`` is trained. The
             more updates a component sees between two readings about it, the larger. One that is trained beyond
             sqrt(E - 1) believes nothing, and has no gradient that would bring it back.
-        angles: components of the observation that are angles in radians: their innovation is the shorter way round.
         space: in which the state lives, such as ``Product(SO3(), Euclidean(3))``: members are points, the update is
             made with the tangents at the forecast's mean, and ``var`` is of the tangents at the belief's. See
             :mod:`torch_denkf.functional.manifolds`.
-        reading_space: in which the reading lives; innovation and R are tangents. In the place of ``angles``.
+        reading_space: in which the reading lives, such as ``Circle()`` for an angle; innovation and R are tangents.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
         **keys: see :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs
             learned observations, not one reading.
@@ -76,7 +75,6 @@ class EnsembleAnalysis(EnsembleUpdate):
         taper: tuple[torch.Tensor, torch.Tensor] | None = None,
         localisation: Literal["significance"] | None = None,
         threshold: float | torch.Tensor = 3.0,
-        angles: Sequence[int] = (),
         space: Space | None = None,
         reading_space: Space | None = None,
         covariance: bool = False,
@@ -95,7 +93,6 @@ class EnsembleAnalysis(EnsembleUpdate):
             inflation=inflation,
             relaxation=relaxation,
             rotate=rotate,
-            angles=angles,
             space=space,
             reading_space=reading_space,
             covariance=covariance,
@@ -134,8 +131,6 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
-        if self.reading_space is not None:
-            predicted, observation = reading_about(self.reading_space, predicted, observation, observed)
         center = None
         if self.space is not None:
             center = self.space.near(forecast).unsqueeze(-2)
@@ -156,10 +151,12 @@ class EnsembleAnalysis(EnsembleUpdate):
                 inflated = torch.where(self._any(observed)[..., None, None], inflated, ensemble)
             ensemble = inflated
         mean, away = ensemble_mean(ensemble), ensemble
+        var = ensemble_var(ensemble, mean)
         if self.space is not None and center is not None:
-            ensemble = self.space.plus(center, ensemble)
-            mean, away = mean_and_tangents(self.space, ensemble, self.space.plus(center.squeeze(-2), mean))
-        var = ensemble_var(away, mean if center is None else None)
+            ensemble, mean = self.space.plus(center, ensemble), self.space.plus(center.squeeze(-2), mean)
+            if not is_flat(self.space):
+                mean, away = mean_and_tangents(self.space, ensemble, mean)
+                var = ensemble_var(away)
         cov = (ensemble_cov(away),) if self.covariance else ()
         return ensemble, mean, var, innovation, nis, log_likelihood, *cov
 
@@ -173,8 +170,6 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     def move_past(self, past, predicted, observation, variance, observed=None, *, noise=None):
         """See :meth:`Update.move_past`; neither inflation nor relaxation touches the past."""
-        if self.reading_space is not None:
-            predicted, observation = reading_about(self.reading_space, predicted, observation, observed)
         center = None
         if self.space is not None:
             center = self.space.near(past.movedim(-3, -2)).unsqueeze(-3)  # of each time

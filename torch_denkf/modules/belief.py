@@ -12,8 +12,7 @@ from torch import nn
 from torch_denkf._checks import check_count, check_values
 from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._spaces import checked_space
+from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.tensors import (
     as_floating,
     as_standard_deviations,
@@ -40,7 +39,7 @@ class _InitialEnsemble(Initial):
     ):
         super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=optional_keys)
         std = as_standard_deviations("std", std)
-        self.space = checked_space("space", space)
+        self.space = check_space("space", space)
         if space is not None:
             space.check(tangent=std)
         check_count("ensemble_size", ensemble_size, least=2, cure="One member has no variance")

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_denkf.functional import kalman_update
-from torch_denkf.functional.manifolds import Euclidean, Space
+from torch_denkf.functional.manifolds import Euclidean, Space, is_flat
 from torch_denkf.modules.gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
 from torch_denkf.running import reads
 from torch_denkf.submodel import Call, Entries, Update, role
@@ -61,7 +61,7 @@ class EKFTransition(GaussianTransition):
             return self._move(rows, states, call), None
 
         entries = _needed(self, entries)
-        if self.space is None:
+        if self.space is None or self.space.flat is not None:
             forecast, jacobian, _ = _linearise(move, entries, call, mean, mean.shape[-1])
         else:
             forecast, jacobian, _ = _linearise_on(move, entries, call, mean, self.space, self.space)
@@ -97,7 +97,7 @@ class EKFAnalysis(GaussianAnalysis):
 
     def _update(self, entries, mean, cov, observation, noise, call):
         entries, size = _needed(self, entries), observation.shape[-1]
-        if self.space is None and self.reading_space is None:
+        if is_flat(self.space, self.reading_space):
             predicted, jacobian, observed = _linearise(self._observe, entries, call, mean, size)
         else:
             space, reading_space = self.space or Euclidean(mean.shape[-1]), self.reading_space or Euclidean(size)

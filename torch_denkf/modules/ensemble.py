@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from numbers import Real
 from typing import Literal, TypedDict
 
@@ -11,10 +10,7 @@ from tensordict import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_number, check_values
-from torch_denkf.functional.angles import align_angles
-from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._spaces import checked_spaces
-from torch_denkf.modules.tensors import check_dims
+from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.submodel import Call, Entries, Update
 
 __all__ = ["EnsembleAnalysisKeys", "EnsembleUpdate"]
@@ -53,9 +49,8 @@ class EnsembleUpdate(Update):
         inflation: factor on the analysis anomalies, where anything is observed; 1 for none.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         rotate: random mean-preserving rotation of the anomalies.
-        angles: components of the observation that are angles in radians: their innovation is the shorter way round.
         space: of the state; ``None`` for plain numbers.
-        reading_space: of the reading; ``None`` for plain numbers, and ``angles``.
+        reading_space: of the reading; ``None`` for plain numbers.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
         localisation: ``"significance"`` or ``None``.
         threshold: of ``"significance"``, in standard deviations.
@@ -72,7 +67,6 @@ class EnsembleUpdate(Update):
         inflation: float,
         relaxation: float,
         rotate: bool,
-        angles: Sequence[int],
         space: Space | None = None,
         reading_space: Space | None = None,
         covariance: bool = False,
@@ -96,10 +90,9 @@ class EnsembleUpdate(Update):
         )
         check_number("inflation", inflation, above=0)
         check_number("relaxation", relaxation, least=0, most=1)
-        check_dims("angles", angles)
         self.inflation, self.relaxation, self.rotate = inflation, relaxation, rotate
-        self.angles, self.info_prefix = list(angles), info_prefix
-        self.space, self.reading_space = checked_spaces(space, reading_space, angles)
+        self.info_prefix = info_prefix
+        self.space, self.reading_space = check_space("space", space), check_space("reading_space", reading_space)
         if localisation not in (None, "significance"):
             raise ValueError(f'localisation is "significance" or None; got {localisation!r}.')
         if localisation is not None:
@@ -121,20 +114,20 @@ class EnsembleUpdate(Update):
 
     def on_entries(self, entries, call):
         """The belief and the diagnostics."""
-        return super().on_entries(self.aligned(entries) if self.angles else entries, call)
+        return super().on_entries(self.aligned(entries), call)
 
     def aligned(self, entries: Entries) -> Entries:
-        """The entries with all angles on one turn, see :func:`~torch_denkf.functional.angles.align_angles`.
+        """Maps predictions and the reading to plain numbers, see :meth:`~torch_denkf.functional.manifolds.Space.align`.
 
-        Predictions and the reading can then be averaged, spread and subtracted like other numbers. Who changes them in
-        front of the analysis does so here, and hands them to :meth:`on_aligned`: another alignment would fold a spread
-        that is wider than a turn.
+        They can then be averaged, spread and subtracted like other numbers. Who changes them in front of the analysis
+        does so here, and hands them to :meth:`on_aligned`: another alignment would fold a spread that is wider than a
+        turn.
         """
-        if not self.angles:
+        if self.reading_space is None:
             return entries
         keys = self.in_keys[1:3]
         predicted, reading = (self.required(entries, key) for key in keys)
-        aligned = align_angles(predicted, reading, self.angles, entries.get(self.observed_key))
+        aligned = self.reading_space.align(predicted, reading, entries.get(self.observed_key))
         return {**entries, **dict(zip(keys, aligned, strict=True))}
 
     def on_aligned(self, entries: Entries, call: Call) -> Entries:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TypedDict
 
 import torch
@@ -11,12 +11,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_number
-from torch_denkf.functional.angles import mean_observation, wrap_angles
 from torch_denkf.functional.gaussian import GaussianUpdate
-from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._spaces import checked_space, checked_spaces, without_hidden
+from torch_denkf.functional.manifolds import Space, check_space, is_flat
+from torch_denkf.modules._spaces import mean_reading
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
-from torch_denkf.modules.tensors import check_dims
 from torch_denkf.running import check_module, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, SubModel, Transition, Update
 
@@ -74,7 +72,7 @@ class GaussianTransition(Transition):
         self_made = [unravel_key(ensemble_key), *out_keys]
         further, optional = further_keys((transition, process_noise), [*in_keys, *self_made])
         super().__init__(transition, in_keys + further, out_keys, optional_keys=optional)
-        self.process_noise, self.space = process_noise, checked_space("space", space)
+        self.process_noise, self.space = process_noise, check_space("space", space)
         self.ensemble_key, self.forecast_ensemble_key = map(unravel_key, (ensemble_key, forecast_ensemble_key))
 
     def parts(self):
@@ -112,10 +110,10 @@ class GaussianAnalysisOptions(TypedDict, total=False):
     Attributes:
         inflation: factor on the belief's standard deviations, where anything is observed; 1 by default, for none. What
             is never observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
-        angles: components of the observation that are angles in radians; their innovation is wrapped to [-pi, pi).
         space: in which the state lives; ``None`` by default, for plain numbers. ``cov`` and ``var`` are of the tangents
             at ``mean``.
-        reading_space: in which the reading lives, in the place of ``angles``; innovation and R are tangents.
+        reading_space: in which the reading lives, such as ``Circle()`` for an angle, whose innovation is wrapped to
+            [-pi, pi); ``None`` by default, for plain numbers. Innovation and R are tangents.
         observation_key: learned observations ``[*B, E, O]``, whose mean is used, or readings ``[*B, O]``;
             ``("sensor", "ensemble")`` by default.
         noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``; ``("sensor", "noise")`` by default.
@@ -131,7 +129,6 @@ class GaussianAnalysisOptions(TypedDict, total=False):
     """
 
     inflation: float
-    angles: Sequence[int]
     space: Space | None
     reading_space: Space | None
     observation_key: NestedKey
@@ -162,7 +159,6 @@ class GaussianAnalysis(Update):
         observation: TensorDictModuleBase,
         *,
         inflation: float = 1.0,
-        angles: Sequence[int] = (),
         space: Space | None = None,
         reading_space: Space | None = None,
         observation_key: NestedKey = ("sensor", "ensemble"),
@@ -182,9 +178,8 @@ class GaussianAnalysis(Update):
         out_keys += [(info_prefix, name) for name in ("innovation", "nis", "log_likelihood")]
         super().__init__(observation, in_keys + further, out_keys, optional_keys=[observed_key, *optional])
         check_number("inflation", inflation, above=0)
-        check_dims("angles", angles)
-        self.inflation, self.angles, self.info_prefix = inflation, list(angles), info_prefix
-        self.space, self.reading_space = checked_spaces(space, reading_space, angles)
+        self.inflation, self.info_prefix = inflation, info_prefix
+        self.space, self.reading_space = check_space("space", space), check_space("reading_space", reading_space)
         self.ensemble_key, self.predicted_key = unravel_key(ensemble_key), unravel_key(predicted_key)
         self.reading_keys, self.observed_key = self.in_keys[2:4], unravel_key(observed_key)
 
@@ -192,32 +187,28 @@ class GaussianAnalysis(Update):
         """The belief and the diagnostics."""
         mean, cov, observation, noise = (self.required(entries, key) for key in self.in_keys[:4])
         if observation.ndim > mean.ndim:
-            observation = self._mean_reading(observation)
+            observation = mean_reading(self.reading_space, observation)
         update, observed = self._update(entries, mean, cov, observation, noise, call._replace(sample=False))
         values = updated(update, observed, self.inflation)
         return dict(zip(self.out_keys, values, strict=True))
-
-    def _mean_reading(self, samples: torch.Tensor) -> torch.Tensor:
-        """The mean of learned observations ``[*B, E, Q]``."""
-        if self.reading_space is not None:
-            return self.reading_space.mean(samples)
-        return mean_observation(samples, self.angles)
 
     def _innovation(
         self, observation: torch.Tensor, predicted: torch.Tensor, observed: torch.Tensor | None
     ) -> torch.Tensor:
         """How far the reading is from what is predicted ``[*B, Q]``, the shorter way round: ``[*B, O]``."""
-        if self.reading_space is None:
-            return wrap_angles(observation - predicted, self.angles)
-        return self.reading_space.minus(without_hidden(observation, predicted, observed), predicted)
+        space = self.reading_space
+        return observation - predicted if space is None else space.innovation(observation, predicted, observed)
 
     def _moved(self, mean: torch.Tensor, update: GaussianUpdate) -> GaussianUpdate:
         """An update of the tangents at ``mean``, as a point and the covariance of the tangents there."""
         if self.space is None:
             return update._replace(mean=mean + update.mean)
-        turn = self.space.right_jacobian(update.mean)
-        cov = turn @ update.cov @ turn.mT
-        return update._replace(mean=self.space.plus(mean, update.mean), cov=(cov + cov.mT) / 2)
+        cov = update.cov
+        if not is_flat(self.space):
+            turn = self.space.right_jacobian(update.mean)
+            cov = turn @ cov @ turn.mT
+            cov = (cov + cov.mT) / 2
+        return update._replace(mean=self.space.plus(mean, update.mean), cov=cov)
 
     def reading_dims(self, entries, call):
         """O, as the model predicts it."""

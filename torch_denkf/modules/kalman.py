@@ -10,13 +10,12 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_covariance, check_number, check_shape, check_square, check_values
-from torch_denkf.functional import kalman_predict, kalman_update, wrap_angles
-from torch_denkf.functional.angles import mean_observation
+from torch_denkf.functional import kalman_predict, kalman_update
 from torch_denkf.functional.linalg import product_of_known
-from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._spaces import checked_space
+from torch_denkf.functional.manifolds import Space, check_space
+from torch_denkf.modules._spaces import mean_reading
 from torch_denkf.modules.gaussian import as_covariance, further_keys, updated
-from torch_denkf.modules.tensors import as_standard_deviations, check_dims, register_constant
+from torch_denkf.modules.tensors import as_standard_deviations, register_constant
 from torch_denkf.running import run_module
 from torch_denkf.submodel import Call, Entries, Initial, Transition, Update
 
@@ -49,7 +48,7 @@ class MomentPrior(Initial):
         register_constant(self, "cov", cov)
         if self.mean.ndim != 1:
             raise ValueError(f"mean must be [S], got {list(self.mean.shape)}")
-        self.space, self.state_dim = checked_space("space", space), self.mean.numel()
+        self.space, self.state_dim = check_space("space", space), self.mean.numel()
         if space is not None:
             space.check(mean=self.mean)
             self.state_dim = space.tangent_dim
@@ -96,7 +95,7 @@ class GaussianAround(Initial):
         super().__init__(nn.Identity(), [state_key], [(belief_prefix, name) for name in ("mean", "cov", "var")])
         std = as_standard_deviations("std", std)
         self.register_buffer("std", std)
-        self.space, self.state_dim = checked_space("space", space), std.numel()
+        self.space, self.state_dim = check_space("space", space), std.numel()
         if space is not None:
             space.check(tangent=std)
             self.input_dim = space.point_dim
@@ -197,7 +196,8 @@ class KalmanAnalysis(Update):
         trainable: whether H is a parameter.
         inflation: factor on the belief's standard deviations, where anything is observed; 1 for none. What is never
             observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
-        angles: components of the observation that are angles in radians: their innovation is the shorter way round.
+        reading_space: in which the reading lives, one of numbers and angles such as ``Euclidean(1) * Circle()``;
+            ``None`` for plain numbers.
         observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used; in a filter
             these stand under a key whose last name is ``"ensemble"``.
         noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``, where ``noise`` is ``None``.
@@ -208,7 +208,7 @@ class KalmanAnalysis(Update):
 
     Raises:
         ValueError: if the shapes do not fit, a number is not finite, ``noise`` is no covariance, or ``inflation`` is
-            not positive.
+            not positive; for a ``reading_space`` of another kind or size.
 
     Example:
         >>> from tensordict import TensorDict
@@ -229,7 +229,7 @@ class KalmanAnalysis(Update):
         *,
         trainable: bool = False,
         inflation: float = 1.0,
-        angles: Sequence[int] = (),
+        reading_space: Space | None = None,
         observation_key: NestedKey = "observation",
         noise_variance_key: NestedKey = ("sensor", "noise"),
         observed_key: NestedKey = "observed",
@@ -245,14 +245,16 @@ class KalmanAnalysis(Update):
             + [(info_prefix, name) for name in ("innovation", "nis", "log_likelihood")],
             optional_keys=[observed_key],
         )
-        self.inflation, self.angles, self.info_prefix = inflation, list(angles), info_prefix
+        self.inflation, self.info_prefix = inflation, info_prefix
+        self.reading_space = check_space("reading_space", reading_space, flat=True)
         register_constant(self, "matrix", matrix, trainable=trainable)
         register_constant(self, "noise", noise)
         check_number("inflation", inflation, above=0)
         if self.matrix.ndim != 2:
             raise ValueError(f"matrix must be [O, S], got {list(self.matrix.shape)}")
         check_values("matrix", self.matrix)
-        check_dims("angles", self.angles, len(self.matrix))
+        if self.reading_space is not None and self.reading_space.point_dim != len(self.matrix):
+            raise ValueError(f"reading_space={reading_space} is not one of the {len(self.matrix)} rows of matrix.")
         if self.noise is not None and self.noise.ndim == 2:
             check_covariance("noise", self.noise, len(self.matrix), "[O] or [O, O]")
         elif self.noise is not None:
@@ -273,9 +275,9 @@ class KalmanAnalysis(Update):
         *noise, observed = rest
         noise = noise[0] if noise else self.noise.expand(*mean.shape[:-1], *self.noise.shape)
         if observation.ndim > mean.ndim:
-            observation = mean_observation(observation, self.angles)
-        if self.angles:  # the same turn as the prediction
+            observation = mean_reading(self.reading_space, observation)
+        if self.reading_space is not None:  # the same turn as the prediction
             predicted = mean @ self.matrix.mT
-            observation = predicted + wrap_angles(observation - predicted, self.angles)
+            observation = predicted + self.reading_space.minus(observation, predicted)
         update = kalman_update(mean, cov, observation, self.matrix, noise, observed=observed)
         return updated(update, observed, self.inflation)

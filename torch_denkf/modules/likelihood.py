@@ -11,12 +11,10 @@ from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf._checks import check_count
-from torch_denkf.functional import wrap_angles
-from torch_denkf.functional.angles import mean_observation
-from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules._spaces import checked_spaces, without_hidden
+from torch_denkf.functional.manifolds import Space, check_space
+from torch_denkf.modules._spaces import mean_reading
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.modules.tensors import as_vector, check_dims, mean_of_members
+from torch_denkf.modules.tensors import as_vector, mean_of_members
 from torch_denkf.submodel import Update
 
 __all__ = ["GaussianLikelihood", "LearnedLikelihood"]
@@ -33,8 +31,8 @@ class GaussianLikelihood(Update):
     Dimensions that are not observed drop out; where nothing is observed it is zero for all particles.
 
     Args:
-        angles: components of the observation that are angles in radians.
-        reading_space: in which the reading lives, in the place of ``angles``; variances are of tangents.
+        reading_space: in which the reading lives, such as ``Circle()`` for an angle; ``None`` for plain numbers.
+            Variances are of tangents.
         predicted_key: predicted observations ``[*B, E, O]``, in the observation's units.
         observation_key: one reading ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used.
         noise_variance_key: variances ``[*B, O]``, the diagonal of R.
@@ -58,7 +56,6 @@ class GaussianLikelihood(Update):
     def __init__(
         self,
         *,
-        angles: Sequence[int] = (),
         reading_space: Space | None = None,
         predicted_key: NestedKey = ("forecast", "observation"),
         observation_key: NestedKey = ("sensor", "ensemble"),
@@ -69,9 +66,7 @@ class GaussianLikelihood(Update):
         super().__init__(
             nn.Identity(), [predicted_key, observation_key, noise_variance_key], [out_key], optional_keys=[observed_key]
         )
-
-        check_dims("angles", angles)
-        self.angles, (_, self.reading_space) = list(angles), checked_spaces(None, reading_space, angles)
+        self.reading_space = check_space("reading_space", reading_space)
         self.reading_keys, self.observed_key = self.in_keys[1:], unravel_key(observed_key)
         self.predicted_key = self.in_keys[0]
 
@@ -83,12 +78,11 @@ class GaussianLikelihood(Update):
                 "Use DiagonalNoise or ConstantNoise."
             )
         if reading.ndim > len(batch_size) + 1:
-            space = self.reading_space
-            reading = mean_observation(reading, self.angles) if space is None else space.mean(reading)
+            reading = mean_reading(self.reading_space, reading)
         reading = reading.unsqueeze(-2)
         if self.reading_space is not None:  # from each particle by itself: they may lie all around
-            reading = without_hidden(reading, predicted, None if observed is None else observed.unsqueeze(-2))
-            reading = self.reading_space.minus(reading.expand_as(predicted), predicted)
+            mask = None if observed is None else observed.unsqueeze(-2)
+            reading = self.reading_space.innovation(reading, predicted, mask)
             predicted = torch.zeros_like(reading)
         if not reading.shape[-1] == predicted.shape[-1] == variance.shape[-1]:
             widths = {
@@ -100,7 +94,7 @@ class GaussianLikelihood(Update):
             # With the reading replaced, not only the residual, NaN reaches neither values nor gradients.
             observed = observed.unsqueeze(-2)
             reading, variance = torch.where(observed, reading, 0.0), torch.where(observed, variance, 1.0)
-        residual = wrap_angles(reading - predicted, self.angles)
+        residual = reading - predicted
         terms = -0.5 * (residual.square() / variance + variance.log() + math.log(2 * math.pi))
         if observed is not None:
             terms = torch.where(observed, terms, 0.0)
@@ -133,7 +127,7 @@ class LearnedLikelihood(Update):
         loc: mean m of each observation dimension ``[O]``; zero by default. Not with a ``observation_key``.
         scale: s of each observation dimension ``[O]``: its standard deviation, or with a ``observation_key`` what a
             good reading errs by; one by default.
-        angles: components of the observation that are angles in radians; with a ``observation_key``.
+        reading_space: in which the reading lives, one of numbers and angles; with a ``observation_key``.
         network: maps ``[*, F + O]`` to ``[*, 1]``; a multi-layer perceptron with ``num_cells`` by default.
         encoding_key: the encoding ``[*B, F]``, such as a sensor's ``encoding_key``; of an entry ``[*B, E, F]`` the
             mean is used.
@@ -145,8 +139,8 @@ class LearnedLikelihood(Update):
         out_key: log-likelihoods ``[*B, E]``, in nats, up to a constant.
 
     Raises:
-        ValueError: on an unknown ``bound``, with both ``loc`` and ``observation_key``, or angles without
-            ``observation_key``.
+        ValueError: on an unknown ``bound``, with both ``loc`` and ``observation_key``, or a ``reading_space`` without
+            ``observation_key``, of another kind, or of another size than O.
         KeyError: if an entry is missing.
 
     Reference:
@@ -170,7 +164,7 @@ class LearnedLikelihood(Update):
         bound: Literal["scaled", "clipped"] = "scaled",
         loc: Sequence[float] | torch.Tensor | None = None,
         scale: Sequence[float] | torch.Tensor | None = None,
-        angles: Sequence[int] = (),
+        reading_space: Space | None = None,
         network: nn.Module | None = None,
         encoding_key: NestedKey = ("sensor", "encoding"),
         observation_key: NestedKey | None = None,
@@ -184,17 +178,19 @@ class LearnedLikelihood(Update):
             raise ValueError(
                 "with a observation_key the network sees the innovation, which has no loc; pass scale alone."
             )
-        if angles and observation_key is None:
-            raise ValueError("angles are those of an innovation, which needs a observation_key.")
+        space = check_space("reading_space", reading_space, flat=True)
+        if space is not None and (observation_key is None or space.point_dim != observation_dim):
+            raise ValueError(
+                f"reading_space={reading_space} is that of a reading of {observation_dim}, with a observation_key."
+            )
         check_count("encoding_dim", encoding_dim)
         check_count("observation_dim", observation_dim)
-        check_dims("angles", angles, observation_dim)
         if network is None:
             network = StochasticMLP(encoding_dim + observation_dim, 1, num_cells, layer="none")
         in_keys = [key for key in (encoding_key, predicted_key, observation_key) if key is not None]
         super().__init__(network, in_keys, [out_key], optional_keys=[observed_key])
         self.bound, self.observation_dim, self.encoding_dim = bound, observation_dim, encoding_dim
-        self.angles = list(angles)
+        self.reading_space = space
         self.reading_keys = [key for key in self.in_keys if key != self.in_keys[1]]
         self.observed_key = unravel_key(observed_key)
         for name, value, default in (("loc", loc, 0.0), ("scale", scale, 1.0)):
@@ -213,9 +209,9 @@ class LearnedLikelihood(Update):
         if readings:
             (reading,) = readings
             if reading.ndim > len(batch_size) + 1:
-                reading = mean_observation(reading, self.angles)
-            innovation = reading.unsqueeze(-2) - predicted
-            seen = wrap_angles(innovation, self.angles) / self.scale
+                reading = mean_reading(self.reading_space, reading)
+            reading, space = reading.unsqueeze(-2), self.reading_space
+            seen = (reading - predicted if space is None else space.minus(reading, predicted)) / self.scale
         else:
             seen = (predicted - self.loc) / self.scale
         if observed is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, Literal, Unpack
 
 import torch
@@ -12,6 +11,7 @@ from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import ensemble_mean, ensemble_var, letkf, neighbours
 from torch_denkf.functional.inflation import random_rotation, relax_to_prior_spread
 from torch_denkf.functional.localisation import Neighbours, neighbours_of_taper
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules.ensemble import EnsembleAnalysisKeys, EnsembleUpdate
 from torch_denkf.modules.tensors import mean_of_members, refuse_trained
 
@@ -44,7 +44,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         localisation: ``"significance"`` also weighs each observation near a component by how far E members can tell
             their correlation from chance, see :class:`EnsembleAnalysis`.
         threshold: of ``"significance"``, in standard deviations; a ``Parameter`` is trained.
-        angles: components of the observation that are angles in radians: their innovation is the shorter way round.
+        reading_space: in which the reading lives, such as ``Circle()`` for an angle; innovation and R are tangents.
         **keys: see :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. Of learned observations the
             mean is taken. What is not observed may be NaN, readings and variances alike.
 
@@ -77,7 +77,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         tile: int = 4096,
         localisation: Literal["significance"] | None = None,
         threshold: float | torch.nn.Parameter = 3.0,
-        angles: Sequence[int] = (),
+        reading_space: Space | None = None,
         **keys: Unpack[EnsembleAnalysisKeys],
     ):
         check_count("tile", tile)
@@ -89,7 +89,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
             inflation=inflation,
             relaxation=relaxation,
             rotate=rotate,
-            angles=angles,
+            reading_space=reading_space,
             localisation=localisation,
             threshold=threshold,
             **keys,

@@ -11,9 +11,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf.functional.linalg import semidefinite_root
-from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.weighted import weighted_mean
-from torch_denkf.modules._spaces import checked_space
 from torch_denkf.modules.noise import ConstantNoise
 from torch_denkf.modules.tensors import check_dims
 from torch_denkf.running import check_module, reads, run_module
@@ -88,7 +87,7 @@ class NoisyTransition(Transition):
             transition.out_keys,
             optional_keys=[log_weight_key, *optional, *of_noise_optional],
         )
-        self.log_weight_key, self.space = unravel_key(log_weight_key), checked_space("space", space)
+        self.log_weight_key, self.space = unravel_key(log_weight_key), check_space("space", space)
         self.before, self.mean_key, self.forecast_mean_key = before, *map(unravel_key, (mean_key, forecast_mean_key))
         check_dims("dims", dims or (), once=True)
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)

@@ -23,11 +23,9 @@ from torch import nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
-from torch_denkf.functional.angles import align_angles
-from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.resampling import effective_sample_size, jitter_copies
 from torch_denkf.functional.weighted import weighted_innovation, weighted_mean, weighted_var
-from torch_denkf.modules._spaces import checked_space, reading_about
 from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.likelihood import GaussianLikelihood
 from torch_denkf.running import check_module, reads, run_module
@@ -319,8 +317,7 @@ class ParticleAnalysis(Update):
             optional_keys=[] if likelihood is None else likelihood.optional_keys,
         )
         check_number("tempering", tempering, above=0)
-        self.tempering, self.info_prefix, self.space = tempering, info_prefix, checked_space("space", space)
-        self.angles: list[int] = [] if likelihood is None else likelihood.angles
+        self.tempering, self.info_prefix, self.space = tempering, info_prefix, check_space("space", space)
         self.reading_space = None if likelihood is None else likelihood.reading_space
         if likelihood is not None:
             self.reading_keys, self.predicted_key = likelihood.reading_keys, likelihood.predicted_key
@@ -350,8 +347,7 @@ class ParticleAnalysis(Update):
 
     def _innovation(self, prior, predicted, reading, variance, observed=None) -> tuple[torch.Tensor, torch.Tensor]:
         if self.reading_space is not None:
-            predicted, reading = reading_about(self.reading_space, predicted, reading, observed)
-        predicted, reading = align_angles(predicted, reading, self.angles, observed)
+            predicted, reading = self.reading_space.align(predicted, reading, observed)
         if reading.ndim == predicted.ndim:
             reading = reading.mean(-2)
         return weighted_innovation(predicted, prior, reading, variance, observed=observed)

@@ -8,6 +8,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf._checks import check_number
+from torch_denkf.functional.manifolds import is_flat
 from torch_denkf.functional.unscented import (
     UnscentedWeights,
     sigma_points,
@@ -136,19 +137,20 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
     def _update(self, entries, mean, cov, observation, noise, call):
-        angles = self.angles
-        if self.space is None and self.reading_space is None:
+        on = self.reading_space
+        if self.space is None and is_flat(on):
             points, weights = self._points(mean, cov)
             predicted, observed = self._observe(entries, points, call)
-            update = unscented_update(points, predicted, observation, noise, weights, observed=observed, angles=angles)
-            return update, observed
+            return unscented_update(
+                points, predicted, observation, noise, weights, observed=observed, space=on
+            ), observed
         points, weights = self._points(torch.zeros_like(cov[..., 0]), cov)
         around = mean.unsqueeze(-2)
         around = around + points if self.space is None else self.space.plus(around, points)
         predicted, observed = self._observe(entries, around, call)
-        if self.reading_space is not None:
-            expected = self.reading_space.mean(predicted, weights.mean)
-            predicted = self.reading_space.minus(predicted, expected.unsqueeze(-2))
+        if on is not None and on.flat is None:
+            expected = on.mean(predicted, weights.mean)
+            predicted, on = on.minus(predicted, expected.unsqueeze(-2)), None
             observation = self._innovation(observation, expected, observed)
-        update = unscented_update(points, predicted, observation, noise, weights, observed=observed, angles=angles)
+        update = unscented_update(points, predicted, observation, noise, weights, observed=observed, space=on)
         return self._moved(mean, update), observed

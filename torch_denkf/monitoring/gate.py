@@ -261,7 +261,7 @@ class GatedAnalysis(Around):
         return {**out, **dict(zip((*self.state_keys, *self._further), own, strict=True))}
 
     def _analyse(self, entries: Entries, call: Call) -> Entries:
-        """What the analysis writes; the angles of an ensemble's entries are on one turn already."""
+        """What the analysis writes; an ensemble's predictions and reading are plain numbers already."""
         return (self.module.on_aligned if self.of_ensemble else self.module.on_entries)(entries, call)
 
     def _with_noise(self, entries: Entries, call: Call) -> Entries:
@@ -283,9 +283,6 @@ class GatedAnalysis(Around):
             return nis, observed.sum(-1, keepdim=True)
         predicted, variance = entries[self.module.in_keys[1]], entries[self.noise_variance_key]
         seen = observed > 0  # what is not observed may be NaN
-        if self.module.reading_space is not None:
-            center = self.module.reading_space.mean(predicted).unsqueeze(-2)
-            predicted = self.module.reading_space.minus(predicted, center)
         predicted = predicted.var(-2) if predicted.shape[-2] > 1 else torch.zeros_like(innovation)
         spread = torch.where(seen, predicted, 0) + torch.where(seen, variance, 1)
         return torch.where(seen, innovation.square() / spread, 0), observed
@@ -302,8 +299,8 @@ class GatedAnalysis(Around):
         if not self.of_ensemble:
             key = self.module.in_keys[1]
             return {**entries, key: entries[key] * factor.unsqueeze(-1)}
-        keys = self.module.in_keys[:2]  # states, and what is predicted of them
-        spaces = (self.module.space, self.module.reading_space)
+        keys = self.module.in_keys[:2]  # states, and what is predicted of them, in plain numbers
+        spaces = (self.module.space, None)
         wider = {key: spread_about_mean(entries[key], factor.sqrt(), on) for key, on in zip(keys, spaces, strict=True)}
         return {**entries, **wider}
 
@@ -369,7 +366,7 @@ def _with_noise_from(key: NestedKey, analysis: KalmanAnalysis) -> KalmanAnalysis
         analysis.matrix.detach(),
         None,
         inflation=analysis.inflation,
-        angles=analysis.angles,
+        reading_space=analysis.reading_space,
         observation_key=keys[2],
         noise_variance_key=key,
         observed_key=analysis.observed_key,

@@ -16,8 +16,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from torch_denkf._checks import check_mask
-from torch_denkf.functional import wrap_angles
-from torch_denkf.functional.manifolds import Space, whole_parts
+from torch_denkf.functional.manifolds import Space, is_flat, whole_parts
 from torch_denkf.submodel import Initial, role
 
 if TYPE_CHECKING:
@@ -64,7 +63,6 @@ class Labels(NamedTuple):
         mask: ``[*B, N]``, True where there is one. N are the tangents' components of a space.
         dims: of the N components those that count.
         scale: ``[N]``, finite, by which errors are divided; ``None`` for one.
-        angles: components that are angles, whose errors are wrapped.
         space: the space whose points they are; ``None`` of plain numbers.
     """
 
@@ -72,7 +70,6 @@ class Labels(NamedTuple):
     mask: Tensor
     dims: Sequence[int]
     scale: Tensor | None = None
-    angles: Sequence[int] = ()
     space: Space | None = None
 
     @property
@@ -98,8 +95,8 @@ class Labels(NamedTuple):
         if members:
             values, mask = values.unsqueeze(-2), mask.unsqueeze(-2)
         if space is None:
-            errors = wrap_angles(estimate - values, self.angles)
-        elif each or not members:
+            errors = estimate - values
+        elif each or not members or space.flat is not None:
             errors = space.minus(estimate, values)
         else:
             center = space.mean(estimate.detach(), None if weights is None else weights.detach()).unsqueeze(-2)
@@ -131,22 +128,22 @@ class Labels(NamedTuple):
         out[list(self.dims)] = value
         return out
 
-    def scaled(self, name: str, scale: Tensor | None, angles: Sequence[int]) -> Labels:
-        """With angles, and a scale, see :meth:`in_all_components`; where that is infinite, a component is no label."""
+    def scaled(self, name: str, scale: Tensor | None) -> Labels:
+        """With a scale, see :meth:`in_all_components`; where that is infinite, a component is no label."""
         if scale is None:
-            return self._replace(angles=angles)
+            return self
         scale = self.in_all_components(name, scale)
         mask = self.mask & scale.isfinite()
         scale = torch.where(scale.isfinite(), scale, 1)
-        values = torch.where(mask, self.values, 0) if self.space is None else self.values
-        return self._replace(values=values, mask=mask, scale=scale, angles=angles)
+        values = torch.where(mask, self.values, 0) if is_flat(self.space) else self.values
+        return self._replace(values=values, mask=mask, scale=scale)
 
 
 class Truth:
     """What is known of a batch: the labels that terms are scored against, and what the filter wrote.
 
     Args:
-        loss: whose names of entries, dimensions, scales and angles count.
+        loss: whose names of entries, dimensions, scales and spaces count.
         data: the batch.
         out: the batch with what the filter, or its part, wrote.
     """
@@ -178,12 +175,11 @@ class Truth:
     def state(self, size: int) -> Labels:
         """The true state as far as it counts, against an estimate of ``size`` components."""
         labels = self._labels("state", self.entry(self.keys.state, given=True), size, self.loss.dims)
-        return labels.scaled("state_scale", self.loss.state_scale, self.loss.angles)
+        return labels.scaled("state_scale", self.loss.state_scale)
 
     def observation(self, target: Tensor, size: int) -> Labels:
         """True observations ``target``, as far as they count, against readings of ``size`` components."""
-        scale, angles = self.loss.observation_scale, self.loss.observation_angles
-        return self._labels("target", target, size).scaled("observation_scale", scale, angles)
+        return self._labels("target", target, size).scaled("observation_scale", self.loss.observation_scale)
 
     def visible(self) -> Labels:
         """Whether the sensor sees, ``[*B, 1]``, where that is known and there is a reading."""
@@ -212,7 +208,7 @@ class Truth:
     def observed_state(self, observe: Callable[[Tensor], Tensor]) -> Tensor:
         """What a model observes in the true state; what it makes of NaN is NaN: no label."""
         # The components of a space are those of tangents: its points are whole.
-        values, dims = self.entry(self.keys.state, given=True), None if self.loss.space else self.loss.dims
+        values, dims = self.entry(self.keys.state, given=True), self.loss.dims if is_flat(self.loss.space) else None
         size = max(self.state_size() or 0, values.shape[-1], 1 + max(dims or [0]))
         return observe(self._known("state", values, size, dims))
 
@@ -226,22 +222,20 @@ class Truth:
         return next(sizes, role(filter.initial, Initial).state_dim)
 
     def _labels(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None = None) -> Labels:
-        space = self.loss.space if name == "state" else None
-        if space is not None:
+        space = {"state": self.loss.space, "target": self.loss.reading_space}.get(name)
+        if space is not None and size != space.point_dim:
+            raise ValueError(f"a point of {space} has {space.point_dim} numbers, but what is scored has {size}")
+        if space is not None and space.flat is None:
             return self._points(space, values, size, dims)
         known = self._known(name, values, size, dims)
         dims = range(min(values.shape[-1], size)) if dims is None else dims
         counting = torch.zeros(size, dtype=torch.bool, device=known.device)
         counting[list(dims)] = True
         mask = ~known.isnan() & counting
-        return Labels(torch.where(mask, known, 0), mask, dims)
+        return Labels(torch.where(mask, known, 0), mask, dims, space=space)
 
     def _points(self, space: Space, values: Tensor, size: int, dims: Sequence[int] | None) -> Labels:
         """True points, and which components of tangents they have labels for."""
-        if size != space.point_dim:
-            raise ValueError(
-                f"a point of space={space} has {space.point_dim} numbers, but the belief's state has {size}"
-            )
         known = self._known("state", values, size, None)
         whole, mask = whole_parts(space, ~known.isnan())
         given = torch.arange(size) < values.shape[-1]

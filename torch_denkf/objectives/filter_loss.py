@@ -39,14 +39,14 @@ class ReadingsOptions(TypedDict, total=False):
         observation_scale: ``[O]``; errors of observations are divided by it, so that dimensions with different units
             count alike. A dimension with infinite scale does not count: means are taken over the others. A term that
             is a likelihood stays a density in the observation's own units.
-        observation_angles: dimensions of observations that are angles in radians; their errors are wrapped to
-            [-pi, pi).
+        reading_space: in which observations live, one of numbers and angles such as ``Euclidean(1) * Circle()``; errors
+            of angles are wrapped to [-pi, pi). ``None`` for plain numbers.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``: the shape of the batch, zero where an element does
             not count.
     """
 
     observation_scale: Scale
-    observation_angles: Sequence[int]
+    reading_space: Space | None
     reduction: Literal["mean", "sum", "none"]
 
 
@@ -60,10 +60,9 @@ class StateOptions(TypedDict, total=False):
             ``dims`` alone, in their order, where some of these lie beyond as many leading ones.
         state_scale: one for each of ``dims``, else of the labels' dimensions; errors of the state are divided by it. A
             dimension with infinite scale does not count.
-        angles: state dimensions that are angles in radians, counted in the whole state; their errors are wrapped to
-            [-pi, pi).
-        space: the space whose points the states are, such as ``Product(SO3(), Euclidean(3))``, in place of ``angles``.
-            Without both it is that of the filter's initial belief. Errors are then tangents ``[D]``, whose components
+        space: the space whose points the states are, such as ``Product(SO3(), Euclidean(3))``, or
+            ``Flat(5, circular=[2])`` for numbers of which one is an angle, whose errors are wrapped to [-pi, pi). By
+            default it is that of the filter's initial belief. Errors are then tangents ``[D]``, whose components
             ``dims`` and ``state_scale`` count; the belief's covariance is one of tangents at its mean. A part of the
             space has a label where all of its numbers have. Scores of members compare tangents at the members' mean,
             which makes them proper; a Gaussian's density is that of the tangent from its mean to the truth, in the
@@ -72,7 +71,6 @@ class StateOptions(TypedDict, total=False):
 
     dims: Sequence[int] | None
     state_scale: Scale
-    angles: Sequence[int]
     space: Space | None
 
 
@@ -134,7 +132,7 @@ class Term(nn.Module):
         Args:
             out: the batch ``[*B]`` with what the filter wrote.
             truth: the labels: ``truth.state(S)`` and ``truth.observation(target, O)`` give true values, where they are
-                known, and errors with the loss's scales and angles.
+                known, and errors with the loss's scales and spaces.
 
         Returns:
             Its values ``[*B]``, or one number; and which elements have what it scores, ``[*B]`` bool (``None``: all).
@@ -178,18 +176,17 @@ class FilterLoss(Checked, LossModule):
         state_scale: one for each of ``dims``, else of the labels' dimensions; errors of the state are divided by it. A
             dimension with infinite scale does not count: means are taken over the others.
         observation_scale: ``[O]``, what errors of observations are divided by.
-        angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
-        space: whose points the states are, in place of ``angles``; without both that of the filter's initial belief.
-            ``dims`` and ``state_scale`` are then those of tangents, see :class:`StateOptions`.
-        observation_angles: dimensions of observations that are angles in radians.
+        space: whose points the states are; by default that of the filter's initial belief. Errors of angles are
+            wrapped to [-pi, pi). ``dims`` and ``state_scale`` are then those of tangents, see :class:`StateOptions`.
+        reading_space: in which observations live, one of numbers and angles; ``None`` for plain numbers.
         detach_every: truncated back-propagation: steps after which the belief is detached.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B]``, zero where an element does not count).
 
     Raises:
         TypeError: for what is no filter, no term or no space.
         ValueError: on an unknown score, two terms of one name, a scale that is not positive, infinite in all
-            dimensions, or of another length than what is scored, a space with ``angles``, labels of another shape, or
-            slices that are not marked.
+            dimensions, or of another length than what is scored, a space of another size than what is scored, a
+            ``reading_space`` of another kind, labels of another shape, or slices that are not marked.
 
     Example:
         >>> from torch_denkf.filters import KalmanFilter
@@ -220,9 +217,8 @@ class FilterLoss(Checked, LossModule):
         dims: Sequence[int] | None = None,
         state_scale: Scale = None,
         observation_scale: Scale = None,
-        angles: Sequence[int] = (),
         space: Space | None = None,
-        observation_angles: Sequence[int] = (),
+        reading_space: Space | None = None,
         detach_every: int | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ):
@@ -233,23 +229,20 @@ class FilterLoss(Checked, LossModule):
             raise TypeError(f"filter must be a torch_denkf Filter; got {filter!r}"[:200])
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f'reduction is "mean", "sum" or "none"; got {reduction!r}.')
-        check_dims("angles", angles)
-        check_dims("observation_angles", observation_angles)
         if dims is not None:
             check_dims("dims", dims, once=True)
             if not len(dims):
                 raise ValueError("dims names the dimensions of the state that count; got none. Pass None for all.")
         space = filter.structure.space if space is None else space
-        check_space(space, angles)
+        space = check_space("space", space)
         if space is not None and dims is not None and max(dims) >= space.tangent_dim:
             raise ValueError(
                 f"dims={list(dims)} names component {max(dims)} of tangents of {space.tangent_dim}, from 0."
             )
         super().__init__()
-        self.space = space
+        self.space, self.reading_space = space, check_space("reading_space", reading_space, flat=True)
         self.dims = None if dims is None else [int(dim) for dim in dims]
         self.filter, self.score, self.reduction, self.detach_every = filter, score, reduction, detach_every
-        self.angles, self.observation_angles = list(angles), list(observation_angles)
         self.register_buffer("state_scale", _checked_scale("state_scale", state_scale))
         self.register_buffer("observation_scale", _checked_scale("observation_scale", observation_scale))
         if self.dims is not None and self.state_scale is not None and self.state_scale.numel() != len(self.dims):

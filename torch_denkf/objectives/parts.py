@@ -37,7 +37,7 @@ class ObservationLoss(FilterLoss):
 
     Args:
         filter: the filter whose observation model is trained; a module with an ``observe()`` method.
-        **options: ``observation_scale``, ``observation_angles`` and ``reduction``, see :class:`ReadingsOptions`.
+        **options: ``observation_scale``, ``reading_space`` and ``reduction``, see :class:`ReadingsOptions`.
 
     Raises:
         ValueError: if a scale is not positive, or labels have another shape.
@@ -98,7 +98,7 @@ class SensorLoss(FilterLoss):
         sensor: weight of ``loss_sensor``.
         noise: weight of ``loss_noise``. R must follow from frames alone.
         visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
-        **options: ``observation_scale``, ``observation_angles`` and ``reduction``, see :class:`ReadingsOptions`.
+        **options: ``observation_scale``, ``reading_space`` and ``reduction``, see :class:`ReadingsOptions`.
 
     Raises:
         ValueError: on an unknown score, a scale that is not positive, or labels of another shape.
@@ -203,7 +203,7 @@ class TransitionLoss(FilterLoss):
         members: E; by default as many as the initial belief has. One is a point, for ``"mse"`` alone.
         belief: prefix of the carried ``ensemble``, or of ``mean`` and ``cov``.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
-        **options: ``dims``, ``state_scale``, ``angles`` and ``space``, see :class:`StateOptions`.
+        **options: ``dims``, ``state_scale`` and ``space``, see :class:`StateOptions`.
 
     Raises:
         ValueError: on an unknown score, a scale that is not positive, a negative spread, too few members, a filter that

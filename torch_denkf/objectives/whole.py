@@ -58,7 +58,7 @@ class DEnKFLoss(FilterLoss):
         smoother: makes the smoothed belief, e.g. ``partial(EnRTS, lag=10)`` or
             :class:`~torch_denkf.smoothers.EnRTS`; it is called with the filter.
         terms: terms of your own beside these, see :class:`Term`.
-        **options: ``dims``, scales, angles, ``space``, ``detach_every`` and ``reduction``, see
+        **options: ``dims``, scales, ``space``, ``reading_space``, ``detach_every`` and ``reduction``, see
             :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. It also says what gaps in the labels are.
 
     Raises:
@@ -201,7 +201,7 @@ class GaussianLoss(FilterLoss):
         nll: weight of ``loss_nll``.
         visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
         terms: terms of your own beside these, see :class:`Term`.
-        **options: ``dims``, scales, angles, ``space``, ``detach_every`` and ``reduction``, see
+        **options: ``dims``, scales, ``space``, ``reading_space``, ``detach_every`` and ``reduction``, see
             :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. It also says what gaps in the labels are.
 
     Raises:
@@ -281,7 +281,7 @@ class MixtureLoss(FilterLoss):
         nll: weight of ``loss_nll``.
         visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
         terms: terms of your own beside these, see :class:`Term`.
-        **options: ``dims``, scales, angles, ``space``, ``detach_every`` and ``reduction``, see
+        **options: ``dims``, scales, ``space``, ``reading_space``, ``detach_every`` and ``reduction``, see
             :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. With a ``state_scale`` the mixture
             is a density of the state in its own units all the same.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -147,12 +146,6 @@ def dims_of(read: Belief, dims: object) -> list[int]:
         if not 0 <= dim < size:
             raise IndexError(f"dims names dimension {dim} of a state of {size} dimensions")
     return chosen
-
-
-def turns_of(read: Belief, dims: list[int], angles: Sequence[int]) -> list[int]:
-    """Which of the chosen dimensions are angles, as places among them."""
-    size = read.mean.shape[-1]
-    return [column for column, dim in enumerate(dims) if dim in {angle % size for angle in angles}]
 
 
 def with_truth(read: Belief, dims: list[int]) -> Tensor:

@@ -26,7 +26,7 @@ from torch_denkf.plots._axes import (
     step_bounds,
     times_of,
 )
-from torch_denkf.plots._belief import Belief, Truth, dims_of, number, read_belief, turns_of, with_truth
+from torch_denkf.plots._belief import Belief, Truth, dims_of, number, read_belief, with_truth
 from torch_denkf.plots._space import angles_of, in_components, names_of
 
 if TYPE_CHECKING:
@@ -49,7 +49,6 @@ def plot_bands(
     time: float | Tensor | None = None,
     level: float = 0.9,
     band: Literal["auto", "ensemble", "variance"] = "auto",
-    angles: Sequence[int] = (),
     space: Space | None = None,
     legend: bool = True,
     ax: Axes | Sequence[Axes] | None = None,
@@ -75,10 +74,9 @@ def plot_bands(
         level: probability of the band.
         band: ``"ensemble"`` draws quantiles of the members; ``"variance"`` draws those of a Gaussian. ``"auto"`` takes
             the ensemble where its members have equal weights and are enough for ``level``.
-        angles: components that are angles in rad: the mean is unwrapped, all else lies within π of it.
-        space: whose points the states are, in place of ``angles``. Components are then those of tangents, with roll,
-            pitch and yaw of a quaternion in degrees, between -180 and 180: a line that leaves at one end goes on at the
-            other. ``readings`` of angles are in rad.
+        space: whose points the states are; ``None`` for plain numbers. Components are then those of tangents, with
+            angles, and roll, pitch and yaw of a quaternion, in degrees, between -180 and 180: a line that leaves at one
+            end goes on at the other. ``readings`` of angles are in rad.
         legend: whether to add one above the first Axes.
         ax: as many Axes as components; ``None`` makes a figure.
 
@@ -100,21 +98,21 @@ def plot_bands(
         [-3.29, 3.29]
     """
     seen = None if isinstance(observed, Mapping) else observed
-    check_space(space, angles)
+    space = check_space("space", space)
     read = read_belief(run, truth, seen, belief=belief, one_sequence=True, space=space)
+    turned: list[int] = []
     if space is not None:
-        read, angles = in_components(read, space), angles_of(space)
+        read, turned = in_components(read, space), angles_of(space)
     chosen = dims_of(read, dims)
     masks = _masks(run, observed) if isinstance(observed, Mapping) else dict.fromkeys(chosen, _seen(read))
     panels = axes_for(ax, len(chosen), (8, 1.2 + 2 * len(chosen)), share=True)
     if names is None and space is not None:
         names = [names_of(space)[dim] for dim in chosen]
-    usual = [180 / np.pi if space is not None and dim in angles else 1.0 for dim in chosen]
+    usual = [180 / np.pi if dim in turned else 1.0 for dim in chosen]
     labels, scales = labels_for(names, chosen), one_each("factors", factors, usual)
     seconds = times_of(time, len(read.mean))
     bounds = step_bounds(seconds)
-    turns = turns_of(read, chosen, angles)
-    angular = [column in turns for column in range(len(chosen))]
+    angular = [dim in turned for dim in chosen]
     mean, lower, upper = _edges(read, chosen, angular, level, band)
     true = None if read.truth is None else _beside(with_truth(read, chosen), mean, angular)
     for what, given in (("readings", readings or {}), ("observed", masks)):
@@ -135,7 +133,7 @@ def plot_bands(
             if seen is not None:
                 values = values.where(seen, torch.nan)
         line, turns = mean[:, column], [0]
-        if space is not None and angular[column]:
+        if angular[column]:
             turns = _turns([mean, lower, upper, true], column)
         for turn in turns:
             away, named = 2 * np.pi * turn, turn == turns[0]

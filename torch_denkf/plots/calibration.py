@@ -14,7 +14,7 @@ from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.metrics import pit
 from torch_denkf.metrics.calibration import histogram_band, rank_histogram
 from torch_denkf.plots._axes import FILL, TRUTH, axes_for, label_below, labels_for, legend_above
-from torch_denkf.plots._belief import Truth, dims_of, read_belief, turns_of, with_truth
+from torch_denkf.plots._belief import Truth, dims_of, read_belief, with_truth
 from torch_denkf.plots._space import in_tangents, names_of
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ def plot_calibration(
     bins: int = 10,
     every: int = 1,
     level: float = 0.99,
-    angles: Sequence[int] = (),
     space: Space | None = None,
     legend: bool = True,
     ax: Axes | Sequence[Axes] | None = None,
@@ -57,9 +56,8 @@ def plot_calibration(
         bins: of the histogram. An ensemble's E+1 ranks are laid on them in equal parts.
         every: use every n-th step of time. Errors of successive steps are alike, which moves bars out of the band.
         level: probability of the band, for all bars of an Axes together.
-        angles: dimensions of the state that are angles in rad, whose errors are wrapped.
-        space: whose points the states are, in place of ``angles``. Components are then those of the tangent from the
-            mean to the truth: a rotation has three, about the body's axes.
+        space: whose points the states are; ``None`` for plain numbers. Components are then those of the tangent from
+            the mean to the truth: a rotation has three, about the body's axes.
         legend: whether to add one above the first Axes.
         ax: as many Axes as components; ``None`` makes a figure.
 
@@ -81,7 +79,7 @@ def plot_calibration(
         >>> [round(float(bar.get_height()), 1) for bar in axes.containers[0]]
         [10.2, 10.2, 10.8, 9.7, 10.2, 10.2, 11.4, 9.2, 8.8, 9.3]
     """
-    check_space(space, angles)
+    space = check_space("space", space)
     read = read_belief(run, truth, belief=belief, space=space)
     if space is not None:
         read = in_tangents(read, space)
@@ -95,20 +93,19 @@ def plot_calibration(
         raise ValueError(f'kind must be "auto", "pit" or "rank"; got {kind!r}')
     if ranks and read.ensemble is None:
         raise ValueError('kind="rank" needs ("belief", "ensemble"); pass kind="pit"')
-    turns = turns_of(read, chosen, angles)
     rows = torch.zeros_like(read.known)
     rows[..., ::every] = read.known[..., ::every]
     true = with_truth(read, chosen)[rows]
     if ranks:
         assert read.ensemble is not None
         weight = None if read.log_weight is None else read.log_weight[rows]
-        counts = _rebin(rank_histogram(read.ensemble[rows][..., chosen], true, log_weight=weight, angles=turns), bins)
+        counts = _rebin(rank_histogram(read.ensemble[rows][..., chosen], true, log_weight=weight), bins)
     elif read.var is None:
         raise ValueError('the spread is missing: the belief needs "var", "cov" or "ensemble"')
     else:
         if bool(true.isnan().any()):
             raise ValueError("the truth is NaN in places, where it is not known; leave out the rows that are not whole")
-        values = pit(read.mean[rows][:, chosen], read.var[rows][:, chosen], true, angles=turns)
+        values = pit(read.mean[rows][:, chosen], read.var[rows][:, chosen], true)
         counts = torch.stack([torch.histc(column, bins, 0, 1) for column in values.unbind(-1)])
     samples = len(true)
     low, high = (100 * count / samples for count in histogram_band(samples, bins, level=level))

@@ -11,7 +11,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.metrics.calibration import spread_error
 from torch_denkf.plots._axes import BELIEF, MARKERS, OTHERS, TRUTH, axes_for, labels_for, legend_above, one_each
-from torch_denkf.plots._belief import Truth, dims_of, read_belief, turns_of, with_truth
+from torch_denkf.plots._belief import Truth, dims_of, read_belief, with_truth
 from torch_denkf.plots._space import angles_of, in_tangents, names_of
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ def plot_spread_error(
     names: Sequence[str] | None = None,
     factors: Sequence[float] | None = None,
     bins: int = 8,
-    angles: Sequence[int] = (),
     space: Space | None = None,
     legend: bool = True,
     ax: Axes | None = None,
@@ -47,9 +46,8 @@ def plot_spread_error(
         names: a label with its unit for each of them, such as ``"v, m/s"``.
         factors: what each is multiplied with, such as ``180 / pi`` for degrees.
         bins: points of a line, each for as many states.
-        angles: dimensions of the state that are angles in rad, whose errors are wrapped.
-        space: whose points the states are, in place of ``angles``. Components are then those of the tangent from the
-            mean to the truth: a rotation has three, about the body's axes, in degrees.
+        space: whose points the states are; ``None`` for plain numbers. Components are then those of the tangent from
+            the mean to the truth: a rotation has three, about the body's axes, in degrees.
         legend: whether to add one above the Axes.
         ax: to draw into; ``None`` makes a figure.
 
@@ -71,7 +69,7 @@ def plot_spread_error(
         >>> [line.get_label() for line in axes.get_lines()]
         ['x, m', 'spread = error']
     """
-    check_space(space, angles)
+    space = check_space("space", space)
     read = read_belief(run, truth, belief=belief, space=space)
     if space is not None:
         read = in_tangents(read, space)
@@ -80,14 +78,12 @@ def plot_spread_error(
         names = [names_of(space, ("about x, deg", "about y, deg", "about z, deg"))[dim] for dim in chosen]
     if read.var is None:
         raise ValueError('the spread is missing: the belief needs "var", "cov" or "ensemble"')
-    turns = turns_of(read, chosen, angles)
     points = spread_error(
         read.mean[read.known][:, chosen],
         read.var[read.known][:, chosen],
         with_truth(read, chosen)[read.known],
         bins=bins,
         ensemble_size=read.ensemble_size,
-        angles=turns,
     )
     (axes,) = axes_for(ax, 1, (6.4, 6.8))
     usual = [180 / pi if dim in turned else 1.0 for dim in chosen]

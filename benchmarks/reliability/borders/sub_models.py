@@ -131,7 +131,7 @@ def _motions() -> Iterator[Subject]:
 
 def _observations() -> Iterator[Subject]:
     reach = d.Wrong({"nan": [NAN], "negative": [-1.0], "zero": [0.0], "text": "far"})
-    yield Subject(m.Select, lambda: {"dims": [0, 1]}, on_row, {"dims": d.angles(2)})
+    yield Subject(m.Select, lambda: {"dims": [0, 1]}, on_row, {"dims": d.indices(2)})
     yield Subject(m.LinearObservation, lambda: {"matrix": EYE.clone()}, on_row, {"matrix": BY_COLUMNS})
     yield Subject(m.LearnedObservation, lambda: {"network": nn.Linear(2, 2)}, on_row)
     yield Subject(PairObservation, lambda: {"reach": [1.0]}, wrong={"reach": reach})
@@ -190,7 +190,7 @@ def _updates() -> Iterator[Subject]:
     }
     linear = {"matrix": BY_COLUMNS, "noise": d.covariance(2)}
     select = lambda: {"observation": m.Select([0, 1])}  # noqa: E731
-    learned = {"bound": d.CHOICE, "num_cells": None, "angles": None, "network": None}
+    learned = {"bound": d.CHOICE, "num_cells": None, "network": None}
     yield Subject(m.EnsembleAnalysis, lambda: {"scheme": "sensor"}, on_row, {"taper": d.Wrong(taper)})
     yield Subject(m.LocalEnsembleAnalysis, lambda: {"near": torch.ones(2, 2)}, on_row, {"near": d.Wrong(near)})
     yield Subject(m.KalmanAnalysis, lambda: {"matrix": EYE.clone(), "noise": EYE.clone()}, on_row, linear)

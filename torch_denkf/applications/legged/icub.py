@@ -83,7 +83,7 @@ def savitzky_golay(values: torch.Tensor, time: torch.Tensor, rows: int = 21, ord
     return (torch.linalg.pinv(powers) @ values[window])[:, 1]
 
 
-def of_rpy(angles: torch.Tensor) -> torch.Tensor:
+def of_rpy(rpy: torch.Tensor) -> torch.Tensor:
     """The quaternions of roll, pitch and yaw ``[*, 3]``, turns about x, then y, then z of the world."""
-    turns = [SO3().exp(angles[..., axis : axis + 1] * torch.eye(3).to(angles)[axis]) for axis in range(3)]
+    turns = [SO3().exp(rpy[..., axis : axis + 1] * torch.eye(3).to(rpy)[axis]) for axis in range(3)]
     return SO3().compose(turns[2], SO3().compose(turns[1], turns[0]))

@@ -1,0 +1,211 @@
+"""Lines and circles: plain numbers, some of which are angles."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Sequence
+from itertools import groupby
+
+import torch
+from torch import Tensor
+
+from torch_denkf._checks import check_count, check_number
+from torch_denkf.functional.angles import wrap_angles
+from torch_denkf.functional.manifolds.space import Space, eye
+
+__all__ = ["Circle", "Euclidean", "Flat"]
+
+_Parts = Callable[..., tuple[Tensor, ...]]
+_RUNS = 4  # of angles and of other numbers, up to which cutting them apart costs less than a mask
+
+
+class Flat(Space):
+    """N plain numbers, of which some are angles in rad, in any order: lines and circles.
+
+    Points and tangents are both N numbers. All is in closed form: a difference and a sum are those of the numbers,
+    with angles wrapped to [-pi, pi), and Jacobians are the identity.
+
+    Args:
+        size: N.
+        circular: components that are angles.
+
+    Raises:
+        TypeError: if a component is no whole number.
+        ValueError: if there is no such component.
+
+    Example:
+        >>> plane = Flat(3, circular=[2])  # x, y and a heading: Euclidean(2) * Circle()
+        >>> plane.minus(torch.tensor([1.0, 0.0, 3.0]), torch.tensor([0.0, 0.0, -3.0]))
+        tensor([ 1.0000,  0.0000, -0.2832])
+    """
+
+    def __init__(self, size: int, circular: Sequence[int] = ()):
+        check_count("size", size, least=1)
+        self.size = self.point_dim = self.tangent_dim = size
+        self.circular = tuple(sorted({operator.index(component) for component in circular}))
+        self._angles = len(self.circular)
+        for component in self.circular:
+            check_number("circular", component, least=0, below=size)
+        runs = groupby(range(size), lambda index: index in self.circular)
+        self._runs = tuple((turns, len(list(run))) for turns, run in runs)  # side by side: whether angles, how many
+
+    def __repr__(self):
+        return f"Flat(size={self.size}, circular={self.circular})"
+
+    def __eq__(self, other):
+        return isinstance(other, Flat) and (self.size, self.circular) == (other.size, other.circular)
+
+    def __hash__(self):
+        return hash((self.size, self.circular))
+
+    @property
+    def flat(self):
+        """This space."""
+        return self
+
+    @property
+    def parts(self) -> tuple[Space, ...]:
+        """The lines that stand side by side, and each circle."""
+        return tuple(
+            part for turns, count in self._runs for part in ([Circle()] * count if turns else [Euclidean(count)])
+        )
+
+    def compose(self, first, second):
+        """The sum, angles wrapped."""
+        return self.normalise(first + second)
+
+    def inverse(self, point):
+        """The negative."""
+        return -point
+
+    def right_jacobian(self, tangent):
+        """The identity."""
+        return eye(tangent, self.size)
+
+    adjoint = basis = dual_basis = right_jacobian
+
+    def neutral(self, like=None):
+        """Zeros."""
+        return torch.zeros(self.size) if like is None else like.new_zeros(self.size)
+
+    def normalise(self, point):
+        """The same numbers, angles wrapped."""
+        return self._apart(lambda angle: (wrap_angles(angle),), _same, point)[0]
+
+    exp = log = normalise
+
+    def plus(self, point, tangent):
+        """The sum, angles wrapped."""
+        self.check(point=point, tangent=tangent)
+        return self.normalise(point + tangent)
+
+    def minus(self, point, origin):
+        """The difference, angles wrapped."""
+        self.check(point=point, origin=origin)
+        return self.normalise(point - origin)
+
+    def mean(self, points, weights=None):
+        """The mean; of angles that of the deviations from the direction of their sum as unit vectors."""
+
+        def of_circles(values: Tensor) -> tuple[Tensor]:
+            center = _direction(values, weights)
+            return (wrap_angles(center + _mean(wrap_angles(values - center), weights)),)
+
+        return self._apart(of_circles, lambda values: (_mean(values, weights),), points)[0].squeeze(-2)
+
+    near = mean
+
+    def innovation(self, reading, expected, observed=None):
+        """The difference, angles wrapped; NaN where the reading is."""
+        return self.minus(reading, expected)
+
+    def align(self, predicted, reading, observed=None):
+        """Brings angles to the same turn; plain numbers stay as they are.
+
+        Predictions go within half a turn of their circular mean, the reading's samples within half a turn of their own,
+        and that within half a turn of the predictions'. See :meth:`Space.align`.
+
+        Example:
+            >>> predicted, reading = Circle().align(torch.tensor([[3.1], [-3.1]]), torch.tensor([-3.0]))
+            >>> predicted.mean().round(decimals=2).abs(), (reading - predicted.mean()).round(decimals=2)
+            (tensor(3.1400), tensor([0.1400]))
+        """
+        self.check(predicted=predicted, reading=reading)
+        if not self.circular:
+            return predicted, reading
+        samples = reading if reading.ndim == predicted.ndim else reading.unsqueeze(-2)
+        if observed is not None:
+            samples = torch.where(observed.unsqueeze(-2), samples, 0)
+
+        def of_circles(predicted: Tensor, samples: Tensor) -> tuple[Tensor, Tensor]:
+            center, own = _direction(predicted), _direction(samples)
+            samples = center + wrap_angles(own - center) + wrap_angles(samples - own)
+            return center + wrap_angles(predicted - center), samples
+
+        predicted, samples = self._apart(of_circles, _same, predicted, samples)
+        return predicted, samples if reading.ndim == predicted.ndim else samples.squeeze(-2)
+
+    def _apart(self, of_circles: _Parts, of_lines: _Parts, *values: Tensor) -> tuple[Tensor, ...]:
+        """Maps the angles among values ``[*, N]`` by one function, and the other numbers by another."""
+        if not self.circular:
+            return of_lines(*values)
+        if len(self.circular) == self.size:
+            return of_circles(*values)
+        if len(self._runs) > _RUNS:
+            turns = torch.tensor([index in self.circular for index in range(self.size)], device=values[0].device)
+            both = zip(of_circles(*values), of_lines(*values), strict=True)
+            return tuple(torch.where(turns, circles, lines) for circles, lines in both)
+        runs = zip(*(value.split([count for _, count in self._runs], -1) for value in values), strict=True)
+        parts = [(of_circles if turns else of_lines)(*own) for (turns, _), own in zip(self._runs, runs, strict=True)]
+        return tuple(torch.cat(own, -1) for own in zip(*parts, strict=True))
+
+    def _whole(self, known):
+        return known, known
+
+
+class Euclidean(Flat):
+    """N plain numbers.
+
+    Args:
+        size: N.
+
+    Example:
+        >>> Euclidean(2).plus(torch.tensor([1.0, 2.0]), torch.tensor([0.5, 0.0]))
+        tensor([1.5000, 2.0000])
+    """
+
+    def __init__(self, size: int):
+        super().__init__(size)
+
+    def __repr__(self):
+        return f"Euclidean(size={self.size})"
+
+
+class Circle(Flat):
+    """An angle in rad, in [-pi, pi).
+
+    Example:
+        >>> Circle().minus(torch.tensor([3.0]), torch.tensor([-3.0]))
+        tensor([-0.2832])
+    """
+
+    def __init__(self):
+        super().__init__(1, [0])
+
+    def __repr__(self):
+        return "Circle()"
+
+
+def _same(*values: Tensor) -> tuple[Tensor, ...]:
+    return values
+
+
+def _mean(values: Tensor, weights: Tensor | None) -> Tensor:
+    """The mean ``[*B, 1, N]`` of values ``[*B, E, N]``."""
+    return values.mean(-2, keepdim=True) if weights is None else (weights.unsqueeze(-1) * values).sum(-2, keepdim=True)
+
+
+def _direction(turns: Tensor, weights: Tensor | None = None) -> Tensor:
+    """The direction of the sum of unit vectors, ``[*B, 1, N]``; a constant to the gradient: it only picks the turn."""
+    turns = turns.detach()
+    return torch.atan2(_mean(turns.sin(), weights), _mean(turns.cos(), weights))

@@ -1,0 +1,67 @@
+"""Quaternions, w first, and rotation matrices."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["quaternion_of", "quaternion_product", "rotate", "rotation_matrix", "skew"]
+
+
+def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
+    """The rotation ``second``, then ``first``: both quaternions ``[*, 4]``, w first."""
+    a, b = first[..., :1], first[..., 1:]
+    c, d = second[..., :1], second[..., 1:]
+    w = a * c - (b * d).sum(-1, keepdim=True)
+    return torch.cat([w, a * d + c * b + torch.linalg.cross(*torch.broadcast_tensors(b, d))], -1)
+
+
+def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
+    """A vector ``[*, 3]`` in the body's axes, turned into the world's by a quaternion ``[*, 4]``."""
+    w, axis = quaternion[..., :1], quaternion[..., 1:]
+    axis, vector = torch.broadcast_tensors(axis, vector)
+    twice = 2 * torch.linalg.cross(axis, vector)
+    return vector + w * twice + torch.linalg.cross(axis, twice)
+
+
+def rotation_matrix(quaternion: Tensor) -> Tensor:
+    """The matrix ``[*, 3, 3]`` of a quaternion ``[*, 4]``: its columns are the body's axes in the world's."""
+    return torch.stack([rotate(quaternion, axis) for axis in torch.eye(3).to(quaternion)], -1)
+
+
+def quaternion_of(matrix: Tensor) -> Tensor:
+    """A quaternion ``[*, 4]`` of a rotation matrix ``[*, 3, 3]``, by the largest of its four numbers."""
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
+    candidates = [
+        torch.stack([1 + a + e + i, h - f, c - g, d - b], -1),
+        torch.stack([h - f, 1 + a - e - i, b + d, c + g], -1),
+        torch.stack([c - g, b + d, 1 - a + e - i, f + h], -1),
+        torch.stack([d - b, c + g, f + h, 1 - a - e + i], -1),
+    ]
+    table = torch.stack(candidates, -2)  # each row is 4 q_k q
+    best = table.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    row = table.gather(-2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2)
+    return unit(row)
+
+
+def skew(vector: Tensor) -> Tensor:
+    """The matrix ``[*, 3, 3]`` whose product with another vector is the cross product with it."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def products(point: Tensor) -> Tensor:
+    """The products of a point's quaternion with i, j and k, ``[*, 4, 3]``."""
+    w, x, y, z = point[..., :4].unbind(-1)
+    rows = [[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def conjugate(quaternion: Tensor) -> Tensor:
+    return torch.cat([quaternion[..., :1], -quaternion[..., 1:]], -1)
+
+
+def unit(quaternion: Tensor) -> Tensor:
+    return quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)

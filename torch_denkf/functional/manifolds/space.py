@@ -1,0 +1,226 @@
+"""The base of all spaces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch_denkf.functional.manifolds.flat import Flat
+    from torch_denkf.functional.manifolds.products import Product
+
+__all__ = ["Space", "check_space", "is_flat"]
+
+_MEAN_STEPS = 3  # of Gauss-Newton, each of which takes at least the square of the spread off the error
+
+
+class Space:
+    """A space of points; the base of all.
+
+    All spaces here are Lie groups. A subclass writes :meth:`compose`, :meth:`inverse`, :meth:`exp`, :meth:`log`,
+    :meth:`right_jacobian`, :meth:`adjoint`, :meth:`basis`, :meth:`dual_basis` and :meth:`neutral`. Two spaces of one
+    kind are equal.
+
+    Attributes:
+        point_dim: numbers of a point, P.
+        tangent_dim: numbers of a tangent, D.
+    """
+
+    point_dim: int
+    tangent_dim: int
+    _angles = 0  # leading numbers of a tangent that are a rotation
+
+    @property
+    def flat(self) -> Flat | None:
+        """The same space as lines and circles in closed form; ``None`` for a space that holds anything else."""
+        return None
+
+    def __mul__(self, other: Space) -> Product:
+        """The product of both, with the points of ``other`` behind."""
+        from torch_denkf.functional.manifolds.products import Product
+
+        if not isinstance(other, Space):
+            return NotImplemented
+        return Product(*(part for one in (self, other) for part in (one.parts if isinstance(one, Product) else [one])))
+
+    def compose(self, first: Tensor, second: Tensor) -> Tensor:
+        """The product of two points ``[*, P]``."""
+        raise NotImplementedError
+
+    def inverse(self, point: Tensor) -> Tensor:
+        """What takes a point ``[*, P]`` back to the neutral one."""
+        raise NotImplementedError
+
+    def exp(self, tangent: Tensor) -> Tensor:
+        """Where a tangent ``[*, D]`` leads from the neutral point, ``[*, P]``."""
+        raise NotImplementedError
+
+    def log(self, point: Tensor) -> Tensor:
+        """The shortest tangent ``[*, D]`` that leads from the neutral point to a point ``[*, P]``."""
+        raise NotImplementedError
+
+    def right_jacobian(self, tangent: Tensor) -> Tensor:
+        r"""J with :math:`\exp(d + \delta) \approx \exp(d) \exp(J \delta)`: ``[*, D, D]`` of ``[*, D]``."""
+        raise NotImplementedError
+
+    def adjoint(self, point: Tensor) -> Tensor:
+        r"""A with :math:`x \exp(d) x^{-1} = \exp(A d)`: ``[*, D, D]`` of ``[*, P]``."""
+        raise NotImplementedError
+
+    def basis(self, point: Tensor) -> Tensor:
+        r"""B with :math:`x \oplus d \approx x + B d` for a small d: ``[*, P, D]`` of ``[*, P]``."""
+        raise NotImplementedError
+
+    def dual_basis(self, point: Tensor) -> Tensor:
+        r"""B with :math:`(x + e) \ominus x \approx B e` for a small e: ``[*, D, P]`` of ``[*, P]``."""
+        raise NotImplementedError
+
+    def neutral(self, like: Tensor | None = None) -> Tensor:
+        """The neutral point ``[P]``, of the precision and on the device of ``like``."""
+        raise NotImplementedError
+
+    def normalise(self, point: Tensor) -> Tensor:
+        """The nearest point to numbers ``[*, P]`` that are one but for rounding, or that a network gave."""
+        return point
+
+    def plus(self, point: Tensor, tangent: Tensor) -> Tensor:
+        """The point ``[*, P]`` that a tangent ``[*, D]`` leads to."""
+        self.check(point=point)
+        self.check(tangent=tangent)
+        return self.compose(point, self.exp(tangent))
+
+    def minus(self, point: Tensor, origin: Tensor) -> Tensor:
+        """The shortest tangent ``[*, D]`` from ``origin`` to ``point``, both ``[*, P]``."""
+        self.check(point=point)
+        self.check(origin=origin)
+        return self.log(self.compose(self.inverse(origin), point))
+
+    def distance(self, point: Tensor, other: Tensor) -> Tensor:
+        """The length ``[*]`` of the tangent between two points; of two rotations the angle between them, in rad."""
+        return torch.linalg.vector_norm(self.minus(point, other), dim=-1)
+
+    def mean(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
+        """The point ``[*B, P]`` around which the tangents to points ``[*B, E, P]`` add up to zero.
+
+        A few Gauss-Newton steps. It is unique where the points lie within a quarter turn of one of them.
+
+        Args:
+            points: ``[*B, E, P]``.
+            weights: ``[*B, E]``, which add up to one; ``None`` for equal ones.
+        """
+        center = self.near(points, weights).unsqueeze(-2)
+        for _ in range(_MEAN_STEPS):
+            away = self.minus(points, center)
+            step = away.mean(-2) if weights is None else (weights.unsqueeze(-1) * away).sum(-2)
+            center = self.plus(center, step.unsqueeze(-2))
+        return center.squeeze(-2)
+
+    def near(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
+        """A point ``[*B, P]`` near the mean, where any will do for tangents: the mean of the numbers."""
+        return self.normalise(self._between(points, weights)).squeeze(-2)
+
+    def _between(self, points: Tensor, weights: Tensor | None) -> Tensor:
+        """A point ``[*B, 1, P]`` near the mean: the mean of the numbers, counted from the first point."""
+        away = points - points[..., :1, :]
+        away = away.mean(-2, keepdim=True) if weights is None else (weights.unsqueeze(-1) * away).sum(-2, keepdim=True)
+        return points[..., :1, :] + away
+
+    def innovation(self, reading: Tensor, expected: Tensor, observed: Tensor | None = None) -> Tensor:
+        """The shortest tangent ``[*, D]`` from an expected reading to the one that came, both ``[*, P]``.
+
+        Behind a mask ``[*, 1]`` or ``[*, D]`` a reading may be NaN: what is expected stands in its place there.
+        """
+        if observed is not None:
+            reading = torch.where(observed.all(-1, keepdim=True) | reading.isfinite(), reading, expected)
+        return self.minus(*torch.broadcast_tensors(reading, expected))
+
+    def align(self, predicted: Tensor, reading: Tensor, observed: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Maps predictions and a reading to plain numbers, which can be averaged and subtracted.
+
+        They are tangents at a point near the predictions' mean.
+
+        Args:
+            predicted: points that the members predict, ``[*B, E, P]``.
+            reading: a point ``[*B, P]``, or samples ``[*B, E, P]``.
+            observed: mask ``[*B, 1]`` or ``[*B, D]``; what it hides may be NaN.
+
+        Returns:
+            Numbers ``[*B, E, D]``, and ``[*B, D]`` or ``[*B, E, D]``.
+        """
+        center = self.near(predicted)
+        expected = center.unsqueeze(-2)
+        if reading.ndim < predicted.ndim:
+            return self.minus(predicted, expected), self.innovation(reading, center, observed)
+        mask = None if observed is None else observed.unsqueeze(-2)
+        return self.minus(predicted, expected), self.innovation(reading, expected, mask)
+
+    def _whole(self, known: Tensor) -> tuple[Tensor, Tensor]:
+        """What :func:`whole_parts` says of a space that is no product."""
+        known = known.all(-1, keepdim=True)
+        return known.expand(*known.shape[:-1], self.point_dim), known.expand(*known.shape[:-1], self.tangent_dim)
+
+    def perturb(self, point: Tensor, std: Tensor, noise: Tensor) -> Tensor:
+        """A random point ``[*, P]``: standard normal ``noise`` ``[*, D]`` times standard deviations ``[*, D]`` away."""
+        return self.plus(point, std * noise)
+
+    def check(self, **values: Tensor) -> None:
+        """Raises unless the last dimension of each value, ``tangent`` or any point, has the right size.
+
+        Raises:
+            ValueError: if it has not; names the value.
+        """
+        for name, value in values.items():
+            due = self.tangent_dim if name == "tangent" else self.point_dim
+            if value.shape[-1:] != (due,):
+                kind = "tangent" if name == "tangent" else "point"
+                raise ValueError(f"{name} has shape {list(value.shape)}; a {kind} of {self} is [*, {due}].")
+
+
+def check_space(name: str, space: Space | None, *, flat: bool = False) -> Space | None:
+    """Returns the space, one of lines and circles in closed form.
+
+    Args:
+        name: its own, for the message.
+        space: a space; ``None`` for plain numbers.
+        flat: whether it must be one of lines and circles.
+
+    Raises:
+        TypeError: for what is no space.
+        ValueError: for another space than one of lines and circles, where it must be one.
+
+    Example:
+        >>> from torch_denkf.functional.manifolds import Circle, Euclidean
+        >>> check_space("space", Euclidean(2) * Circle())
+        Flat(size=3, circular=(2,))
+    """
+    if space is None:
+        return None
+    if not isinstance(space, Space):
+        raise TypeError(f"{name} is a Space, such as SO3() or Product(SE2(), Euclidean(2)); got {space!r}"[:200])
+    if flat and space.flat is None:
+        raise ValueError(f"{name} is one of numbers and angles here, such as Euclidean(2) * Circle(); got {space}.")
+    return space.flat or space
+
+
+def is_flat(*spaces: Space | None) -> bool:
+    """Returns whether the formulas of plain numbers hold: all are plain numbers, or lines and circles."""
+    return all(space is None or space.flat is not None for space in spaces)
+
+
+def eye(like: Tensor, size: int) -> Tensor:
+    """Returns the identity ``[*, size, size]`` for points ``[*, N]``."""
+    return torch.eye(size, dtype=like.dtype, device=like.device).expand(*like.shape[:-1], size, size)
+
+
+def blocks(parts: Sequence[Tensor]) -> Tensor:
+    """Matrices on the diagonal of one."""
+    sizes = [part.shape[-1] for part in parts]
+    rows = []
+    for place, part in enumerate(parts):
+        batch = part.shape[:-1]
+        before, after = part.new_zeros(*batch, sum(sizes[:place])), part.new_zeros(*batch, sum(sizes[place + 1 :]))
+        rows.append(torch.cat([before, part, after], -1))
+    return torch.cat(rows, -2)
