@@ -507,7 +507,11 @@ class Filter(Checked, TensorDictSequential):
         entries = {key: value for key, value in entries.items() if key not in without}
         if self.update_at_reset or not set(structure.frame_keys).isdisjoint(chain(*reads(self.initial))):
             written = steps.run(structure.frames, entries, call, bool(without))
-        start = self.initial_belief(entries, call)
+        hidden, mask = dict(entries), role(self.initial, Initial).observed_key
+        if without and mask is not None and not entries.keys() >= {*reads(self.initial)[0]}:
+            hidden = {**self._nothing(call.batch_size), **entries}
+            hidden[mask] = torch.zeros(*call.batch_size, 1, dtype=torch.bool, device=tensordict.device)
+        start = self.initial_belief(hidden, call)
         if self.update_at_reset:
             written.update(steps.begin(entries, call, start, bool(without)))
         else:
