@@ -145,7 +145,7 @@ class Filter(Checked, TensorDictSequential):
         check_module("initial", initial)
         super().__init__(*modules)
         self.initial = initial
-        self.init_key, self.control_keys = init_key, list(control_keys)
+        self.init_key, self.control_keys = unravel_key(init_key), list(control_keys)
         self.forecast_keys, self.check_finite = dict(forecast_keys or {}), check_finite
         self.fixed_options: dict[str, Any] = {
             "update_at_reset": update_at_reset,
