@@ -309,7 +309,7 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
 
     Gradients reach the threshold, which may be trained, and not the anomalies: for them the factor is a constant, as a
     taper is. Near the threshold its slope is steepest, and correlations are of chance: the training of a filter of 64
-    members through it diverged (``benchmarks/ur5``). So of several readings the threshold's gradient leaves out how
+    members of a robot arm through it diverged. So of several readings the threshold's gradient leaves out how
     the first ones change the correlations that the later ones see.
 
     Args:

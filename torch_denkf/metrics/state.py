@@ -41,7 +41,7 @@ def state_difference(estimated: Tensor, truth: Tensor, *, space: Space | None = 
     Args:
         estimated: states, ``[*B, S]``.
         truth: the true states, of the same shape.
-        space: whose points the states are, such as ``Flat(5, circular=[2])`` of KITTI's (x, y, θ, v, θ_dot); ``None``
+        space: whose points the states are, such as ``Flat(5, circular=[2])`` of (x, y, θ, v, θ_dot); ``None``
             for plain numbers. Turn rates are no angles.
 
     Returns:

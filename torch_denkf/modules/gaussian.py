@@ -44,7 +44,7 @@ class GaussianTransition(Transition):
     """Forecasts mean and covariance through a transition of ensembles; a subclass writes :meth:`_forecast`.
 
     Args:
-        transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.applications.car.UnicycleTransition`.
+        transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.modules.LearnedTransition`.
         process_noise: writes Q, variances ``[*B, S]`` or a covariance ``[*B, S, S]``, see
             :mod:`torch_denkf.modules.process_noise`; it may read the belief's mean and the forecast's.
         **keys: see :class:`GaussianTransitionKeys`.

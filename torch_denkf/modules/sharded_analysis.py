@@ -24,8 +24,7 @@ class ShardedEnsembleAnalysis(EnsembleAnalysis):
 
     Results are those of one process that holds the whole state, up to rounding. An analysis of 32 members and 10⁷
     components, of which a tenth is observed, takes two processes of one machine 2.0 s and 2.6 GB each. One process
-    takes 2.2 s and 4.8 GB (``python -m torch.distributed.run --nproc_per_node=2 -m benchmarks.speed.sharded``, four
-    shared cores).
+    takes 2.2 s and 4.8 GB (four shared cores; ``python -m torch.distributed.run --nproc_per_node=2`` starts two).
 
     Args:
         scheme: ``"sensor"``, ``"etkf"`` or ``"sakov"``, as in :class:`EnsembleAnalysis`.
