@@ -14,6 +14,8 @@ from torch_denkf.diagnosis.composition import check_composition as check_composi
 from torch_denkf.diagnosis.masks import UnreadMasks
 from torch_denkf.diagnosis.policy import PolicyStart
 from torch_denkf.diagnosis.shapes import ReadingRanks
+from torch_denkf.diagnosis.slices import UnmarkedSlices
+from torch_denkf.diagnosis.slices import check_slices as check_slices
 
 __all__ = [
     "check_analysis",
@@ -22,4 +24,4 @@ __all__ = [
 
 def default_observers() -> list[Any]:
     """Returns the observers that a new filter has."""
-    return [ReadingRanks(), UnreadMasks(), CeilingReached(), NarrowEnsemble(), PolicyStart()]
+    return [UnmarkedSlices(), ReadingRanks(), UnreadMasks(), CeilingReached(), NarrowEnsemble(), PolicyStart()]

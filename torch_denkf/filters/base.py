@@ -404,7 +404,7 @@ class Filter(Checked, TensorDictSequential):
             entries.update({key: where_rows(reset, written[key], entries[key]) for key in structure.carry})
         following = {("next", *previous_key(key)): written[key] for key in structure.carry}
         following["next", *KNOWN] = torch.ones(*size, 1, dtype=torch.bool, device=written[structure.carry[0]].device)
-        record = Record("policy", tensordict, entries, {**written, **following})
+        record = Record("policy", tensordict, size, entries, {**written, **following})
         return self.write(tensordict, self.finished(record, given))
 
     def step(
@@ -441,7 +441,7 @@ class Filter(Checked, TensorDictSequential):
             written = self.steps.step(entries, Call(size), partial=True)
         else:
             written = (self.steps if self.compiled is None else self.compiled.of(self)).step(entries, Call(size))
-        return self.write(tensordict, self.finished(Record("step", tensordict, entries, written)))
+        return self.write(tensordict, self.finished(Record("step", tensordict, size, entries, written)))
 
     def predict(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
         """A step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does.
@@ -567,16 +567,16 @@ class Filter(Checked, TensorDictSequential):
         unknown = [key for key in kept if key not in inner.values()]
         if unknown:
             raise ValueError(f"keep names {unknown}; the filter writes {list(inner)}.")
-        rows, marks = as_rows(tensordict, starts_of(tensordict, self.init_key))
-        outputs = self._scan(rows, marks, detach_every, kept)
+        outputs, rows = self._scan(tensordict, detach_every, kept)
         if rows is not tensordict:
             outputs = {key: value.flatten(0, 1) for key, value in outputs.items()}
         return self.write(tensordict, {key: outputs[key] for key in kept})
 
     def _scan(
-        self, rows: TensorDictBase, marks: Tensor | None, detach_every: int | None, keep: Sequence[NestedKey]
-    ) -> Entries:
-        """Returns the outputs ``keep`` of sequences ``[*B, T]`` that begin at ``marks``, and at their first element."""
+        self, tensordict: TensorDictBase, detach_every: int | None, keep: Sequence[NestedKey]
+    ) -> tuple[Entries, TensorDictBase]:
+        """Returns the outputs ``keep`` of sequences ``[*B, T]``, and the tensordict with slices in rows."""
+        rows, marks = as_rows(tensordict, starts_of(tensordict, self.init_key))
         structure, steps, size = self.structure, self.steps, rows.batch_size
         entries, call = self.entries_of(rows), Call(size, time=True)
         given = list(entries.values())
@@ -602,7 +602,7 @@ class Filter(Checked, TensorDictSequential):
             )[1]
         steps.blank(outputs, gathered.fresh)
         outputs.update({key: frames[key] for key in keep if key in frames})
-        return self.finished(Record("sequence", rows, entries, outputs), given)
+        return self.finished(Record("sequence", tensordict, size, entries, outputs), given), rows
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:
         """``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
