@@ -123,7 +123,7 @@ class SubModel(Checked, TensorDictModule):
     __getattr__ = nn.Module.__getattr__
 
     def compute(self, *values: Any, **_: Any) -> Tensor | tuple[Tensor, ...]:
-        """What the sub-model writes: one tensor for each of ``out_keys``, or a tensor alone if that is one.
+        """Computes one tensor for each of ``out_keys``, or a tensor alone if that is one.
 
         Args:
             *values: the entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
@@ -172,11 +172,11 @@ class SubModel(Checked, TensorDictModule):
 
     @property
     def draws(self) -> bool:
-        """Whether :meth:`compute` asks for noise."""
+        """Tells whether :meth:`compute` asks for noise."""
         return "noise" in self._wants
 
     def on_entries(self, entries: Entries, call: Call) -> Entries:
-        """What the sub-model writes where ``entries`` are; changes nothing.
+        """Returns what the sub-model writes on entries; changes nothing.
 
         Raises:
             KeyError: if an entry is missing.
@@ -207,7 +207,7 @@ class SubModel(Checked, TensorDictModule):
         return [*(self.required(entries, key) for key in self.in_keys), *map(entries.get, self.optional_keys)]
 
     def by_key(self, out: Tensor | Sequence[Tensor] | None) -> Entries:
-        """What :meth:`compute` returned, under :attr:`out_keys`.
+        """Returns the results of :meth:`compute` under :attr:`out_keys`.
 
         Raises:
             ValueError: if it is not one tensor for each of them.
@@ -267,7 +267,7 @@ class SubModel(Checked, TensorDictModule):
         return type(error)(f"{error} {self._what_there_was(entries)}")
 
     def _what_there_was(self, entries: Entries) -> str:
-        """What was read, and constants, with their shapes: for the message of an error."""
+        """Describes what was read, and constants, with their shapes, for the message of an error."""
         values = {key: entries.get(key) for key in (*self.in_keys, *self.optional_keys)}
         read = [_shown(key, value) for key, value in values.items() if isinstance(value, Tensor)]
         named = (*self.named_buffers(recurse=False), *self.named_parameters(recurse=False))
@@ -453,7 +453,7 @@ class Update(SubModel):
 
     @property
     def updates_ensemble(self) -> bool:
-        """Whether it reads an ensemble, what its members predict of a reading, the reading, and its noise; and a mask.
+        """Tells whether it reads an ensemble, its predicted observations, the reading, its noise, and a mask.
 
         Such an analysis can be given a past to correct (:meth:`move_past`).
         """

@@ -22,7 +22,7 @@ __all__ = ["StateErrors", "known_tangents", "mean_of_known", "rotation_error", "
 
 
 class StateErrors(NamedTuple):
-    """What :func:`state_errors` returns.
+    """Holds the results of :func:`state_errors`.
 
     Attributes:
         rmse: root of the mean squared error, ``[S]``, in each dimension's units.
@@ -130,7 +130,7 @@ def rotation_error(estimated: Tensor, truth: Tensor, *, space: Space) -> Tensor:
 
 
 def known_tangents(truth: Tensor, space: Space | None) -> Tensor:
-    """What is NaN where no error is known: the truth ``[*B, S]``, of points of a space zeros and NaN, ``[*B, D]``."""
+    """Marks unknown errors by NaN: the truth ``[*B, S]``, of points of a space zeros and NaN, ``[*B, D]``."""
     if space is None:
         return truth
     known = whole_parts(space, ~truth.isnan())[1]

@@ -99,7 +99,7 @@ class ContinuousNoise(SubModel):
 
 
 class NoisePerSecond(SubModel):
-    r"""What another process noise writes, taken as variance per second: times the seconds since the last step.
+    r"""Multiplies the variances of another process noise, which are per second, by the seconds since the last step.
 
     It is the noise of a random walk, for motions that read their own ``dt``. Put it inside of a module that maps the
     noise of velocities to that of the state.

@@ -109,7 +109,7 @@ class EKFAnalysis(GaussianAnalysis):
 
 
 def _needed(module, entries: Entries) -> Entries:
-    """What the model inside reads, and the mask."""
+    """Lists the keys that the model inside reads, and the mask."""
     needed, optional = reads(module.module)
     keys = dict.fromkeys([*needed, *optional, role(module, Update).observed_key])
     return {key: entries[key] for key in keys if key in entries}

@@ -123,7 +123,7 @@ class NoisyTransition(Transition):
         return written
 
     def _mean(self, members: torch.Tensor, log_weights: torch.Tensor | None) -> torch.Tensor:
-        """What the noise model may read; on a space, one that reads the state's width alone gets any member."""
+        """Returns the mean for the noise model; on a space, one that reads the state's width alone gets any member."""
         if self.space is not None:
             if isinstance(self.module["noise"], ConstantNoise):
                 return members[..., 0, :]

@@ -69,12 +69,12 @@ class ShardedEnsembleAnalysis(EnsembleAnalysis):
         self.group = group
 
     def _any(self, observed):
-        """Where any process observes anything, ``[*B]``."""
+        """Marks rows in which any process observes anything, ``[*B]``."""
         seen = observed.any(-1).byte()
         if dist.is_initialized():
             dist.all_reduce(seen, dist.ReduceOp.MAX, group=self.group)
         return seen.bool()
 
     def _options(self, noise, taper):
-        """Of :func:`analyse_sharded`; there is neither noise nor taper."""
+        """Returns the options of :func:`analyse_sharded`; there is neither noise nor taper."""
         return {"scheme": self.scheme, "group": self.group}
