@@ -11,6 +11,7 @@ from torch_denkf.diagnosis.ceiling import CeilingReached
 from torch_denkf.diagnosis.check import check_analysis
 from torch_denkf.diagnosis.collapse import NarrowEnsemble
 from torch_denkf.diagnosis.composition import check_composition as check_composition
+from torch_denkf.diagnosis.errors import explained as explained
 from torch_denkf.diagnosis.masks import UnreadMasks
 from torch_denkf.diagnosis.policy import PolicyStart
 from torch_denkf.diagnosis.shapes import ReadingRanks

@@ -148,7 +148,7 @@ class Filter(Checked, TensorDictSequential):
         self.init_key = unravel_key(init_key)
         self.control_keys = [unravel_key(key) for key in control_keys]
         self.forecast_keys, self.check_finite = dict(forecast_keys or {}), check_finite
-        self._options: dict[str, Any] = {
+        self.fixed_options: dict[str, Any] = {
             "update_at_reset": update_at_reset,
             "variance_ceiling": variance_ceiling,
             "prefix": prefix,
@@ -186,17 +186,17 @@ class Filter(Checked, TensorDictSequential):
     @property
     def update_at_reset(self) -> bool:
         """Tells whether the initial belief is updated with the first frame."""
-        return self._options["update_at_reset"]
+        return self.fixed_options["update_at_reset"]
 
     @property
     def variance_ceiling(self) -> float | None:
         """Ceiling of the belief's variances."""
-        return self._options["variance_ceiling"]
+        return self.fixed_options["variance_ceiling"]
 
     @property
     def prefix(self) -> str | None:
         """Name under which the filter's own entries stand."""
-        return self._options["prefix"]
+        return self.fixed_options["prefix"]
 
     def with_options(self, **options: Unpack[FilterOptions]) -> Filter:
         """Returns a filter of the same modules with other options, see the class.
@@ -209,10 +209,10 @@ class Filter(Checked, TensorDictSequential):
             [('imu', 'belief', 'mean'), ('imu', 'belief', 'cov')]
         """
         new = _shallow(self)
-        new._options = {**self._options}
+        new.fixed_options = {**self.fixed_options}
         for name, value in options.items():
-            if name in new._options:
-                new._options[name] = value
+            if name in new.fixed_options:
+                new.fixed_options[name] = value
             else:
                 setattr(new, name, value)
         return new._renewed(self)
@@ -507,7 +507,11 @@ class Filter(Checked, TensorDictSequential):
         entries = {key: value for key, value in entries.items() if key not in without}
         if self.update_at_reset or not set(structure.frame_keys).isdisjoint(chain(*reads(self.initial))):
             written = steps.run(structure.frames, entries, call, bool(without))
-        start = self.initial_belief(entries, call)
+        hidden, mask = dict(entries), role(self.initial, Initial).observed_key
+        if without and mask is not None and not entries.keys() >= {*reads(self.initial)[0]}:
+            hidden = {**self._nothing(call.batch_size), **entries}
+            hidden[mask] = torch.zeros(*call.batch_size, 1, dtype=torch.bool, device=tensordict.device)
+        start = self.initial_belief(hidden, call)
         if self.update_at_reset:
             written.update(steps.begin(entries, call, start, bool(without)))
         else:
@@ -650,7 +654,7 @@ class Filter(Checked, TensorDictSequential):
         """Sets entries, under their names outside of the filter; looks each nested tensordict up once."""
         owners: dict[tuple, Any] = {}
         for key, value in written.items():
-            if self._options["prefix"] is not None:
+            if self.fixed_options["prefix"] is not None:
                 key = self.outer(key)
             prefix = () if isinstance(key, str) else key[:-1]
             owner = tensordict if not prefix else owners.get(prefix)
