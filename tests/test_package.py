@@ -1,7 +1,9 @@
 """The package as a user gets it: what a wheel holds, and what an import costs."""
 
+import ast
 import json
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -84,6 +86,47 @@ def test_modules_is_a_relative_link():
     assert (link / "stochastic.py").samefile(ROOT / "torch_denkf" / "modules" / "stochastic.py")
 
 
+#: The rooms that every user needs; with them go the files at the package's top, but for the one that looks robots up.
+CORE = ("functional", "metrics", "modules", "filters", "smoothers", "transforms", "objectives")
+ROBOTS = {
+    name
+    for robot in ("car", "legged", "reacher", "ur5")
+    for name in import_module(f"torch_denkf.applications.{robot}").__all__
+    if name[0].isupper()
+}
+
+
+def docstrings(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+            yield ast.get_docstring(node) or ""
+
+
+def test_no_docstring_of_the_core_names_an_application():
+    package = ROOT / "torch_denkf"
+    assert {"UnicycleTransition", "FlowSensor"} <= ROBOTS
+    core = [path for room in CORE for path in (package / room).rglob("*.py")]
+    core += [path for path in package.glob("*.py") if path.name != "_registered.py"]
+    found = {
+        (str(path.relative_to(package)), word)
+        for path in core
+        for text in docstrings(path)
+        for word in re.findall(r"\w+", text)
+        if word == "applications" or word in ROBOTS
+    }
+    assert not found
+
+
+def test_no_docstring_names_a_study():
+    found = {
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "torch_denkf").rglob("*.py")
+        for text in docstrings(path)
+        if re.search(r"\bbenchmarks[/.]", text)
+    }
+    assert not found
+
+
 IMPORTS = """
 import json, sys
 
@@ -137,6 +180,9 @@ def test_every_public_name_is_there():
         "motions",
         "training",
         "deployment",
+        "imperfect",
+        "diagnosis",
+        "baselines",
         "applications.car",
         "applications.ur5",
         "applications.reacher",

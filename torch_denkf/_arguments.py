@@ -94,7 +94,7 @@ def _signature(owner: type) -> tuple[inspect.Signature, dict[str, str], bool]:
 
 
 def _of_bases(owner: type) -> dict[str, str]:
-    """What the next class takes, to which ``**kwargs`` are handed on, by name."""
+    """Returns the arguments of the next class, to which ``**kwargs`` are handed on, by name."""
     for base in owner.__mro__[1:]:
         if "__init__" in base.__dict__ and Checked in base.__mro__:
             signature, options, _ = _signature(base)

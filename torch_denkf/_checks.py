@@ -302,7 +302,7 @@ def check_covariance(name: str, cov: Tensor, size: int | None = None, layout: st
 
 
 def has_values(tensor: Tensor) -> bool:
-    """Whether a tensor's values can be looked at: not on "meta", of a fake tensor, under vmap, or in a traced graph.
+    """Tells whether a tensor's values can be read: not on "meta", of a fake tensor, under vmap, or in a traced graph.
 
     Example:
         >>> has_values(torch.ones(2)), has_values(torch.ones(2, device="meta"))
@@ -327,7 +327,7 @@ def flag_value(flag: Tensor) -> bool | None:
 
 
 def _has_values(tensor: Tensor) -> bool:
-    """Likewise, of a constant; one of another class of tensors may know more than to be read."""
+    """Tells whether a constant's values can be read; another class of tensors may forbid it."""
     return type(tensor) in (Tensor, torch.nn.Parameter) and has_values(tensor)
 
 

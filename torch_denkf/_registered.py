@@ -1,4 +1,4 @@
-"""What outer rings register with inner ones, which import nothing of theirs: here it is looked up by name.
+"""Look-up by name of what outer rings register with inner ones, which import nothing of theirs.
 
 A folder of ``torch_denkf.applications`` has a file ``registered.py`` with ``BUILDERS`` and ``COMMANDS``, and weights in
 ``weights/NAME/``. Nothing else of the library knows an application. The kit's rooms that a filter uses by default
@@ -31,7 +31,7 @@ def builders() -> dict[str, Callable[..., Any]]:
 
 
 def commands() -> dict[str, tuple[str, str]]:
-    """Where the commands of the terminal are, and what they do, by name."""
+    """Maps the name of each command of the terminal to its place and its description."""
     return {name: command for each in _all() for name, command in each.COMMANDS.items()}
 
 

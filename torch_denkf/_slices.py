@@ -1,4 +1,4 @@
-"""Where sequences begin in data: marks of episodes and slices, and slices that lie end to end."""
+"""Beginnings of sequences in data: marks of episodes and slices, and slices that lie end to end."""
 
 from __future__ import annotations
 
@@ -73,5 +73,5 @@ def _marks(source: TensorDictBase, tensordict: TensorDictBase, *keys: NestedKey)
 
 
 def _any(mark: Tensor, ndim: int) -> Tensor:
-    """Whether any agent's mark is set, ``[*B, T, 1]``."""
+    """Tells whether any agent's mark is set, ``[*B, T, 1]``."""
     return mark.flatten(ndim).any(-1, keepdim=True) if mark.ndim > ndim else mark.unsqueeze(-1)

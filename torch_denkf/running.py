@@ -55,7 +55,7 @@ def check_network(name: str, network: Any) -> None:
 
 
 def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> Entries:
-    """What a module writes where ``entries`` are: a sub-model, a sequence of modules, or any TensorDict module.
+    """Runs a module on entries, and returns what it writes: a sub-model, a sequence, or any TensorDict module.
 
     Another TensorDict module gets a TensorDict of what it names among its keys, so it sees the same in a step as in a
     sequence. So does a sub-model with a ``forward`` of its own, or with forward hooks.
@@ -92,7 +92,7 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
 
 
 def run_modules(modules: Iterable[tuple[str, TensorDictModuleBase]], entries: Entries, call: Call) -> Entries:
-    """What named modules write, one after the other."""
+    """Runs named modules one after the other, and returns what they write."""
     entries, written = dict(entries), {}
     for name, module in modules:
         out = run_module(module, entries, call.part(name))
@@ -102,7 +102,7 @@ def run_modules(modules: Iterable[tuple[str, TensorDictModuleBase]], entries: En
 
 
 def is_sequence(module: Any) -> TypeGuard[TensorDictSequential]:
-    """Whether a module is a plain sequence of others, and not a filter, for example.
+    """Tells whether a module is a plain sequence of others, and not a filter, for example.
 
     Torch's tracer shows modules as objects of a class of its own, which inherits theirs: their type alone says nothing.
     """
@@ -115,7 +115,7 @@ def named_modules_of(sequence: TensorDictSequential) -> list[tuple[str, TensorDi
 
 
 def reads(module: TensorDictModuleBase) -> tuple[list[NestedKey], list[NestedKey]]:
-    """What a module must find, and what it uses where it is there."""
+    """Returns the keys that a module must find, and those that it uses where they are there."""
     if not is_sequence(module):
         may = [unravel_key(key) for key in getattr(module, "optional_keys", ())]
         must = [key for key in map(unravel_key, module.in_keys) if key not in may]
@@ -124,7 +124,7 @@ def reads(module: TensorDictModuleBase) -> tuple[list[NestedKey], list[NestedKey
 
 
 def reads_of(modules: Iterable[TensorDictModuleBase]) -> tuple[list[NestedKey], list[NestedKey]]:
-    """What modules must find that run one after the other, and what they use where it is there."""
+    """Returns the keys that modules, one after the other, must find, and those that they use where they are there."""
     needed: dict[NestedKey, None] = {}
     optional: dict[NestedKey, None] = {}
     made: set[NestedKey] = set()
@@ -137,7 +137,7 @@ def reads_of(modules: Iterable[TensorDictModuleBase]) -> tuple[list[NestedKey], 
 
 
 def writes(module: TensorDictModuleBase) -> list[NestedKey]:
-    """What a module writes; of a plain sequence what its modules write now, one of which may have been replaced."""
+    """Returns the keys that a module writes; of a plain sequence those that its modules write now."""
     return list(dict.fromkeys(unravel_key(key) for part in in_sequences(module) for key in part.out_keys))
 
 
@@ -151,7 +151,7 @@ def in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]
 
 
 def reading_of(sensor: TensorDictModuleBase) -> NestedKey:
-    """Where a sensor writes its reading: first what the last of its modules writes that makes one."""
+    """Returns the key of a sensor's reading: the first that the last of its modules writes that makes one."""
     *_, last = (part for part in in_sequences(sensor) if not role(part, Sensor).judges_reading)
     return writes(last)[0]
 

@@ -124,7 +124,7 @@ class SubModel(Checked, TensorDictModule):
     __getattr__ = nn.Module.__getattr__
 
     def compute(self, *values: Any, **_: Any) -> Tensor | tuple[Tensor, ...]:
-        """What the sub-model writes: one tensor for each of ``out_keys``, or a tensor alone if that is one.
+        """Computes one tensor for each of ``out_keys``, or a tensor alone if that is one.
 
         Args:
             *values: the entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
@@ -173,11 +173,11 @@ class SubModel(Checked, TensorDictModule):
 
     @property
     def draws(self) -> bool:
-        """Whether :meth:`compute` asks for noise."""
+        """Tells whether :meth:`compute` asks for noise."""
         return "noise" in self._wants
 
     def on_entries(self, entries: Entries, call: Call) -> Entries:
-        """What the sub-model writes where ``entries`` are; changes nothing.
+        """Returns what the sub-model writes on entries; changes nothing.
 
         Raises:
             KeyError: if an entry is missing.
@@ -208,7 +208,7 @@ class SubModel(Checked, TensorDictModule):
         return [*(self.required(entries, key) for key in self.in_keys), *map(entries.get, self.optional_keys)]
 
     def by_key(self, out: Tensor | Sequence[Tensor] | None) -> Entries:
-        """What :meth:`compute` returned, under :attr:`out_keys`.
+        """Returns the results of :meth:`compute` under :attr:`out_keys`.
 
         Raises:
             ValueError: if it is not one tensor for each of them.
@@ -416,7 +416,7 @@ class Update(SubModel):
 
     @property
     def updates_ensemble(self) -> bool:
-        """Whether it reads an ensemble, what its members predict of a reading, the reading, and its noise; and a mask.
+        """Tells whether it reads an ensemble, its predicted observations, the reading, its noise, and a mask.
 
         Such an analysis can be given a past to correct (:meth:`move_past`).
         """

@@ -35,7 +35,6 @@ OWN_METHODS = {
         ``_add_specs``                     the specs of what that trial wrote
         ``_post_step_mdp_hooks``           with ``store_ensemble=False``, leaves the ensemble out of what is stored
         ``_check_batched_worker_compat``   refuses ``store_ensemble=False`` inside a worker process
-        ``_assert_finite``                 names the input, or the filter, where a belief is not finite
         =================================  =============================================================================
         """,
 }

@@ -27,8 +27,8 @@ from torch_denkf.modules import (
     StochasticMLP,
     UKFAnalysis,
     UKFTransition,
-    run_module,
 )
+from torch_denkf.running import run_module
 from torch_denkf.submodel import Call
 
 B, S = 3, 9  # the unicycle's five and two steps of its past; or three times three numbers

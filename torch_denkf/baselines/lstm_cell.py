@@ -199,7 +199,7 @@ class LSTMUpdate(Update):
         self.feature_sizes = [size for size in (features, observation_dim) if size]
 
     def reading_dims(self, entries, call):
-        """Of the encoding, and of the reading."""
+        """Returns the sizes of the encoding and of the reading."""
         return self.feature_sizes
 
     def compute(self, hidden, cell, *rest, batch_size):
@@ -221,7 +221,7 @@ class LSTMUpdate(Update):
         return *kept, mean, variance.diag_embed(), variance
 
     def _features(self, inputs: list[torch.Tensor], observed: torch.Tensor | None, batch_size) -> torch.Tensor:
-        """What the LSTM reads, ``[*B, in_size]``."""
+        """Concatenates the inputs of the LSTM, ``[*B, in_size]``."""
         dtype, parts = self.loc.dtype, []
         if self.encoding_key is not None:
             encoding, *inputs = inputs

@@ -137,7 +137,7 @@ def _results(
     parameters: Sequence[Tensor],
     seed: int,
 ) -> list[Tensor]:
-    """What a function returns, in memory of its own, and its gradients by some of the ``values`` and ``parameters``."""
+    """Clones the results of a function, and its gradients by some of the ``values`` and ``parameters``."""
     copies = {id(value): value.detach().requires_grad_() for value in values if value.requires_grad}
     leaves = [copies.get(id(value), value) for value in values]
     places = iter(leaves)
@@ -182,7 +182,7 @@ def _telling(value: Tensor) -> Tensor:
 
 
 def _nudged(value: Tensor, step: float, seed: int) -> Tensor:
-    """The same numbers but for the last digits."""
+    """Changes the last digits of numbers."""
     if not value.is_floating_point():
         return value
     noise = torch.randn(value.shape, generator=torch.Generator().manual_seed(seed)).to(value)
@@ -190,7 +190,7 @@ def _nudged(value: Tensor, step: float, seed: int) -> Tensor:
 
 
 def _distance(one: Tensor, other: Tensor) -> Tensor:
-    """How far two tensors are apart, in each column; infinitely where one of them has no value."""
+    """Computes the distance of two tensors in each column, infinite where one of them is NaN."""
     one, other = one.cpu().double(), other.cpu().double()
     same = (one == other) | (one.isnan() & other.isnan())
     return _columns(torch.where(same, 0.0, (one - other).abs().nan_to_num(nan=torch.inf)))
@@ -203,7 +203,7 @@ def _columns(value: Tensor) -> Tensor:
 
 
 def _last_digits(values: Sequence[Tensor], outputs: int) -> list[Tensor]:
-    """How far two orders of the same sums may be apart, for each column; ``values`` after ``outputs`` are gradients."""
+    """Bounds the rounding between two orders of a sum, for each column; ``values`` after ``outputs`` are gradients."""
     sizes = [_columns(value.cpu().double().abs().nan_to_num(nan=0, posinf=0)) for value in values]
     steepest = max((float(size.max()) for size in sizes[outputs:]), default=0.0)
     found = []

@@ -1,4 +1,4 @@
-"""Which kernels inductor makes of a compiled step: products that take longer to call than to compute are written out.
+"""Kernels of a compiled step: products that take longer to call than to compute are written out.
 
 A product of small matrices takes a microsecond, and two more for the library around it. What inductor writes itself
 runs in one kernel with what comes before and after.
@@ -31,7 +31,7 @@ class FewCalls(CustomGraphPass):
         write_out_products(graph)
 
     def uuid(self) -> bytes:
-        """What inductor's cache knows this by."""
+        """Identifies the pass in inductor's cache."""
         return get_hash_for_files((__file__,))
 
 

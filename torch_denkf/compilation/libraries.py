@@ -25,7 +25,7 @@ _HEADER, _64_BITS = 64, 2  # bytes of ELF's header; its class
 
 
 def free_space(folder: Path) -> str:
-    """How much a user may still write to a folder, or to the nearest one above that is there.
+    """Returns how much a user may still write to a folder, or to the nearest one above that is there.
 
     Example:
         >>> free_space(Path("/"))
@@ -86,7 +86,7 @@ def _cache_in_use() -> Path:
 
 
 def is_whole(library: Path) -> bool:
-    """Whether a file is a library (ELF, 64 bits) that reaches to the end of what its header announces."""
+    """Tells whether a file is a library (ELF, 64 bits) that reaches to the end of what its header announces."""
     with library.open("rb") as stream:
         header, size = stream.read(_HEADER), os.fstat(stream.fileno()).st_size
         if len(header) < _HEADER or header[:4] != b"\x7fELF":

@@ -1,4 +1,4 @@
-"""How torch.compile splits a chunk into forward and backward: what one leaves for the other goes in few tensors.
+"""Partition of a chunk into forward and backward for torch.compile, with few saved tensors.
 
 A step of small networks leaves two dozen small tensors for its backward pass. Each costs a few microseconds more than
 its numbers do: an allocation, a Python object, and autograd's records. So tensors of one shape go as one. The inputs of
@@ -45,7 +45,7 @@ class FewSavedTensors(CustomPartitionerFn):
         return forward, backward
 
     def uuid(self) -> bytes:
-        """What inductor's cache knows this by."""
+        """Identifies the pass in inductor's cache."""
         return get_hash_for_files((__file__,))
 
 
@@ -134,7 +134,7 @@ def _is_weight_gradient(node: Node) -> bool:
 
 
 def _terms(node: Node) -> list[Node]:
-    """What a node adds up, for one user alone."""
+    """Lists the terms that a node adds up, for one user alone."""
     parts = node.args if node.target is aten.add.Tensor and not node.kwargs and len(node.users) == 1 else ()
     if parts and all(isinstance(part, Node) for part in parts):
         return [term for part in parts for term in _terms(part)]
@@ -142,7 +142,7 @@ def _terms(node: Node) -> list[Node]:
 
 
 def _viewed(node: Node) -> Node:
-    """What a node is a view of, of the same numbers in the same order."""
+    """Returns the node of which a node is a view, of the same numbers in the same order."""
     while node.target in (aten.view.default, aten.reshape.default):
         node = node.args[0]
     return node
@@ -161,7 +161,7 @@ def _in_order_of_one_input(products: Sequence[Node]) -> tuple[Node | None, list[
 
 
 def _small(node: Node) -> bool:
-    """Whether what a node computes is a small contiguous tensor."""
+    """Tells whether a node computes a small contiguous tensor."""
     value = node.meta.get("val")
     if not isinstance(value, torch.Tensor) or not value.ndim:
         return False

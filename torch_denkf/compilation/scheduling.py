@@ -1,4 +1,4 @@
-"""How inductor bundles the loops of a compiled step into functions of C++: a short function each, used again.
+"""Bundling of the loops of a compiled step into functions of C++: a short function each, used again.
 
 Inductor puts all loops between two calls of the library into one function. Where small products are written out, that
 is a whole chunk of steps: tens of thousands of lines, with memory of its own for each number on the way. With one
@@ -35,7 +35,7 @@ class ShortFunctions(CustomSchedulerPass):
         return nodes
 
     def uuid(self) -> bytes:
-        """What inductor's cache knows this by."""
+        """Identifies the pass in inductor's cache."""
         return get_hash_for_files((__file__,), str(torch.get_num_threads()))
 
 
@@ -44,7 +44,7 @@ def _always() -> bool:
 
 
 def _by_several_threads(node: BaseSchedulerNode) -> bool:
-    """Whether inductor shares the loops of a node among threads; by its rule, iterations for each thread."""
+    """Tells whether inductor shares the loops of a node among threads; by its rule, iterations for each thread."""
     threads = config.cpp.threads if config.cpp.threads > 0 else torch.get_num_threads()
     loops = [part for part in node.get_nodes() if isinstance(part, SchedulerNode)]
     sizes = [prod(int(size) for sizes in part.get_ranges() for size in sizes) for part in loops]

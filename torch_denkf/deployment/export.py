@@ -190,7 +190,7 @@ def _write(program: torch.export.ExportedProgram, package: io.BytesIO, signature
 
 
 def _run(package: io.BytesIO, compiled: bool) -> Callable:
-    """What runs a package."""
+    """Returns the function that runs a package."""
     package.seek(0)
     if compiled:
         return torch._inductor.aoti_load_package(package)
@@ -198,7 +198,7 @@ def _run(package: io.BytesIO, compiled: bool) -> Callable:
 
 
 def _inputs(filter: Filter, entries: Entries, example: TensorDictBase) -> list[NestedKey]:
-    """What the step reads: all that it must, and what the example has of what it may."""
+    """Lists the inputs of the step: all that it must read, and what the example has of what it may."""
     structure = filter.structure
     keys = [*structure.needed, *structure.controls, *structure.carry]
     missing = [key for key in keys if key not in entries]

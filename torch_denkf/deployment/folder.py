@@ -93,7 +93,7 @@ def save_folder(
 
 
 def _unsettled(folder: Path, sha256: object) -> Path:
-    """Where new weights are until a description of them has taken the place of the old one."""
+    """Returns the place of new weights until a description of them has taken the place of the old one."""
     return folder / f"weights-{sha256}.safetensors"
 
 
@@ -111,7 +111,7 @@ def _settle(folder: Path) -> None:
 
 
 def read_folder_config(folder: str | Path, builders: Mapping[str, object]) -> dict[str, Any]:
-    """What :func:`save_folder` wrote beside the weights.
+    """Reads what :func:`save_folder` wrote next to the weights.
 
     Args:
         folder: with ``config.json``.
@@ -188,7 +188,7 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
 
 
 def _fits(value: Tensor, made: Tensor) -> bool:
-    """Whether numbers are of the same kind as those that were built, and infinite only where these are."""
+    """Tells whether numbers are of the same kind as those that were built, and infinite only where these are."""
     if value.is_floating_point() != made.is_floating_point():
         return False
     if value.shape != made.shape:  # for load_state_dict to say

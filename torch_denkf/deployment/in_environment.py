@@ -17,7 +17,7 @@ class Step(Protocol):
 
     @property
     def inputs(self) -> Mapping[str, tuple[tuple[int, ...], str]]:
-        """What a call needs, by name: shape and dtype."""
+        """Maps the name of each input to its shape and dtype."""
 
     @property
     def outputs(self) -> Sequence[str]:

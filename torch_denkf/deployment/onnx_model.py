@@ -84,7 +84,7 @@ def onnx_model(
 
 
 def _refusal(error: BaseException) -> str:
-    """What to say of an error of the exporter."""
+    """Returns the message for an error of the exporter."""
     reason = " ".join(str(error).split())
     cause: BaseException | None = error
     while cause is not None:

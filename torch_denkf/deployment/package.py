@@ -130,7 +130,7 @@ def load_step(path: str | Path) -> PackagedStep:
 
 
 def run_onnx(model: bytes) -> tuple[Callable[..., tuple[Tensor, ...]], str]:
-    """What runs an ONNX model, tensors in, tensors out; and its description, empty where it has none.
+    """Returns a function that runs an ONNX model on tensors, and its description, empty where it has none.
 
     Raises:
         ImportError: without onnxruntime; names the extra.
@@ -157,7 +157,7 @@ def run_onnx(model: bytes) -> tuple[Callable[..., tuple[Tensor, ...]], str]:
 
 
 def _is_compiled(path: Path) -> bool:
-    """Whether a package holds native code, where it is whole: code that was changed would end the process.
+    """Tells whether a package holds native code; raises if that was changed, since it would end the process.
 
     Raises:
         ValueError: if it is no package, or one of its parts does not have its checksum.

@@ -1,4 +1,4 @@
-"""How far long work has come: a bar in a terminal, a line now and then elsewhere."""
+"""Progress of long work: a bar in a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a function of settings builds the model that is to be stored with them: what differs, by name.
+"""Check that a function of settings builds the model that is to be stored with them.
 
 Parameters and buffers come back from the file. All else does not: the number of members, an analysis' scheme, the keys,
 a function between two layers. So these are compared, and no reading is needed for that.
@@ -23,7 +23,7 @@ _PLAIN = (type(None), bool, int, float, str, bytes, torch.dtype, torch.device, t
 
 
 def build_from(builder: Callable[..., nn.Module], settings: Mapping[str, Any]) -> nn.Module:
-    """What a function makes of settings that come from JSON: lists are tuples again."""
+    """Calls a function with settings that come from JSON: lists are tuples again."""
     return builder(**{name: _as_tuples(value) for name, value in settings.items()})
 
 
@@ -42,7 +42,7 @@ def refuse_another(model: nn.Module, name: str, builder: Callable[..., nn.Module
 
 
 def differences(given: nn.Module, built: nn.Module) -> Iterator[str]:
-    """What is not the same in two models, values of parameters and stored buffers aside.
+    """Lists the differences of two models, values of parameters and stored buffers aside.
 
     Compared are the modules and their types; names, shapes and dtypes of what is stored; buffers that are not stored;
     and the attributes without a leading underscore that hold plain values, tensors, functions, or containers of them.
@@ -89,7 +89,7 @@ def _attributes(module: nn.Module) -> dict[str, Any]:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Whether two values are equal; of what is not known how to compare, whether they are of one type."""
+    """Tells whether two values are equal; of unknown kinds, whether they are of one type."""
     if isinstance(one, _PLAIN) or isinstance(other, _PLAIN):
         return type(one) is type(other) and (one == other or one != one)  # NaN is itself
     if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
@@ -106,7 +106,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _parts(value: Any) -> list[Any]:
-    """What a function does, and with which values; nothing of what is no function."""
+    """Lists the code and the values of a function; nothing for anything else."""
     if isinstance(value, functools.partial):
         return [value.func, value.args, value.keywords]
     if isinstance(value, types.CodeType):  # without the line that it stands in

@@ -131,7 +131,7 @@ class _Case(NamedTuple):
         return torch.eye(self.observation_dim, self.state_dim, dtype=self.dtype)
 
     def draw(self, batch: Sequence[int], members: int | None = None) -> TensorDict:
-        """What an analysis reads, ``[*batch]``, without a mask."""
+        """Draws inputs of an analysis, ``[*batch]``, without a mask."""
         size = self.members if members is None else members
         mixing = torch.eye(self.state_dim, dtype=self.dtype) + 0.3 * torch.randn(
             *batch, self.state_dim, self.state_dim, dtype=self.dtype
@@ -262,7 +262,7 @@ def _gain(analysis: TensorDictModuleBase, case: _Case, tolerance: float) -> Iter
 
 
 def _noise(analysis: TensorDictModuleBase, case: _Case) -> Iterator[tuple[str, float, float]]:
-    """Whether noise can be drawn beforehand, and follows torch's generator."""
+    """Checks that noise can be drawn beforehand, and follows torch's generator."""
     state, width = case.state_dim, case.observation_dim
     for place, part in random_parts(analysis, "self"):
         lacks = part.draw_noise((2,), members=16, state_dim=state, observation_dim=width, dtype=case.dtype) is None

@@ -114,7 +114,7 @@ def _named(tensordict: TensorDictBase, names: tuple[str, ...]) -> Iterator[tuple
 
 
 def _breaks(clock: Tensor, inner: Tensor, *, strict: bool) -> Tensor:
-    """Where a clock stands still, runs back, or (``strict``) leaps, among the steps ``inner``."""
+    """Marks steps, among ``inner``, at which a clock stands still, runs back, or (``strict``) leaps."""
     steps = clock.double().diff()
     if not inner.any():
         return inner
@@ -131,7 +131,7 @@ def _end(following: TensorDictBase, size: int) -> Tensor | None:
 
 
 def _chain(tensordict: TensorDictBase, following: TensorDictBase, inner: Tensor) -> tuple[bool, Tensor]:
-    """Whether the next step's entries can be compared with what follows, and where none of them is there, ``[N - 1]``.
+    """Compares the next step's entries with what follows: whether that is possible, and breaks ``[N - 1]``.
 
     A transform of sampled data may change one entry and not its next one, and a robot may stand still. So one entry
     that moves and goes on is enough, and a step in which all are the same.

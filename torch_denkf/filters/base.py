@@ -185,7 +185,7 @@ class Filter(Checked, TensorDictSequential):
 
     @property
     def update_at_reset(self) -> bool:
-        """Whether the initial belief is updated with the first frame."""
+        """Tells whether the initial belief is updated with the first frame."""
         return self.fixed_options["update_at_reset"]
 
     @property
@@ -295,7 +295,7 @@ class Filter(Checked, TensorDictSequential):
         return [module for _, module in self.structure.update]
 
     def outer(self, key: NestedKey) -> NestedKey:
-        """Where a tensordict holds what the modules know as ``key``: entries of the filter's own, under the prefix."""
+        """Returns the key of an entry outside of the filter: what the filter writes stands under the prefix."""
         if self.prefix is None:
             return key
         names = (key,) if isinstance(key, str) else key
@@ -625,7 +625,7 @@ class Filter(Checked, TensorDictSequential):
         return next((p for p in chain(self.parameters(), self.buffers()) if p.is_floating_point()), None)
 
     def entries_of(self, tensordict: TensorDictBase, *, one_step: bool = False) -> Entries:
-        """What the modules may read, as far as it is there, and noise; for ``one_step`` not what starts a sequence.
+        """Reads the inputs of the modules, and noise, where they are there; for ``one_step`` without initial beliefs.
 
         Raises:
             KeyError: if there is noise that no module draws.

@@ -48,19 +48,18 @@ class EKF(GaussianFilter):
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torch_denkf.modules import ConstantNoise, GaussianAround, Select
-        >>> from torch_denkf.applications.car import UnicycleNoise, UnicycleTransition
-        >>> q = ConstantNoise([0.5, 0.1], in_key=("belief", "mean"), out_key=("forecast", "noise"))
+        >>> from torch_denkf.modules import ConstantNoise, GaussianAround, LearnedTransition, Select
+        >>> move = torch.tensor([[1.0, 0.1], [0.0, 1.0]])  # [position m, speed m/s], 0.1 s later
         >>> ekf = EKF(
-        ...     UnicycleTransition(torch.zeros_like, dt=0.1),
+        ...     LearnedTransition(lambda state: state @ move.T, residual=False),
         ...     None,
-        ...     Select([3, 4]),
-        ...     ConstantNoise([0.3, 0.05], in_key="reading"),
-        ...     process_noise=UnicycleNoise(q, dt=0.1),
-        ...     initial=GaussianAround([0.0, 0.0, 0.0, 1.0, 0.1]),
+        ...     Select([1]),
+        ...     ConstantNoise([0.3], in_key="reading"),
+        ...     process_noise=[0.0, 0.5],
+        ...     initial=GaussianAround([0.0, 1.0]),
         ...     observation_key="reading",
         ... )
-        >>> drive = TensorDict({"reading": torch.tensor([10.0, 0.0]).expand(9, 2), "state": torch.zeros(9, 5)}, [9])
+        >>> drive = TensorDict({"reading": torch.full((9, 1), 10.0), "state": torch.zeros(9, 2)}, [9])
         >>> ekf.sequence(drive)["belief", "mean"][-1, 0] > 6.0  # m in 8 steps, from a wrong speed
         tensor(True)
     """

@@ -1,4 +1,4 @@
-"""What the constructors of all filters share."""
+"""Options that the constructors of all filters share."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["FilterOptions"]
 
 
 class FilterOptions(TypedDict, total=False):
-    """What every filter's constructor takes beside its parts; see :class:`Filter`."""
+    """Declares the options of every filter's constructor, next to its parts; see :class:`Filter`."""
 
     control_keys: Sequence[NestedKey]
     init_key: NestedKey

@@ -174,9 +174,8 @@ class DPF(ParticleFilter):
         likelihood: learned, bounded from below, see :class:`~torch_denkf.modules.LearnedLikelihood`.
         motion_noise: learned variances of some dimensions of the state, see
             :class:`~torch_denkf.modules.NoisyTransition`; ``None`` where ``transition`` is random already.
-        noisy_dims: those dimensions. The noise is added before the motion; to have it after, or inside of a
-            :class:`~torch_denkf.applications.car.modules.pairs.ClonedTransition`, give a ``transition`` with noise
-            instead.
+        noisy_dims: those dimensions. The noise is added before the motion; to have it after, give a ``transition`` with
+            noise instead.
         initial: the initial belief.
         **kwargs: of :class:`ParticleFilter`.
 
@@ -186,17 +185,16 @@ class DPF(ParticleFilter):
 
     Example:
         >>> import torch
-        >>> from torch_denkf.modules import AroundState, DiagonalNoise, LearnedLikelihood, Select
-        >>> from torch_denkf.applications.car import UnicycleTransition
-        >>> from torch_denkf.modules import VectorSensor
+        >>> from torch_denkf.modules import AroundState, DiagonalNoise, LearnedLikelihood, LearnedTransition
+        >>> from torch_denkf.modules import Select, VectorSensor
         >>> dpf = DPF(
-        ...     UnicycleTransition(torch.nn.Linear(2, 2), dt=0.1),
-        ...     VectorSensor(6, 2, ensemble_size=1, layer="none"),
-        ...     Select([3, 4]),
-        ...     LearnedLikelihood(2, 2, encoding_key=("sensor", "ensemble")),
-        ...     DiagonalNoise(2, in_features=5, in_key=("belief", "mean"), out_key=("forecast", "noise")),
-        ...     noisy_dims=[3, 4],
-        ...     initial=AroundState([0.0] * 5, ensemble_size=100),
+        ...     LearnedTransition(torch.nn.Linear(2, 2)),
+        ...     VectorSensor(6, 1, ensemble_size=1, layer="none"),
+        ...     Select([1]),
+        ...     LearnedLikelihood(1, 1, encoding_key=("sensor", "ensemble")),
+        ...     DiagonalNoise(1, in_features=2, in_key=("belief", "mean"), out_key=("forecast", "noise")),
+        ...     noisy_dims=[1],
+        ...     initial=AroundState([0.0, 0.0], ensemble_size=100),
         ... )
         >>> dpf["transition"].scheme
         'systematic'
@@ -245,15 +243,14 @@ class MixtureParticleFilter(ParticleFilter):
 
     Example:
         >>> import torch
-        >>> from torch_denkf.modules import AroundState, DiagonalNoise, Select, VectorSensor
-        >>> from torch_denkf.applications.car import UnicycleTransition
-        >>> from torch_denkf.modules import StochasticMLP
+        >>> from torch_denkf.modules import AroundState, DiagonalNoise, LearnedTransition, Select, StochasticMLP
+        >>> from torch_denkf.modules import VectorSensor
         >>> pf = MixtureParticleFilter(
-        ...     UnicycleTransition(StochasticMLP(2, 2), dt=0.1),
-        ...     VectorSensor(6, 2, ensemble_size=1, layer="none"),
-        ...     Select([3, 4]),
-        ...     DiagonalNoise(2),
-        ...     initial=AroundState([0.0] * 5, ensemble_size=100),
+        ...     LearnedTransition(StochasticMLP(2, 2)),
+        ...     VectorSensor(6, 1, ensemble_size=1, layer="none"),
+        ...     Select([1]),
+        ...     DiagonalNoise(1),
+        ...     initial=AroundState([0.0, 0.0], ensemble_size=100),
         ... )
         >>> pf["transition"].scheme, type(pf["likelihood"]).__name__
         ('soft', 'GaussianLikelihood')

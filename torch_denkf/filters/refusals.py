@@ -1,4 +1,4 @@
-"""What a filter refuses before a step: entries that are missing or unknown, mixed precision."""
+"""Raises before a step: entries that are missing or unknown, mixed precision."""
 
 from __future__ import annotations
 

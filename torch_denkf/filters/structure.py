@@ -1,4 +1,4 @@
-"""What a filter's modules say about themselves: who reads frames alone, who the belief, and what is carried on."""
+"""Sorts a filter's modules by their keys: those that read frames alone, those that read the belief, and the carry."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ RESUMES = ("previous", "resumes")
 
 
 def previous_key(key: NestedKey) -> tuple[str, ...]:
-    """Where a policy's filter finds what was ``key`` one step before."""
+    """Returns the key under which a policy's filter finds the value of the step before."""
     return ("previous", key) if isinstance(key, str) else ("previous", *key)
 
 
 def takes_reading(module: TensorDictModuleBase) -> TypeGuard[Update]:
-    """Whether a module takes in a reading, and heeds a mask that hides it."""
+    """Tells whether a module is an update with a reading and an observed mask."""
     return isinstance(module, Update) and bool(module.reading_keys) and module.observed_key is not None
 
 
@@ -237,7 +237,7 @@ def _sorted(
 def _forecasts(
     carry: Sequence[NestedKey], written: Sequence[NestedKey], chosen: Mapping[NestedKey, NestedKey]
 ) -> dict[NestedKey, NestedKey]:
-    """Which entry that the transition writes is the forecast of which carried one: that of the same last name."""
+    """Maps each carried entry to its forecast, the entry of the same last name that the transition writes."""
     chosen = {unravel_key(key): unravel_key(value) for key, value in chosen.items()}
     unknown = [key for key in chosen if key not in carry] + [key for key in chosen.values() if key not in written]
     if unknown:

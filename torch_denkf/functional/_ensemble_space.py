@@ -77,7 +77,7 @@ def analyse_in_tiles(
     rotation: Tensor | None = None,
     total: Callable[..., list[Tensor]] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What :func:`~torch_denkf.functional.analyse` does in ensemble space, without gradients, in little memory.
+    """Computes :func:`~torch_denkf.functional.analyse` in ensemble space, without gradients, in little memory.
 
     Beside the arguments and the result it holds a few tiles ``[*B, E, columns]``, rows ``[*B, O]`` and matrices
     ``[*B, E, E]``. Arguments and results are those of ``analyse``, checked there.

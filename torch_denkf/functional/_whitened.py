@@ -1,4 +1,4 @@
-"""What the gain of the ensemble update acts on, in units of the reading's noise: the same for both spaces."""
+"""Innovations and anomalies that the gain of the ensemble update acts on, in units of the reading's noise."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def whiten(predicted: Tensor, samples: Tensor, noise: Tensor, observed: Tensor |
 
 
 def shift(scheme: str, reading: Whitened, observed: Tensor | None, perturbation: Tensor | None) -> Tensor:
-    """What the gain acts on, one row a member, or one for all (``"etkf"``)."""
+    """Returns the innovations that the gain acts on, one row a member, or one for all (``"etkf"``)."""
     if scheme == "sensor":
         return (reading.samples - reading.predicted) * reading.scale  # Ỹ − HX, eq. 12
     if scheme == "sakov":

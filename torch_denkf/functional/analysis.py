@@ -28,7 +28,7 @@ Space = Literal["auto", "observation", "ensemble"]
 
 
 class Analysis(NamedTuple):
-    """What :func:`analyse` returns.
+    """Holds the results of :func:`analyse`.
 
     Attributes:
         ensemble: the analysis ensemble X_{t|t}, ``[*B, E, S]``, in the state's units.
@@ -297,7 +297,7 @@ def check_significance(threshold: float | Tensor | None, size: int) -> None:
 
 
 def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: float | Tensor) -> Tensor:
-    r"""How far sample covariances are to be believed: :math:`\max(0, 1 - (z_0 / z)^2)`.
+    r"""Computes the localisation factor of sample covariances by significance, :math:`\max(0, 1 - (z_0 / z)^2)`.
 
     The correlation r of two components of E members that have nothing to do with each other is not zero: its standard
     deviation is :math:`1 / \sqrt{E - 1}`. So :math:`z = |r| \sqrt{E - 1}` says how significant r is. Each update
@@ -309,7 +309,7 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
 
     Gradients reach the threshold, which may be trained, and not the anomalies: for them the factor is a constant, as a
     taper is. Near the threshold its slope is steepest, and correlations are of chance: the training of a filter of 64
-    members through it diverged (``benchmarks/ur5``). So of several readings the threshold's gradient leaves out how
+    members of a robot arm through it diverged. So of several readings the threshold's gradient leaves out how
     the first ones change the correlations that the later ones see.
 
     Args:

@@ -16,7 +16,7 @@ from torch_denkf.functional.linalg import cholesky
 
 
 class GaussianUpdate(NamedTuple):
-    """What :func:`kalman_update` returns.
+    """Holds the results of :func:`kalman_update`.
 
     Attributes:
         mean: posterior mean, ``[*B, S]``, in the state's units.

@@ -1,4 +1,4 @@
-r"""Where a body goes, by what its gyro and its accelerometer read.
+r"""Motion of a body by its gyro and its accelerometer.
 
 Source: Forster, Carlone, Dellaert & Scaramuzza 2017, IEEE T-RO 33 (the model); Fourmy, Flayols, Léziart, Mansard & Solà
 2021, ICRA, and Brossard, Barrau, Chauchat & Bonnabel 2022, IEEE T-RO 38 (the exact integrals).

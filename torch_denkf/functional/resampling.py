@@ -117,7 +117,7 @@ def jitter_copies(
     widens the distribution, less so with more particles. N is the *effective* number of particles. To the weighted
     covariance comes a share 1 / N³ of that of all particles: where one or two have all the weight, which says little
     about the spread, the kernel is wide, and a filter that has lost the state can find it again; where a few dozen
-    share the weight, it is nothing. (The cube was found on Lorenz-63, in ``benchmarks/smoothing``.)
+    share the weight, it is nothing. The exponent three was found on Lorenz-63.
 
     Args:
         resampled: what :func:`systematic_resample` or :func:`soft_resample` picked, ``[*B, E, S]``: copies are

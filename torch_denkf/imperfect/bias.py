@@ -140,7 +140,7 @@ class FadingBias(nn.Module):
 
     @property
     def decay(self) -> Tensor:
-        """What is left of a bias after a step, ``[K]``."""
+        """Returns the share of a bias that is left after a step, ``[K]``."""
         return (-(-self.log_time).exp()).exp()
 
     @property
@@ -219,7 +219,7 @@ class BiasedNoise(Wrapper):
 
 
 class BiasedObservation(Wrapper):
-    """What the sensor reads of the state, plus its biases.
+    """Predicts the observation of the state, plus the biases of its sensor.
 
     With K = G O biases each component of the reading has G of them: the first O belong to components 1 to O, and so do
     the next O.
@@ -333,7 +333,7 @@ class BiasedBelief(AroundInitial):
 
 
 class BiasedParts(NamedTuple):
-    """What a filter is made of whose state holds its sensor's errors, see :func:`biased_parts`."""
+    """Holds the parts of a filter whose state holds its sensor's biases, see :func:`biased_parts`."""
 
     transition: TensorDictModuleBase
     observation: TensorDictModuleBase

@@ -208,7 +208,7 @@ class Visible(Around):
     def _particles(
         self, entries: Entries, call: Call, visible: Tensor, mask: Tensor | None, seen: Tensor | None
     ) -> Entries:
-        """What the analysis makes of likelihoods that are mixtures."""
+        """Returns the posterior under likelihoods that are mixtures."""
         prior, likelihood = (self.required(entries, key) for key in self.module.in_keys[1:3])
         predicted, reading, variance = (self.required(entries, key) for key in self.module.in_keys[3:6])
         if self.module.reading_space is not None:
@@ -242,7 +242,7 @@ def _like(seen: Tensor, value: Tensor) -> Tensor:
 
 
 def _kind(analysis: Update) -> str:
-    """What an analysis updates: ``"members"``, ``"moments"`` or ``"particles"``."""
+    """Returns the kind of belief that an analysis updates: ``"members"``, ``"moments"`` or ``"particles"``."""
     wrapped = isinstance(analysis, Around) and not analysis.updates_ensemble
     if isinstance(analysis, Update) and not wrapped and analysis.info_prefix is not None:
         written = [cast("tuple[str, ...]", unravel_key(key)) for key in analysis.out_keys]

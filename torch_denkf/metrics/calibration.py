@@ -28,7 +28,7 @@ __all__ = [
 
 
 class SpreadError(NamedTuple):
-    """What :func:`spread_error` returns.
+    """Holds the results of :func:`spread_error`.
 
     Attributes:
         spread: root mean square of the predicted standard deviation in each bin, ``[S, bins]``, ascending.
@@ -239,7 +239,7 @@ def rank_histogram(
     log_weight: Tensor | None = None,
     space: Space | None = None,
 ) -> Tensor:
-    """How often the truth falls into each of the E+1 gaps between and beyond the sorted members.
+    """Counts how often the truth falls into each of the E+1 gaps between and beyond the sorted members.
 
     The histogram is flat, up to chance, for a calibrated ensemble, Gaussian or not. It is high at both ends for an
     overconfident one. A truth that equals some members counts in equal parts in all the gaps that they separate.

@@ -15,7 +15,7 @@ __all__ = ["NEES", "gaussian_nll", "nees"]
 
 
 class NEES(NamedTuple):
-    """What :func:`nees` returns; ``*M`` are the batch dims that are left after averaging.
+    """Holds the results of :func:`nees`; ``*M`` are the batch dims that are left after averaging.
 
     Attributes:
         mean: ``[*M]``; S for a consistent filter.

@@ -22,7 +22,7 @@ __all__ = ["StateErrors", "known_tangents", "mean_of_known", "rotation_error", "
 
 
 class StateErrors(NamedTuple):
-    """What :func:`state_errors` returns.
+    """Holds the results of :func:`state_errors`.
 
     Attributes:
         rmse: root of the mean squared error, ``[S]``, in each dimension's units.
@@ -41,7 +41,7 @@ def state_difference(estimated: Tensor, truth: Tensor, *, space: Space | None = 
     Args:
         estimated: states, ``[*B, S]``.
         truth: the true states, of the same shape.
-        space: whose points the states are, such as ``Flat(5, circular=[2])`` of KITTI's (x, y, θ, v, θ_dot); ``None``
+        space: whose points the states are, such as ``Flat(5, circular=[2])`` of (x, y, θ, v, θ_dot); ``None``
             for plain numbers. Turn rates are no angles.
 
     Returns:
@@ -130,7 +130,7 @@ def rotation_error(estimated: Tensor, truth: Tensor, *, space: Space) -> Tensor:
 
 
 def known_tangents(truth: Tensor, space: Space | None) -> Tensor:
-    """What is NaN where no error is known: the truth ``[*B, S]``, of points of a space zeros and NaN, ``[*B, D]``."""
+    """Marks unknown errors by NaN: the truth ``[*B, S]``, of points of a space zeros and NaN, ``[*B, D]``."""
     if space is None:
         return truth
     known = whole_parts(space, ~truth.isnan())[1]

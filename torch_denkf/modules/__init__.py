@@ -21,7 +21,6 @@ from torch_denkf.modules.sharded_analysis import ShardedEnsembleAnalysis
 from torch_denkf.modules.stochastic import StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
-from torch_denkf.running import reads, run_module
 from torch_denkf.submodel import Initial, SubModel, Transition, Update
 
 __all__ = [
@@ -30,8 +29,6 @@ __all__ = [
     "Transition",
     "Update",
     "Around",
-    "reads",
-    "run_module",
     "StochasticMLP",
     "deterministic",
     "LearnedTransition",

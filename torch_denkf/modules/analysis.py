@@ -161,7 +161,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         return ensemble, mean, var, innovation, nis, log_likelihood, *cov
 
     def _factor(self, ensemble) -> float | torch.Tensor:
-        """Of the inflation: one for all components, or ``[*B, 1, S]``."""
+        """Returns the factor of the inflation, one for all components, or ``[*B, 1, S]``."""
         if self.inflated is None:
             return self.inflation
         factor = torch.ones_like(ensemble[..., :1, :])
@@ -186,11 +186,11 @@ class EnsembleAnalysis(EnsembleUpdate):
         return ensemble if self.space is None or center is None else self.space.plus(center, ensemble)
 
     def _any(self, observed):
-        """Where anything is observed, ``[*B]``."""
+        """Marks rows in which anything is observed, ``[*B]``."""
         return observed.any(-1)
 
     def _options(self, noise: torch.Tensor | None, taper: torch.Tensor | None) -> dict[str, Any]:
-        """Of :func:`analyse`."""
+        """Returns the options of :func:`analyse`."""
         if self.scheme == "perturbed" and noise is None:
             raise ValueError('the scheme "perturbed" has no deterministic forward; use "etkf" or "sakov".')
         return {

@@ -99,10 +99,10 @@ class ContinuousNoise(SubModel):
 
 
 class NoisePerSecond(SubModel):
-    r"""What another process noise writes, taken as variance per second: times the seconds since the last step.
+    r"""Multiplies the variances of another process noise, which are per second, by the seconds since the last step.
 
-    It is the noise of a random walk, for motions that read their own ``dt``, such as
-    :class:`~torch_denkf.applications.car.UnicycleTransition`. In a :class:`UnicycleNoise` put it inside.
+    It is the noise of a random walk, for motions that read their own ``dt``. Put it inside of a module that maps the
+    noise of velocities to that of the state.
 
     Args:
         noise: writes variances ``[*B, N]`` or a covariance ``[*B, N, N]`` per second; its keys are kept.

@@ -26,7 +26,7 @@ class EKFTransition(GaussianTransition):
     itself. Rows of a batch must not depend on each other.
 
     Args:
-        transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.applications.car.UnicycleTransition`.
+        transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.modules.LearnedTransition`.
         process_noise: writes Q, variances ``[*B, S]`` or a covariance ``[*B, S, S]``, see
             :mod:`torch_denkf.modules.process_noise`; it may read the belief's mean and the forecast's.
         stop_jacobian_gradient: F is a constant to the gradient (as in Kloss et al. 2021).
@@ -109,7 +109,7 @@ class EKFAnalysis(GaussianAnalysis):
 
 
 def _needed(module, entries: Entries) -> Entries:
-    """What the model inside reads, and the mask."""
+    """Lists the keys that the model inside reads, and the mask."""
     needed, optional = reads(module.module)
     keys = dict.fromkeys([*needed, *optional, role(module, Update).observed_key])
     return {key: entries[key] for key in keys if key in entries}

@@ -1,4 +1,4 @@
-"""What the updates of an ensemble share: the entries they read and write."""
+"""Base of the updates of an ensemble: the entries that they read and write."""
 
 from __future__ import annotations
 

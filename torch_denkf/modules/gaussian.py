@@ -1,4 +1,4 @@
-"""What the filters with a mean and a covariance share: they run ensemble modules, and add Q and R."""
+"""Bases of the steps of a mean and a covariance: they run ensemble modules, and add Q and R."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class GaussianTransition(Transition):
     """Forecasts mean and covariance through a transition of ensembles; a subclass writes :meth:`_forecast`.
 
     Args:
-        transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.applications.car.UnicycleTransition`.
+        transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.modules.LearnedTransition`.
         process_noise: writes Q, variances ``[*B, S]`` or a covariance ``[*B, S, S]``, see
             :mod:`torch_denkf.modules.process_noise`; it may read the belief's mean and the forecast's.
         **keys: see :class:`GaussianTransitionKeys`.
@@ -105,7 +105,7 @@ class GaussianTransition(Transition):
 
 
 class GaussianAnalysisOptions(TypedDict, total=False):
-    """What an update of mean and covariance takes beside the observation model.
+    """Declares the options of an update of mean and covariance, next to the observation model.
 
     Attributes:
         inflation: factor on the belief's standard deviations, where anything is observed; 1 by default, for none. What
@@ -195,7 +195,7 @@ class GaussianAnalysis(Update):
     def _innovation(
         self, observation: torch.Tensor, predicted: torch.Tensor, observed: torch.Tensor | None
     ) -> torch.Tensor:
-        """How far the reading is from what is predicted ``[*B, Q]``, the shorter way round: ``[*B, O]``."""
+        """Computes the innovation ``[*B, O]`` from predictions ``[*B, Q]``, of angles the shorter way round."""
         space = self.reading_space
         return observation - predicted if space is None else space.innovation(observation, predicted, observed)
 
@@ -260,7 +260,7 @@ def as_covariance(noise: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
 def further_keys(
     modules: Iterable[TensorDictModuleBase], known: Iterable[NestedKey]
 ) -> tuple[list[NestedKey], list[NestedKey]]:
-    """What ``modules`` must find, and what they may, beside the entries ``known``."""
+    """Returns the keys that ``modules`` must find, and those that they may, next to the entries ``known``."""
     known = set(map(unravel_key, known))
     needed: dict[NestedKey, None] = {}
     optional: dict[NestedKey, None] = {}

@@ -13,7 +13,7 @@ __all__ = ["KeypointTrunk", "SpatialSoftArgmax"]
 
 
 class SpatialSoftArgmax(nn.Module):
-    """Where each channel is large: the mean place under the softmax of its values.
+    """Computes the mean place of each channel under the softmax of its values.
 
     Args:
         channels: C.

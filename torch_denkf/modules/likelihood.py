@@ -199,7 +199,7 @@ class LearnedLikelihood(Update):
             self.register_buffer(name, vector)
 
     def reading_dims(self, entries, call):
-        """Of the encoding, and of the reading."""
+        """Returns the sizes of the encoding and of the reading."""
         return [self.encoding_dim, self.observation_dim][: len(self.reading_keys)]
 
     def compute(self, encoding, predicted, *rest, batch_size):

@@ -162,7 +162,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), *diagnostics
 
     def move_past(self, past, predicted, observation, variance, observed=None, *, noise=None):
-        """What the readings say of earlier states ``[*B, E, L, S]``: see :meth:`EnsembleAnalysis.move_past`.
+        """Updates earlier states ``[*B, E, L, S]``, see :meth:`EnsembleAnalysis.move_past`.
 
         Each component learns from the observations near it now. What moves far in L steps needs a larger radius.
         """
@@ -187,7 +187,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         return mean + noise @ (ensemble - mean)
 
     def _reached(self, observed: torch.Tensor | None, variance: torch.Tensor) -> torch.Tensor:
-        """Whether anything is observed near each component, ``[S]`` or ``[*B, S]``."""
+        """Marks components near which anything is observed, ``[S]`` or ``[*B, S]``."""
         near = self.taper > 0
         if observed is None or observed.shape[-1] < variance.shape[-1]:
             return near.any(-1)

@@ -37,8 +37,7 @@ class NoisyTransition(Transition):
             unless ``before``, the forecast's at ``forecast_mean_key``, which are worked out for it.
         dims: state dimensions that the noise acts on, in the order of Q; ``None`` for all.
         before: True adds the noise to the state *before* it moves. What moves with these dimensions then moves with
-            their noise, such as the pose of a :class:`torch_denkf.applications.car.UnicycleTransition` with its
-            velocities.
+            their noise, such as the pose of a vehicle with its velocities.
         mean_key: the belief's mean ``[*B, S]``.
         forecast_mean_key: the mean of the forecast before the noise, ``[*B, S]``.
         log_weight_key: optional log-weights of the belief ``[*B, E]``.
@@ -124,7 +123,7 @@ class NoisyTransition(Transition):
         return written
 
     def _mean(self, members: torch.Tensor, log_weights: torch.Tensor | None) -> torch.Tensor:
-        """What the noise model may read; on a space, one that reads the state's width alone gets any member."""
+        """Returns the mean for the noise model; on a space, one that reads the state's width alone gets any member."""
         if self.space is not None:
             if isinstance(self.module["noise"], ConstantNoise):
                 return members[..., 0, :]

@@ -132,7 +132,7 @@ class ConstantNoise(Sensor):
 
 
 class ScaledNoise(Sensor):
-    r"""What another noise module writes, times the square of a factor that is set by hand after training.
+    r"""Multiplies the variances of another noise module by the square of a factor that is set by hand after training.
 
     A filter that is too sure of itself needs more spread. Scaling Q and R by one factor widens its intervals and
     leaves its gain as it was trained. Inflating the belief itself in every step would also multiply what nothing

@@ -1,4 +1,4 @@
-r"""What makes an ensemble a set of weighted particles: their weights, resampling, the update.
+r"""Weighted particles: their weights, resampling, the update.
 
 Weights are normalised log-weights ``[*B, E]`` beside the ensemble. The order of a step is
 
@@ -198,7 +198,7 @@ class ResampledTransition(Transition):
         return written if past is None else {**written, unravel_key(self.out_keys[-1]): picked}
 
     def with_past(self, past_key: NestedKey, out_past_key: NestedKey) -> ResampledTransition:
-        """The same resampling and motion, for particles with a past; the motion is shared, not copied."""
+        """Returns the transition for particles with a lag window; the motion is shared, not copied."""
         return ResampledTransition(
             self.module,
             self.scheme,
@@ -215,7 +215,7 @@ class ResampledTransition(Transition):
         )
 
     def _wanted(self, log_weights: torch.Tensor, observed: torch.Tensor | None) -> torch.Tensor | None:
-        """Which rows to resample, ``[*B, 1]``; ``None`` for all."""
+        """Marks the rows to resample, ``[*B, 1]``; ``None`` for all."""
         wanted = None if observed is None else observed.any(-1, keepdim=True)
         if self.ess_threshold is not None:
             few = effective_sample_size(log_weights) < self.ess_threshold * log_weights.shape[-1]

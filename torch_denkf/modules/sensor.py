@@ -51,7 +51,7 @@ class StochasticSensor(Sensor):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Those of the head."""
+        """Names the noise of the head."""
         return self.module["head"].noise_names
 
     def draw_noise(self, batch_size, *, time=False, device=None, dtype=None, generator=None, **_):

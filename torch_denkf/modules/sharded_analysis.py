@@ -24,8 +24,7 @@ class ShardedEnsembleAnalysis(EnsembleAnalysis):
 
     Results are those of one process that holds the whole state, up to rounding. An analysis of 32 members and 10⁷
     components, of which a tenth is observed, takes two processes of one machine 2.0 s and 2.6 GB each. One process
-    takes 2.2 s and 4.8 GB (``python -m torch.distributed.run --nproc_per_node=2 -m benchmarks.speed.sharded``, four
-    shared cores).
+    takes 2.2 s and 4.8 GB (four shared cores; ``python -m torch.distributed.run --nproc_per_node=2`` starts two).
 
     Args:
         scheme: ``"sensor"``, ``"etkf"`` or ``"sakov"``, as in :class:`EnsembleAnalysis`.
@@ -70,12 +69,12 @@ class ShardedEnsembleAnalysis(EnsembleAnalysis):
         self.group = group
 
     def _any(self, observed):
-        """Where any process observes anything, ``[*B]``."""
+        """Marks rows in which any process observes anything, ``[*B]``."""
         seen = observed.any(-1).byte()
         if dist.is_initialized():
             dist.all_reduce(seen, dist.ReduceOp.MAX, group=self.group)
         return seen.bool()
 
     def _options(self, noise, taper):
-        """Of :func:`analyse_sharded`; there is neither noise nor taper."""
+        """Returns the options of :func:`analyse_sharded`; there is neither noise nor taper."""
         return {"scheme": self.scheme, "group": self.group}

@@ -140,7 +140,7 @@ def check_dims(name: str, dims: Sequence[int], size: int | None = None, *, once:
 def variance_and_floor(
     owner: str, size: int, r: Tensor | Sequence[float] | float, floor: Tensor | Sequence[float] | float | None
 ) -> tuple[Tensor, Tensor]:
-    """What a noise before training has above its floor, :math:`r^2 - c`, and the floor c, both ``[size]``.
+    """Splits variances before training into what is above the floor, :math:`r^2 - c`, and the floor c, both ``[size]``.
 
     Args:
         owner: who asks, for the message.

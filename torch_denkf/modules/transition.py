@@ -21,7 +21,7 @@ class MemberNetwork(SubModel):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Those of the network."""
+        """Names the noise of the network."""
         return getattr(self.module, "noise_names", ())
 
     def draw_noise(self, batch_size, *, members=None, time=False, device=None, dtype=None, generator=None, **_):

@@ -44,8 +44,8 @@ class _SigmaPoints:
 class UKFTransition(_SigmaPoints, GaussianTransition):
     r"""Forecast of mean and covariance from sigma points that go through a transition as an ensemble of 2 S + 1.
 
-    The transition's stochastic networks run their deterministic forward. One that mixes its members, such as
-    ``UnicycleTransition(drift=False)`` with a network that depends on the velocity, mixes the sigma points.
+    The transition's stochastic networks run their deterministic forward. One that mixes its members, as a
+    network without drift does that subtracts their mean, mixes the sigma points.
 
     Args:
         transition: forecasts ensembles ``[*B, E, S]``.

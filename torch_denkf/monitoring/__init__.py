@@ -1,10 +1,10 @@
 """Gates, monitors and signs: what a filter believes of a reading, and which sensor is not to be believed."""
 
 from torch_denkf.monitoring.black import BlackIsMissing
-from torch_denkf.monitoring.chi_square import detectable_bias
+from torch_denkf.monitoring.chi_square import detectable_bias as detectable_bias
 from torch_denkf.monitoring.filters import Gated, Monitored
-from torch_denkf.monitoring.gate import GatedAnalysis, GateOptions
-from torch_denkf.monitoring.innovation_tests import observe
+from torch_denkf.monitoring.gate import GatedAnalysis as GatedAnalysis
+from torch_denkf.monitoring.gate import GateOptions
 from torch_denkf.monitoring.monitor import InnovationMonitor, MonitoredSensor
 from torch_denkf.monitoring.signs import SignGate
 
@@ -12,11 +12,8 @@ __all__ = [
     "BlackIsMissing",
     "Gated",
     "GateOptions",
-    "GatedAnalysis",
     "InnovationMonitor",
     "Monitored",
     "MonitoredSensor",
     "SignGate",
-    "detectable_bias",
-    "observe",
 ]

@@ -1,4 +1,4 @@
-"""Which true values are known, and of which components: the one rule of all losses.
+"""Labels of losses: the true values that are known, and their components.
 
 Labels ``[*B, N]`` are of the leading N components, or of the components that ``dims`` names. What is NaN, what a mask
 of labels leaves out and what is padding is no label: it has no value and no gradient, and no mean counts it.
@@ -74,7 +74,7 @@ class Labels(NamedTuple):
 
     @property
     def rows(self) -> Tensor:
-        """Which elements have a label, ``[*B]``."""
+        """Marks the elements that have a label, ``[*B]``."""
         return self.mask.any(-1)
 
     def errors(self, estimate: Tensor, weights: Tensor | None = None, *, each: bool = False) -> Tensor:
@@ -140,7 +140,7 @@ class Labels(NamedTuple):
 
 
 class Truth:
-    """What is known of a batch: the labels that terms are scored against, and what the filter wrote.
+    """Holds the labels of a batch that terms are scored against, and what the filter wrote.
 
     Args:
         loss: whose names of entries, dimensions, scales and spaces count.
@@ -169,7 +169,7 @@ class Truth:
 
     @cached_property
     def counts(self) -> Tensor:
-        """Which elements the filter stepped to, ``[*B]``."""
+        """Marks the elements that the filter stepped to, ``[*B]``."""
         return self.loss._counts(self.data)
 
     def state(self, size: int) -> Labels:
@@ -182,7 +182,7 @@ class Truth:
         return self._labels("target", target, size).scaled("observation_scale", self.loss.observation_scale)
 
     def visible(self) -> Labels:
-        """Whether the sensor sees, ``[*B, 1]``, where that is known and there is a reading."""
+        """Returns whether the sensor sees, ``[*B, 1]``, where that is known and there is a reading."""
         values, mask = self.entry(self.keys.target_visible, given=True), self.data.get(self.keys.observed, None)
         values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
         labels = self._labels("visible", values, 1)
@@ -206,7 +206,7 @@ class Truth:
         return labels._replace(mask=labels.mask.all(-1, keepdim=True))
 
     def observed_state(self, observe: Callable[[Tensor], Tensor]) -> Tensor:
-        """What a model observes in the true state; what it makes of NaN is NaN: no label."""
+        """Observes the true state by a model; what it makes of NaN is NaN: no label."""
         # The components of a space are those of tangents: its points are whole.
         values, dims = self.entry(self.keys.state, given=True), self.loss.dims if is_flat(self.loss.space) else None
         size = max(self.state_size() or 0, values.shape[-1], 1 + max(dims or [0]))

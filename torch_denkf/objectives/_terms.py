@@ -40,7 +40,7 @@ class OfBelief(Term):
         super().__init__(weight)
 
     def place(self, truth: Truth) -> NestedKey:
-        """Where it stands."""
+        """Returns its key."""
         return getattr(truth.keys, self.key)
 
 
@@ -85,7 +85,7 @@ class Particles(OfBelief):
         return labels.errors(particles, log_weights.softmax(-1), each=self.each(truth)), log_weights, labels
 
     def each(self, truth: Truth) -> bool:
-        """Whether the score has a tangent space at each particle: the width around it is in that."""
+        """Tells whether the score has a tangent space at each particle: the width around it is in that."""
         return truth.loss.score == "mixture"
 
 
@@ -290,7 +290,7 @@ def score_ensemble(truth: Truth, ensemble: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def score_moments(truth: Truth, mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
-    """Likewise, of a mean ``[*B, S]`` and a covariance ``[*B, S, S]``."""
+    """Scores a mean ``[*B, S]`` and a covariance ``[*B, S, S]`` against the true state, and marks what has one."""
     labels = truth.state(mean.shape[-1])
     return score_gaussian(labels.errors(mean), labels.mask, cov, truth.loss.score, labels.scale), labels.rows
 
@@ -332,10 +332,10 @@ def observation_model(filter: Filter) -> TensorDictModuleBase | None:
 
 
 def learns(model: nn.Module) -> bool:
-    """Whether a model has parameters."""
+    """Tells whether a model has parameters."""
     return any(True for _ in model.parameters())
 
 
 def written_by(filter: Filter) -> list[NestedKey]:
-    """What a filter writes, by the names of its modules: what stands before them is taken off."""
+    """Lists what a filter writes, by the names of its modules, without a prefix."""
     return [*filter.structure.frame_keys, *filter.structure.step_keys]

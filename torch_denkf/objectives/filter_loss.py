@@ -27,7 +27,7 @@ Scale = Sequence[float] | Tensor | None
 
 
 class ReadingsOptions(TypedDict, total=False):
-    """What every loss that scores readings takes.
+    """Declares the options of every loss that scores readings.
 
     Labels, true states and true observations, may have gaps. A mask of labels, which is named like them with
     ``_observed`` behind (``"state_observed"``; ``[*B, 1]``, or one for each dimension), says where there are some, and
@@ -50,7 +50,7 @@ class ReadingsOptions(TypedDict, total=False):
 
 
 class StateOptions(TypedDict, total=False):
-    """What every loss takes that scores the state.
+    """Declares the options of every loss that scores the state.
 
     The true state may have fewer dimensions than the belief: its labels are of the leading ones, or of ``dims``.
 
@@ -74,7 +74,7 @@ class StateOptions(TypedDict, total=False):
 
 
 class SequenceOptions(ReadingsOptions, StateOptions, total=False):
-    """What every loss of a whole filter takes, beside :class:`ReadingsOptions` and :class:`StateOptions`.
+    """Declares the options of losses of a whole filter, next to :class:`ReadingsOptions` and :class:`StateOptions`.
 
     Attributes:
         detach_every: truncated back-propagation: steps after which the belief is detached.
@@ -139,7 +139,7 @@ class Term(nn.Module):
         raise NotImplementedError
 
     def exists(self, loss: FilterLoss) -> bool:
-        """Whether there is what the term scores, for a weight of ``None``."""
+        """Tells whether there is what the term scores, for a weight of ``None``."""
         return True
 
 
@@ -251,7 +251,7 @@ class FilterLoss(Checked, LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What must be there."""
+        """Lists the keys that must be there."""
         return self._needed()
 
     @in_keys.setter
@@ -312,15 +312,15 @@ class FilterLoss(Checked, LossModule):
         return self.filter.inside(self._filters().sequence(tensordict.copy(), detach_every=self.detach_every))
 
     def _filters(self):
-        """What runs over the sequences."""
+        """Returns the filter that runs over the sequences."""
         return self.filter
 
     def _counts(self, tensordict: TensorDictBase) -> Tensor:
-        """Which elements were stepped to, ``[*B]``."""
+        """Marks the elements that a step led to, ``[*B]``."""
         return self.filter.stepped(tensordict)
 
     def _needed(self) -> list[NestedKey]:
-        """What the filter must find beside its belief, and the true state."""
+        """Lists the inputs of the filter next to its belief, and the true state."""
         structure = self.filter.structure
         needed = [*structure.needed, *structure.controls]
         supervised = any(term.needs_state for term in self.terms if term.name in self.weights)

@@ -164,7 +164,7 @@ class SensorLoss(FilterLoss):
         return placed[::-1]
 
     def _needed(self):
-        """What the modules read, and the true observation, or the state that it follows from."""
+        """Lists the inputs of the modules, and the true observation, or the state that it follows from."""
         model, keys = _terms.observation_model(self.filter), self.tensor_keys
         unknown = model is None or _terms.learns(model)
         needed = list(reads_of(self._trained())[0])
@@ -252,7 +252,7 @@ class TransitionLoss(FilterLoss):
         return [self.filter.transition_module]
 
     def _needed(self):
-        """What the transition reads beside the belief, and the true state."""
+        """Lists the inputs of the transition next to the belief, and the true state."""
         structure = self.filter.structure
         needed = [*structure.needed, *structure.controls]
         read = reads(self.filter.transition_module)[0]
@@ -322,7 +322,7 @@ def forecasts_from_truth(
     members: int | None,
     space: Space | None = None,
 ) -> Entries:
-    """What the transition writes at every time of ``[*B, T]`` where the state before was the true one.
+    """Forecasts every time of ``[*B, T]`` from the true state before.
 
     What else the belief carries is read where it is stored, and taken from the initial belief of that time where not.
 
@@ -365,7 +365,7 @@ def forecasts_from_truth(
 
 
 def _belief_at(truth: Tensor, belief: str, spread: Tensor, members: int | None, space: Space | None) -> Entries:
-    """What a belief may hold that is at the truth, or around it by ``spread``."""
+    """Returns the entries of a belief at the truth, or around it by ``spread``."""
     size = truth.shape[-1] if space is None else space.tangent_dim
     std = spread.to(truth.dtype).expand(*truth.shape[:-1], size)
     if members is None:

@@ -11,7 +11,6 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torch_denkf.deployment.files import replacing
 from torch_denkf.plots._axes import times_of
 from torch_denkf.plots._belief import Truth, entry_of, read_belief
 from torch_denkf.plots._frames import as_picture, write_gif, write_mp4
@@ -52,6 +51,8 @@ def write_video(file: str | Path, frames: Iterable[Tensor | np.ndarray], fps: fl
         raise ValueError(f"a video ends with .mp4 or .gif; got {file.name!r}")
     if not fps > 0 or (file.suffix.lower() == ".gif" and fps > 50):
         raise ValueError(f"fps must be positive, and at most 50 for a GIF; got {fps}")
+    from torch_denkf.deployment.files import replacing  # its package brings the filters, and pictures need none
+
     with replacing(file) as beside:
         writers[file.suffix.lower()](beside, (as_picture(frame) for frame in frames), fps)
     return file

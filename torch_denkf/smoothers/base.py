@@ -92,7 +92,7 @@ class Smoother(Checked, TensorDictModuleBase):
         return tensordict
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:
-        """Which elements were stepped to, see :meth:`Filter.stepped`."""
+        """Marks the elements that a step led to, see :meth:`Filter.stepped`."""
         return self.filter.stepped(tensordict)
 
     def _filter_for(self, count: int) -> Filter:

@@ -111,7 +111,7 @@ class FixedLag(Filter):
 
 
 def kind_of(filter: Filter) -> tuple[str, str]:
-    """What the belief is, ``"ensemble"``, ``"moments"`` or ``"particles"``, and the prefix of its entries.
+    """Returns the kind of belief, ``"ensemble"``, ``"moments"`` or ``"particles"``, and the prefix of its entries.
 
     Raises:
         TypeError: for a filter that cannot be smoothed.

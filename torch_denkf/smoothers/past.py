@@ -30,7 +30,7 @@ __all__ = ["ENSEMBLE_PAST", "EnsemblePast", "LaggedAnalysis", "LaggedBelief", "P
 
 
 class Past(NamedTuple):
-    """Which entries hold the last L states, and what is believed of the oldest.
+    """Names the entries of the lag window, and of the posterior of its oldest state.
 
     Attributes:
         carried: last names of the entries.
@@ -199,7 +199,7 @@ def lagged(analysis: Update) -> Update:
 
 
 class LaggedBelief(SubModel):
-    """What is believed of the state L steps ago, given all readings up to now.
+    """Writes the posterior of the state L steps ago, given all readings up to now.
 
     Args:
         belief_prefix: prefix of the ``past`` ``[*B, E, L, S]`` that is carried on, and of ``log_weight`` ``[*B, E]``.

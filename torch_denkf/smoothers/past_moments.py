@@ -62,7 +62,7 @@ class CrossTransition(Wrapper, Transition):
         return {**written, unravel_key(self.out_keys[-1]): cross}
 
     def without_step(self, entries):
-        """What stands beside the forecast where an episode begins: there is no state before."""
+        """Returns the cross-covariance at a reset, zero: there is no state before."""
         cov = self.required(entries, self.in_keys[1])
         return {unravel_key(self.out_keys[-1]): torch.zeros_like(cov)}
 

@@ -1,4 +1,4 @@
-"""What torchrl environments see of a filter."""
+"""Transforms of torchrl that run a filter in an environment."""
 
 from torch_denkf.transforms.denkf import DEnKFTransform
 from torch_denkf.transforms.primer import LastAction

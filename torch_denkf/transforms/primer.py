@@ -1,4 +1,4 @@
-"""What an environment must carry where a filter is part of the policy, beside the last belief: the action since."""
+"""Primer that keeps the previous action for a filter inside a policy."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ class Flat(Space):
         return torch.zeros(self.size) if like is None else like.new_zeros(self.size)
 
     def normalise(self, point):
-        """The same numbers, angles wrapped."""
+        """Wraps the angles among the numbers."""
         return self._apart(lambda angle: (wrap_angles(angle),), _same, point)[0]
 
     exp = log = normalise

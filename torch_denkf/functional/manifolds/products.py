@@ -310,7 +310,7 @@ def places_of(space: Space) -> list[Place]:
 
 
 def whole_parts(space: Space, known: Tensor) -> tuple[Tensor, Tensor]:
-    """Of which parts all is known: a rotation of which one number is missing is not, nor is its pose.
+    """Marks the parts of which all is known: a rotation of which one number is missing is not, nor is its pose.
 
     Args:
         space: S.

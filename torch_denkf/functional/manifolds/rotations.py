@@ -51,7 +51,7 @@ class SE2(Space):
         return torch.cat([back[..., :1], _turn(back, back[..., 1:])], -1)
 
     def exp(self, tangent):
-        """Where a constant twist leads: an arc."""
+        """Maps a constant twist to the pose that it leads to, along an arc."""
         along, across = self._arc(tangent[..., :1])
         x, y = tangent[..., 1:2], tangent[..., 2:]
         return torch.cat([wrap_angles(tangent[..., :1]), along * x - across * y, across * x + along * y], -1)
@@ -141,14 +141,14 @@ class _RotationAndVectors(Space):
         return torch.cat([turn, moved.flatten(-2)], -1)
 
     def inverse(self, point):
-        """What undoes it."""
+        """Returns the inverse."""
         back = conjugate(point[..., :4])
         if not self.vectors:
             return back
         return torch.cat([back, -rotate(back.unsqueeze(-2), self._vectors(point, 4)).flatten(-2)], -1)
 
     def exp(self, tangent):
-        """Where a constant rate of all leads."""
+        """Maps a tangent, a constant rate of all, to the point that it leads to."""
         angles = tangent[..., :3]
         square = angles.square().sum(-1, keepdim=True)
         quaternion = torch.cat([series(square, cos_half), 0.5 * series(square, sinc_half) * angles], -1)
@@ -201,7 +201,7 @@ class _RotationAndVectors(Space):
         return self._matrix(turn, skew(self._vectors(point, 4)) @ turn.unsqueeze(-3)) if self.vectors else turn
 
     def _matrix(self, block: Tensor, low: Tensor) -> Tensor:
-        """Of blocks ``[*, 3, 3]`` on the diagonal, and others ``[*, K, 3, 3]`` below the first."""
+        """Assembles a matrix of blocks ``[*, 3, 3]`` on the diagonal, and others ``[*, K, 3, 3]`` below the first."""
         first = torch.cat([block, low.flatten(-3, -2)], -2)
         others = eye(block[..., 0], self.vectors)[..., None, :, None] * block[..., None, :, None, :]
         others = others.flatten(-2).flatten(-3, -2)

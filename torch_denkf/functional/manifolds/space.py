@@ -35,7 +35,7 @@ class Space:
 
     @property
     def flat(self) -> Flat | None:
-        """The same space as lines and circles in closed form; ``None`` for a space that holds anything else."""
+        """Returns the space as lines and circles in closed form; ``None`` for a space that holds anything else."""
         return None
 
     def __mul__(self, other: Space) -> Product:
@@ -51,11 +51,11 @@ class Space:
         raise NotImplementedError
 
     def inverse(self, point: Tensor) -> Tensor:
-        """What takes a point ``[*, P]`` back to the neutral one."""
+        """Returns the inverse of a point ``[*, P]``, which takes it back to the neutral one."""
         raise NotImplementedError
 
     def exp(self, tangent: Tensor) -> Tensor:
-        """Where a tangent ``[*, D]`` leads from the neutral point, ``[*, P]``."""
+        """Maps a tangent ``[*, D]`` at the neutral point to the point that it leads to, ``[*, P]``."""
         raise NotImplementedError
 
     def log(self, point: Tensor) -> Tensor:
@@ -158,7 +158,7 @@ class Space:
         return self.minus(predicted, expected), self.innovation(reading, expected, mask)
 
     def _whole(self, known: Tensor) -> tuple[Tensor, Tensor]:
-        """What :func:`whole_parts` says of a space that is no product."""
+        """Returns :func:`whole_parts` of a space that is no product."""
         known = known.all(-1, keepdim=True)
         return known.expand(*known.shape[:-1], self.point_dim), known.expand(*known.shape[:-1], self.tangent_dim)
 
