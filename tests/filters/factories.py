@@ -95,7 +95,9 @@ class Perturbed(Update):
 
     def __init__(self, *, masked=False, reading="observation", info="info"):
         reads = [("forecast", "ensemble"), ("forecast", "observation"), reading, ("sensor", "noise")]
-        writes = [("belief", name) for name in ("ensemble", "mean", "var")] + [(info, name) for name in ("innovation", "nis", "log_likelihood")]
+        writes = [("belief", name) for name in ("ensemble", "mean", "var")] + [
+            (info, name) for name in ("innovation", "nis", "log_likelihood")
+        ]
         super().__init__(nn.Identity(), reads, writes, optional_keys=["observed"] if masked else [])
         self.reading_keys, self.info_prefix = self.in_keys[2:], info
 

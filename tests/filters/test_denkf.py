@@ -12,6 +12,7 @@ from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
     LearnedTransition,
+    LinearObservation,
     NoisyTransition,
     Select,
     StochasticMLP,

@@ -149,7 +149,8 @@ class AroundState(_InitialEnsemble):
 class FromSensor(_InitialEnsemble):
     """A belief from the first sensor reading: observed dimensions N(mean reading, R), the others a Gaussian prior.
 
-    Where nothing is observed at reset, the prior alone is used, as with ``filter.initialise(..., without=[...])``.
+    Where nothing is observed at reset, the prior alone is used, as with ``filter.initialise(..., without=[...])``, or
+    where it is called by itself on a tensordict without the reading.
 
     Args:
         dims: state dimensions that the sensor reads, in the observation's order.
@@ -162,7 +163,7 @@ class FromSensor(_InitialEnsemble):
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
 
     Raises:
-        KeyError: if an entry is missing.
+        KeyError: if an entry is missing in a filter, or the noise of a reading that is there.
 
     Example:
         >>> from tensordict import TensorDict
@@ -192,7 +193,7 @@ class FromSensor(_InitialEnsemble):
 
     def on_entries(self, entries, call):
         """The belief; without its reading the prior."""
-        if all(key in entries for key in self.in_keys):
+        if self.in_keys[0] in entries:
             return super().on_entries(entries, call)
         mean, std = (part.expand(*call.batch_size, -1) for part in (self.mean, self.std))
         noise = cast("torch.Tensor | None", self._noise(entries, [], call))
