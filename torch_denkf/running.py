@@ -10,6 +10,7 @@ from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
+from torch_denkf._registered import diagnosis
 from torch_denkf.submodel import EXPLAINED, Call, Entries, Sensor, SubModel, role
 
 __all__ = [
@@ -66,7 +67,7 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
             except EXPLAINED as error:
                 if torch.compiler.is_compiling():
                     raise
-                raise module.explained(error, entries) from error
+                raise diagnosis().explained(module, error, entries) from error
         if is_sequence(module):
             return run_modules(named_modules_of(module), entries, call)
     keys, optional = reads(module)

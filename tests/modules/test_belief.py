@@ -81,9 +81,6 @@ class TestFromSensor:
         )
         assert_moments(self.start()(td), torch.tensor([1.0, 2.0, 9.0]), torch.tensor([0.1, 0.2, 2.0]))
 
-    def test_without_its_reading_it_is_the_prior(self, float64):
-        assert_moments(self.start()(TensorDict({("sensor", "noise"): torch.ones(2)})), self.mean, self.std)
-
     def test_a_filter_whose_start_lacks_its_reading_says_so(self):
         start = FromSensor([0], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, observation_key="readng")
         frames = TensorDict({"observation": torch.zeros(2, 3, 2), ("sensor", "noise"): torch.ones(2, 3, 1)}, [2, 3])

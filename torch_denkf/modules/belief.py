@@ -3,10 +3,9 @@ r"""Initial beliefs: the first ensemble :math:`X_0 = [x^1_0, \dots, x^E_0]` of a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf._checks import check_count, check_values
@@ -149,8 +148,7 @@ class AroundState(_InitialEnsemble):
 class FromSensor(_InitialEnsemble):
     """A belief from the first sensor reading: observed dimensions N(mean reading, R), the others a Gaussian prior.
 
-    Where nothing is observed at reset, the prior alone is used, as with ``filter.initialise(..., without=[...])``, or
-    where it is called by itself on a tensordict without the reading.
+    Where nothing is observed at reset, the prior alone is used, as with ``filter.initialise(..., without=[...])``.
 
     Args:
         dims: state dimensions that the sensor reads, in the observation's order.
@@ -163,7 +161,7 @@ class FromSensor(_InitialEnsemble):
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
 
     Raises:
-        KeyError: if an entry is missing in a filter, or the noise of a reading that is there.
+        KeyError: if an entry is missing.
 
     Example:
         >>> from tensordict import TensorDict
@@ -189,15 +187,7 @@ class FromSensor(_InitialEnsemble):
         register_location(self, "mean", mean)
         check_dims("dims", dims, once=True, size=self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
-        self.input_dim = len(self.dims)
-
-    def on_entries(self, entries, call):
-        """The belief; without its reading the prior."""
-        if self.in_keys[0] in entries:
-            return super().on_entries(entries, call)
-        mean, std = (part.expand(*call.batch_size, -1) for part in (self.mean, self.std))
-        noise = cast("torch.Tensor | None", self._noise(entries, [], call))
-        return self.by_key(self._members(mean, std, noise, call.batch_size))
+        self.input_dim, self.observed_key = len(self.dims), unravel_key(observed_key)
 
     def compute(self, reading, variance, observed=None, *, noise, batch_size):
         """The belief."""
