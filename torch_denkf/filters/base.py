@@ -528,7 +528,7 @@ class Filter(Checked, TensorDictSequential):
     def draw_noise(self, tensordict: TensorDictBase, *, generator: torch.Generator | None = None) -> TensorDictBase:
         """Writes the noise that the modules will need on ``tensordict`` (one step or a sequence), drawn in bulk.
 
-        Noise that is there already is kept. Noise that depends on a size which only the step knows is drawn there.
+        Noise that is there already is kept.
         """
         size, entries = tensordict.batch_size, self.entries_of(tensordict)
         places, time = (*dict(self.structure.modules), "initial"), len(size) > 0
@@ -712,8 +712,8 @@ class Filter(Checked, TensorDictSequential):
             row = {key: value.flatten(0, len(size) - 1)[:1] if size else value for key, value in row.items()}
         else:
             row = {key: value.new_zeros(1, *value.shape[len(size) :]) for key, value in row.items()}
-        call = Call(torch.Size([1] if size else []))
-        with torch.random.fork_rng(devices=[]), set_recurrent_mode(False), recorded_draws(self, self._random) as drawn:
+        call, devices = Call(torch.Size([1] if size else [])), [x.device for x in row.values() if x.is_cuda][:1]
+        with torch.random.fork_rng(devices), set_recurrent_mode(False), recorded_draws(self, self._random) as drawn:
             start = run_module(self.initial, {**self._nothing(call.batch_size), **row}, call.part("initial"))
             # Where an entry has not come yet, what reads it asks for what it did before; the step itself raises.
             with suppress(KeyError, *EXPLAINED):
