@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from tests.filters.factories import has_compiler, linear_denkf, toy_denkf, toy_frames
+from tests.filters.factories import Perturbed, has_compiler, linear_denkf, linear_kalman, toy_denkf, toy_frames
 from torch_denkf.compilation import need_compiler
 from torch_denkf.modules import ConstantNoise, LearnedObservation, StochasticMLP
 
@@ -24,7 +24,7 @@ def assert_close(ours, theirs, keys, dtype):
 @pytest.mark.parametrize("dtype", [pytest.param(torch.float32, marks=pytest.mark.slow), torch.float64])
 def test_compiled_is_eager_forward_and_backward(dtype):
     filter = toy_denkf("perturbed").to(dtype)
-    frames = toy_frames((2, 6), masks=2)  # the start and a chunk, a chunk, and a step that is left over
+    frames = toy_frames((2, 7), masks=2)  # a chunk, chunks that detach the belief, and a step that is left over
     frames["measurement"], frames["action"] = frames["measurement"].to(dtype), frames["action"].to(dtype)
     filter.draw_noise(frames)
     eager = filter.sequence(frames.copy(), detach_every=2)
@@ -33,7 +33,7 @@ def test_compiled_is_eager_forward_and_backward(dtype):
     filter.compile(chunk=2, backend="eager")
     compiled = filter.sequence(frames.copy(), detach_every=2)
     compiled_step = filter.step(eager[:, 2].copy())
-    assert sorted(kind[0] for kind in filter.compiled._functions) == ["chunk", "chunk", "first", "step"]
+    assert sorted(kind[0] for kind in filter.compiled._functions) == ["chunk", "chunk", "chunk", "step"]
     assert_close(compiled, eager, filter.out_keys, dtype)
     assert_close(compiled_step, eager_step, filter.out_keys, dtype)
     ours = torch.autograd.grad(compiled["belief", "mean"].square().sum(), list(filter.parameters()))
@@ -97,14 +97,83 @@ def test_what_changes_after_compiling_is_noticed(monkeypatch):
     agree(lambda model: freeze(model, False))
     agree(lambda model: setattr(model["analysis"], "inflation", 1.5))
     agree(lambda model: setattr(model["observation"].module, "activation", nn.Tanh()))
-    agree(lambda model: model.with_modules(noise=ConstantNoise([1.0, 2.0], in_key="observation")))
-    agree(lambda model: setattr(model, "update_at_reset", True))
     assert means[0].equal(means[1])
     for before, after in pairwise(means[1:]):
         assert not torch.allclose(before, after)
     frames = frames.double()
     agree(lambda model: model.double())
     assert means[-1].dtype == torch.double
+
+
+def test_a_new_filter_of_other_modules_or_options_compiles_its_own(float64):
+    frames = toy_frames((2, 3), masks=0, resets=False)
+    filter = toy_denkf().double().eval()
+    compiled = toy_denkf().double().eval().compile(chunk=2, backend="eager")
+    compiled.load_state_dict(filter.state_dict())
+    noise, means = ConstantNoise([1.0, 2.0], in_key="measurement"), []
+    for change in (
+        lambda one: one,
+        lambda one: one.with_modules(noise=noise),
+        lambda one: one.with_options(update_at_reset=True),
+    ):
+        outs = []
+        for model in map(change, (filter, compiled)):
+            torch.manual_seed(1)
+            out = model.sequence(frames.copy())
+            outs.append(torch.cat([out["belief", "mean"], model.step(out[:, 1].copy())["belief", "mean"][:, None]], 1))
+        torch.testing.assert_close(outs[1], outs[0], rtol=0, atol=1e-12)
+        assert model.compiled is not None
+        assert {kind[0] for kind in model.compiled._functions} == {"chunk", "step"}
+        means.append(outs[0])
+    assert model.compiled is not compiled.compiled
+    for other in means[1:]:
+        assert not torch.allclose(other, means[0])
+
+
+def test_predictions_and_steps_without_a_reading_stay_eager(float64):
+    for make in (linear_denkf, linear_kalman):
+        eager, filter = make(), make().compile(backend="eager")
+        td = filter.initialise(TensorDict({"observation": torch.zeros(2)}))
+        predicted, left_out = filter.predict(td.copy()), filter.step(td.copy(), without=["observation"])
+        assert not filter.compiled._functions
+        expected = eager.predict(td.copy())["belief"]
+        for belief in (predicted["belief"], left_out["belief"]):
+            for key in ("mean", "var"):
+                assert belief[key].equal(expected[key])
+
+
+def test_a_stochastic_analysis_of_a_users_own_compiles(float64):
+    """And gives what the library's own gives for the same seed, compiled or not."""
+    frames, outs = TensorDict({"observation": torch.randn(3, 5, 2)}, [3, 5]), []
+    for analysis, chunk in ((None, 0), (Perturbed(), 0), (Perturbed(), 2)):
+        filter = linear_denkf("perturbed", noisy=True)
+        if analysis is not None:
+            filter = filter.with_modules(analysis=analysis)
+        filter.compile(chunk=chunk, backend="eager")
+        torch.manual_seed(1)
+        out = filter.sequence(frames.copy())
+        step = filter.step(out[:, -1].copy())
+        outs.append(torch.cat([out["belief", "mean"], step["belief", "mean"].unsqueeze(1)], 1))
+    assert {kind[0] for kind in filter.compiled._functions} == {"chunk", "step"}
+    for out in outs[1:]:
+        torch.testing.assert_close(out, outs[0], rtol=0, atol=1e-12)
+
+
+def test_a_first_call_that_resets_all_rows_is_compared_all_the_same():
+    """Where the belief is reset nothing of the transition shows, and one function serves all steps."""
+
+    def wrong_after_a_step(graph, example):
+        def run(*inputs):
+            (goes_on,) = (value for value in inputs if value.dtype == torch.bool)
+            off = goes_on.any().float()
+            return tuple(value + off if value.is_floating_point() else value for value in graph(*inputs))
+
+        return run
+
+    frames = TensorDict({"observation": torch.randn(2, 1, 2)}, [2, 1])
+    filter = linear_kalman().compile(chunk=1, backend=wrong_after_a_step)
+    with torch.no_grad(), pytest.raises(RuntimeError, match="compiled sequence is wrong"):
+        filter.sequence(frames)
 
 
 def test_a_compiled_step_draws_its_noise_outside_and_anew():

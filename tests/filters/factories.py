@@ -6,8 +6,8 @@ from torch import nn
 
 from torch_denkf.compilation import need_compiler
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter
-from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.modules import EnsembleAnalysis, GaussianPrior, Initial, StochasticMLP, Transition
+from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.modules import EnsembleAnalysis, GaussianPrior, Initial, StochasticMLP, Transition, Update
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation
 from torch_denkf.modules.sensor import VectorSensor
@@ -86,6 +86,34 @@ class FixedEnsemble(Initial):
     def compute(self, *, batch_size):
         ensemble = self.members.expand(*batch_size, *self.members.shape)
         return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)
+
+
+class Perturbed(Update):
+    """A stochastic analysis as a user writes it, with or without a mask."""
+
+    noise_names = ("",)
+
+    def __init__(self, *, masked=False, reading="observation", info="info"):
+        reads = [("forecast", "ensemble"), ("forecast", "observation"), reading, ("sensor", "noise")]
+        writes = [("belief", name) for name in ("ensemble", "mean", "var")] + [
+            (info, name) for name in ("innovation", "nis", "log_likelihood")
+        ]
+        super().__init__(nn.Identity(), reads, writes, optional_keys=["observed"] if masked else [])
+        self.reading_keys, self.info_prefix = self.in_keys[2:], info
+
+    def draw_noise(self, batch_size, *, members=None, observation_dim=None, device=None, dtype=None, **_):
+        if members is None or observation_dim is None:
+            return None
+        return torch.randn(*batch_size, members, observation_dim, device=device, dtype=dtype)
+
+    def noise_sizes(self, forecast, predicted, *_):
+        return {"members": forecast.shape[-2], "observation_dim": predicted.shape[-1]}
+
+    def compute(self, forecast, predicted, reading, variance, observed=None, *, noise):
+        ensemble, *rest = analyse(
+            forecast, predicted, reading, variance, scheme="perturbed", observed=observed, perturbation=noise
+        )
+        return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), *rest
 
 
 def linear_system(dtype=None):

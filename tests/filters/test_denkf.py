@@ -5,12 +5,14 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
     EnsembleAnalysis,
     LearnedTransition,
+    LinearObservation,
     NoisyTransition,
     Select,
     StochasticMLP,
@@ -123,3 +125,31 @@ def test_process_noise_of_another_width_leaves_the_analysis_its_own():
     )
     noise = denkf.draw_noise(TensorDict({"y": torch.zeros(5, 2)}, [5]))
     assert noise["noise", "analysis"].shape == (5, 8, 2)
+
+
+def test_the_mask_of_a_filters_default_analysis_can_be_named(float64):
+    """Oracle: the mask under its usual name."""
+    F, Q, H, R = linear_system()
+    frames = TensorDict({"observation": torch.randn(3, 6, 2), "gps_observed": torch.rand(3, 6, 2) < 0.5}, [3, 6])
+    renamed = frames.clone().rename_key_("gps_observed", "observed")
+    noise = ConstantNoise(R.sqrt(), in_key="observation")
+    initial = linear_denkf().initial
+    for make in (
+        lambda **keys: linear_kalman(**keys),
+        lambda **keys: DEnKF(
+            NoisyLinear(F, torch.linalg.cholesky(Q)),
+            None,
+            LinearObservation(H),
+            noise,
+            initial=initial,
+            observation_key="observation",
+            **keys,
+        ),
+    ):
+        outs = []
+        for filter, given in ((make(), renamed), (make(observed_key="gps_observed"), frames)):
+            torch.manual_seed(1)
+            outs.append(filter.sequence(given.copy())["belief", "mean"])
+        assert outs[0].equal(outs[1])
+    with pytest.raises(ValueError, match="observed_key are for the default analysis"):
+        DEnKF(noise, None, noise, noise, linear_denkf()["analysis"], initial=initial, observed_key="gps_observed")

@@ -10,6 +10,7 @@ from torch import nn
 from tests.filters.beliefs_for_tests import BELIEF, ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import (
     NoisyLinear,
+    Perturbed,
     linear_denkf,
     linear_kalman,
     linear_system,
@@ -122,6 +123,13 @@ def test_a_prediction_refuses_an_analysis_that_does_not_name_its_reading(float64
     close(still, {MEAN: still["forecast", "ensemble"].mean(-2)}, [MEAN])
     with pytest.raises(KeyError, match=r"Halfway at place 'analysis' .*reading_keys"):
         nameless.predict(start)
+
+
+def test_an_analysis_without_a_mask_cannot_do_without_its_reading():
+    filter = linear_denkf("perturbed", noisy=True).with_modules(analysis=Perturbed())
+    td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
+    with pytest.raises(KeyError, match="its reading_keys and its observed_key"):
+        filter.predict(td)
 
 
 def test_an_analysis_that_cannot_take_a_past_says_what_to_write(float64):

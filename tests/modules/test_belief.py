@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.filters.factories import linear_denkf
 from torch_denkf.modules import AroundState, FromSensor, GaussianPrior
 
 E = 40_000
@@ -79,6 +80,15 @@ class TestFromSensor:
             }
         )
         assert_moments(self.start()(td), torch.tensor([1.0, 2.0, 9.0]), torch.tensor([0.1, 0.2, 2.0]))
+
+    def test_a_filter_whose_start_lacks_its_reading_says_so(self):
+        start = FromSensor([0], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, observation_key="readng")
+        frames = TensorDict({"observation": torch.zeros(2, 3, 2), ("sensor", "noise"): torch.ones(2, 3, 1)}, [2, 3])
+        filter = linear_denkf(initial=start)
+        with pytest.raises(KeyError, match="FromSensor reads 'readng', which is missing"):
+            filter.initialise(frames[:, 0].copy())
+        with pytest.raises(KeyError, match="FromSensor reads 'readng', which is missing"):
+            filter.sequence(frames)
 
     def test_missing_noise_is_named(self):
         with pytest.raises(KeyError, match="'sensor', 'noise'"):

@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 
 __all__ = ["CompiledSteps"]
 
-#: Where an episode begins, among the names of what a chunk takes.
-_BEGINS = ("start", "begins")
+#: Where an episode goes on, among the names of what a chunk takes. It is compared like a frame's mask: where the first
+#: call resets all rows, nothing of the transition would show.
+_GOES_ON = ("start", "goes on")
 
 
 class CompiledSteps:
@@ -69,12 +70,12 @@ class CompiledSteps:
             here = tuple(cuts[begin : begin + length])
             now = tuple(inputs[key].narrow(time, begin, length) for key in keys)
             marked = max(0, min(length, resets.shape[time] - begin))
-            now_resets = resets.narrow(time, begin, marked) if marked else None
+            goes_on = ~resets.narrow(time, begin, marked) if marked else None
             now_starts = tuple(value.narrow(time, begin, marked) for value in starts.values()) if marked else ()
             kind = ("chunk", marked, keys, start_keys, batch, here, keep)
             make = partial(_chunk, steps, keys, start_keys, keep, batch, here)
-            names = (*steps.structure.carry, *keys, *((_BEGINS, *start_keys) if marked else ()))
-            given, writes = (carry, now, now_resets, now_starts), (*steps.structure.carry, *keep)
+            names = (*steps.structure.carry, *keys, *((_GOES_ON, *start_keys) if marked else ()))
+            given, writes = (carry, now, goes_on, now_starts), (*steps.structure.carry, *keep)
             carry, values = self._call(kind, steps, make, given, names, writes)
             outputs.append(values)
             begin += length
@@ -166,9 +167,9 @@ class BoundSteps(NamedTuple):
 
 
 def _frames(steps: Steps, names: tuple) -> list[NestedKey]:
-    """Returns the names of inputs that are neither noise nor beliefs, nor mark resets."""
+    """Returns the names of inputs that are neither noise nor beliefs."""
     structure = steps.structure
-    others = {*structure.carry, *structure.belief, _BEGINS}
+    others = {*structure.carry, *structure.belief}
     return [name for name in names if name not in others and name[0] != "noise"]
 
 
@@ -187,7 +188,8 @@ def _step(steps: Steps, keys: tuple, writes: tuple, batch: torch.Size) -> Callab
 
 
 def _chunk(steps: Steps, keys, start_keys, keep, batch: torch.Size, cuts: tuple) -> Callable:
-    def chunk(carry: tuple, inputs: tuple, resets: Tensor | None, starts: tuple) -> tuple[tuple, tuple]:
+    def chunk(carry: tuple, inputs: tuple, goes_on: Tensor | None, starts: tuple) -> tuple[tuple, tuple]:
+        resets = None if goes_on is None else ~goes_on
         carried = steps.structure.carry
         belief = dict(zip(carried, carry, strict=True))
         begins = dict(zip(start_keys, starts, strict=True)) if starts else {}

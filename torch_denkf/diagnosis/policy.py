@@ -15,7 +15,7 @@ __all__ = ["PolicyStart"]
 
 #: Beliefs that an environment's transform has brought up to the frame that comes with them.
 _UP_TO_DATE = WeakIdKeyDictionary()
-#: Beliefs that a policy's filter wrote for its next step, and a reference to that filter's observer.
+#: Beliefs that a policy's filter wrote for its next step, and a reference to that filter.
 _CARRIED = WeakIdKeyDictionary()
 
 
@@ -33,7 +33,8 @@ class PolicyStart(Once):
         if record.way == "environment":
             _UP_TO_DATE[record.written[carry]] = None
             return
-        belief = record.entries.get(previous_key(carry))
+        given = (record.tensordict.get(filter.outer(key), None) for key in (previous_key(carry), carry))
+        belief = next((value for value in given if value is not None), None)
         writer = None if belief is None else _CARRIED.get(belief)
         name = type(filter).__name__
         if belief is not None and belief in _UP_TO_DATE:
@@ -43,10 +44,10 @@ class PolicyStart(Once):
                 "already: each reading counts twice. Keep the filter in one place: in the environment, where the "
                 "policy reads ('belief', 'mean'), or in the policy behind filter.make_tensordict_primer().",
             )
-        if writer is not None and writer() is not self:
+        if writer is not None and writer() is not filter:
             self.warn(
                 "foreign",
                 f"{name} in a policy starts its step from a belief that another filter wrote. Where both are in one "
                 'policy, give one of them a name of its own, prefix="imu" for example.',
             )
-        _CARRIED[record.written["next", *previous_key(carry)]] = ref(self)
+        _CARRIED[record.written["next", *previous_key(carry)]] = ref(filter)

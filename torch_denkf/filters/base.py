@@ -351,13 +351,12 @@ class Filter(Checked, TensorDictSequential):
 
         The first call of each kind (chunk, batch size, with or without gradients) compiles, later ones reuse that;
         copies and pickles of the filter compile anew. Noise is drawn outside, so a seed gives what it gives eagerly, up
-        to rounding. Calls stay eager where the size of a noise is not known in advance, and in :meth:`predict` and
-        ``step(without=...)``, which would compile anew for each reading that is lost; a warning says so once. On a
-        policy's data they stay eager, too.
+        to rounding. Some calls stay eager: :meth:`predict`; ``step(without=...)``; in a policy, steps in which rows may
+        reset, and sequences of its data.
 
         Compilers have errors that nothing else shows. So the first call also runs eagerly, and where a reading is zero
-        or hidden both run again with numbers in it; a sequence with gradients is differentiated both ways, too. What
-        differs by more than rounding is refused.
+        or missing both run again with numbers in it; a sequence with gradients is differentiated both ways, too. What
+        differs by more than rounding raises.
 
         Args:
             chunk: steps of a sequence in one compiled graph. What is left over after whole chunks runs step by step. A
@@ -529,10 +528,12 @@ class Filter(Checked, TensorDictSequential):
     def draw_noise(self, tensordict: TensorDictBase, *, generator: torch.Generator | None = None) -> TensorDictBase:
         """Writes the noise that the modules will need on ``tensordict`` (one step or a sequence), drawn in bulk.
 
-        Noise that is there already is kept. Noise that depends on a size which only the step knows is drawn there.
+        Noise that is there already is kept.
         """
         size, entries = tensordict.batch_size, self.entries_of(tensordict)
-        return self.write(tensordict, self.missing_noise(entries, size, time=len(size) > 0, generator=generator))
+        places, time = (*dict(self.structure.modules), "initial"), len(size) > 0
+        noise = self.missing_noise(entries, size, places=places, time=time, generator=generator)
+        return self.write(tensordict, noise)
 
     def sequence(
         self,
@@ -680,11 +681,11 @@ class Filter(Checked, TensorDictSequential):
         entries: Entries,
         size: torch.Size,
         *,
-        places: Sequence[str] | None = None,
+        places: Iterable[str] | None = None,
         time: bool = False,
         generator: torch.Generator | None = None,
     ) -> Entries:
-        """Draws the noise of some modules, or all, that is not among the entries; one trial step tells the sizes."""
+        """Draws the noise of a step's modules, or of some, that is not there yet; one trial step tells the sizes."""
         if not self._random:
             return {}
         shapes = {
@@ -693,7 +694,7 @@ class Filter(Checked, TensorDictSequential):
         kind = tuple(sorted(shapes.items(), key=str))
         if kind not in self._drawn:
             self._drawn[kind] = self._trial(entries, size)
-        drawn = self._drawn[kind]
+        drawn, places = self._drawn[kind], dict(self.structure.modules) if places is None else places
         return draw_noise(drawn, entries, size, places=places, like=self.like(), time=time, generator=generator)
 
     def _nothing(self, batch_size: Sequence[int]) -> Entries:

@@ -52,7 +52,7 @@ def own(written: Entries, given: Iterable[Tensor] = ()) -> Entries:
 
 
 def check_belief(structure: Structure, entries: Entries, written: Entries) -> None:
-    """Raises where the new belief is not finite.
+    """Raises where the new belief is not finite, or the one that the step started from.
 
     Args:
         structure: of the filter.
@@ -64,8 +64,9 @@ def check_belief(structure: Structure, entries: Entries, written: Entries) -> No
     """
     finite = None
     for key, kind in structure.carried:
-        value = written[key]
-        if value.is_floating_point():
+        for value in (written[key], entries.get(key)):  # a particle that is not finite may have been resampled away
+            if value is None or not value.is_floating_point():
+                continue
             sound = value.isfinite().all() if kind is None else kind.finite(key[-1], value)
             finite = sound if finite is None else finite & sound
     if finite is None or flag_value(finite) is not False:

@@ -121,7 +121,7 @@ def _environments() -> Iterator[Subject]:
 
 def _tracked(**given: Any) -> Any:
     car = pretrained.LOADERS["car-odometry"](pretrained.FOLDERS["car-odometry"])
-    frames = [np.full((24, 72, 3), 40 * k, np.uint8) for k in range(4)]
+    frames = [np.full((24, 72, 3), 40 * k, np.uint8) for k in range(1, 5)]
     settings: dict[str, Any] = {"frames": frames, "calibration": (41.7, 41.7, 35.5, 11.5), "fps": 10.0, **given}
     if "times" in given:
         settings["fps"] = None

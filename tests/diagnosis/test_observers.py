@@ -1,0 +1,226 @@
+"""Observers see each run of a filter before anything is written; they go with its copies."""
+
+import copy
+import pickle
+import warnings
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.envs import InitTracker, TransformedEnv
+from torchrl.modules import set_recurrent_mode
+
+from tests.filters.factories import Perturbed, linear_denkf, linear_kalman, linear_system
+from torch_denkf.diagnosis.once import Once
+from torch_denkf.envs import LinearGaussianEnv
+from torch_denkf.filters.finish import Record
+from torch_denkf.transforms import DEnKFTransform
+
+MEAN = ("belief", "mean")
+WAYS = ("step", "sequence", "policy", "environment")
+
+
+class Seen:
+    """An observer that counts, and raises if it is told to."""
+
+    def __init__(self):
+        self.ways, self.records, self.raises = WAYS, [], False
+
+    def __call__(self, filter, record):
+        self.records.append((record, [key for key in filter.out_keys if key in record.tensordict.keys(True, True)]))
+        if self.raises:
+            raise RuntimeError("stop")
+
+
+def frames(*batch):
+    return TensorDict({"observation": torch.randn(*batch, 2)}, batch)
+
+
+def environment(*transforms):
+    F, Q, H, R = linear_system()
+    env = TransformedEnv(LinearGaussianEnv(F, H, Q.diag().sqrt(), R.sqrt(), batch_size=[2]))
+    for transform in transforms:
+        env.append_transform(transform)
+    return env
+
+
+def actor():
+    return TensorDictModule(lambda mean: mean[..., :1], [MEAN], ["action"])
+
+
+def run(filter, way):
+    """Runs a filter in a way, and returns how often it must have been seen."""
+    if way == "step":
+        row = filter.initialise(frames(2))
+        for _ in range(3):
+            row = filter.step(row)
+        return 3
+    if way == "sequence":
+        filter.sequence(frames(2, 5))
+        with set_recurrent_mode(True):
+            filter(frames(2, 4))
+        return 2
+    if way == "policy":
+        environment(InitTracker(), filter.make_tensordict_primer()).rollout(6, TensorDictSequential(filter, actor()))
+        return 6
+    environment(DEnKFTransform(filter)).rollout(4, actor())
+    return 4
+
+
+@pytest.mark.parametrize("make", [linear_kalman, linear_denkf])
+@pytest.mark.parametrize("chunk", [0, 2])
+@pytest.mark.parametrize("way", WAYS)
+def test_a_run_is_seen_once(make, chunk, way):
+    filter, seen = make().compile(chunk=chunk, backend="eager"), Seen()
+    filter.observers.append(seen)
+    count = run(filter, way)
+    assert len(seen.records) == count
+    for record, _ in seen.records:
+        assert isinstance(record, Record)
+        assert record.way == way
+        assert record.entries["observation"].shape[0] == record.written[MEAN].shape[0] == 2
+        assert record.written[MEAN].ndim == 2 + (way == "sequence")
+        assert (record.env is not None) == (way == "environment")
+
+
+@pytest.mark.parametrize("way", ["step", "sequence", "policy"])
+def test_an_observer_that_raises_leaves_the_tensordict_as_it_was(way):
+    filter, seen = linear_kalman(), Seen()
+    filter.observers, seen.raises = [seen], True
+    td = frames(2, 5) if way == "sequence" else filter.initialise(frames(2))
+    before = td.clone()
+    names = {"step": filter.step, "sequence": filter.sequence, "policy": filter}
+    with pytest.raises(RuntimeError, match="stop"):
+        names[way](td)
+    assert set(td.keys(True, True)) == set(before.keys(True, True))
+    assert all(td[key].equal(value) for key, value in before.items(True, True))
+
+
+def test_an_observer_that_raises_stops_an_environment_before_it_emits_a_belief():
+    filter, seen = linear_kalman(), Seen()
+    env = environment(DEnKFTransform(filter))
+    row = env.rand_action(env.reset())
+    filter.observers, seen.raises = [seen], True
+    with pytest.raises(RuntimeError, match="stop"):
+        env.step(row)
+    ((_, written),) = seen.records
+    assert not written
+
+
+def test_observers_see_only_the_ways_that_they_name():
+    filter, seen = linear_kalman(), Seen()
+    filter.observers, seen.ways = [seen], ("sequence",)
+    for way in WAYS:
+        run(filter, way)
+    assert {record.way for record, _ in seen.records} == {"sequence"}
+
+
+def test_a_function_is_an_observer():
+    filter, ways = linear_kalman(), []
+    filter.observers = [lambda filter, record: ways.append(record.way)]
+    filter.step(filter.initialise(frames(2)))
+    assert ways == ["step"]
+
+
+# -------------------------------------------------------------------------------------------- the default observers
+
+
+def masked(filter):
+    """Runs that warn of a mask that is not read."""
+    hidden = frames(2, 3).set("observed", torch.zeros(2, 3, 1, dtype=torch.bool))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        filter.sequence(hidden.copy())
+        filter.step(filter.initialise(hidden[:, 0].copy()))
+    return [str(one.message) for one in said]
+
+
+def blind():
+    return linear_denkf("perturbed", noisy=True).with_modules(analysis=Perturbed())
+
+
+def test_clearing_the_observers_silences_all():
+    filter = blind()
+    filter.observers.clear()
+    assert masked(filter) == []
+    several = frames(2, 3, 4).select("observation")  # not of one robot: an observer would raise
+    row = linear_kalman().initialise(frames(2)).set("observation", several["observation"][:, 0])
+    with pytest.raises(ValueError, match="too many"):
+        linear_kalman().step(row.copy())
+    quiet = linear_kalman(variance_ceiling=1.0)
+    quiet.observers.clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        quiet.step(row)
+        environment(DEnKFTransform(quiet)).rollout(3, TensorDictSequential(quiet, actor()))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda filter: pickle.loads(pickle.dumps(filter))])
+@pytest.mark.parametrize("ran", [False, True])
+def test_observers_go_with_a_copy(copied, ran):
+    """Its own, and what was said of the original is not said again."""
+    filter, seen = blind(), Seen()
+    filter.observers.append(seen)
+    if ran:
+        assert len(masked(filter)) == 1
+        assert masked(filter) == []
+    other, before = copied(filter), len(seen.records)
+    (own,) = (one for one in other.observers if isinstance(one, Seen))
+    assert own is not seen
+    assert len(masked(other)) == (0 if ran else 1)
+    assert len(seen.records) == before
+    assert len(own.records) == before + 2
+    assert masked(other) == []
+
+
+def test_a_filter_of_other_modules_or_options_has_the_observers():
+    filter, seen = linear_kalman(), Seen()
+    filter.observers = [seen]
+    for other in (filter.with_options(update_at_reset=True), filter.with_modules(initial=filter.initial)):
+        other.step(other.initialise(frames(2)))
+        other.observers.clear()
+    assert len(seen.records) == 2
+    assert filter.observers == [seen]
+
+
+def test_each_warning_is_given_once():
+    class Far(Once):
+        def __call__(self, filter, record):
+            for name in ("mean", "var"):
+                if (record.written["belief", name].abs() > 1e-3).any():
+                    self.warn(name, f"{name} is large.")
+
+    filter = linear_kalman()
+    filter.observers = [Far()]
+    with pytest.warns(UserWarning, match="large. Said once.") as said:
+        run(filter, "step")
+    assert len(said) == 2
+
+
+# ------------------------------------------------------------------------------------------------------------- hooks
+
+
+@pytest.mark.parametrize("make", [linear_kalman, lambda: linear_denkf("perturbed", noisy=True)])
+@pytest.mark.parametrize("way", ["step", "sequence"])
+def test_a_hook_is_called_once_a_step(make, way):
+    """The trial step that finds the sizes of noise calls none."""
+    filter, calls = make(), {}
+    for place in ("transition", "analysis"):
+        calls[place] = []
+        filter[place].register_forward_hook(lambda module, read, out, place=place: calls[place].append(out.batch_size))
+        filter[place].register_forward_pre_hook(lambda module, read, place=place: calls[place].append("before"))
+    start = []
+    filter.initial.register_forward_hook(lambda module, read, out: start.append(out.batch_size))
+    if way == "sequence":
+        filter.sequence(frames(2, 5))
+        filter.sequence(frames(2, 5))
+        assert calls == dict.fromkeys(calls, ["before", torch.Size([2])] * 10)
+        assert start == [torch.Size([2, 1])] * 2
+        return
+    row = filter.initialise(frames(2))
+    for _ in range(3):
+        filter.step(row)
+    filter.draw_noise(frames(2, 3))
+    assert calls == dict.fromkeys(calls, ["before", torch.Size([2])] * 3)
+    assert start == [torch.Size([2])]
