@@ -18,7 +18,7 @@ from torch_denkf.fusion._updates import Updates
 from torch_denkf.fusion.joint_moments import JOINT_PAST, JointForecast, PresentOfJoint, joint_space
 from torch_denkf.fusion.parts import OfOwnErrors
 from torch_denkf.fusion.sensor import FusedSensor, wire
-from torch_denkf.imperfect.bias import FadingBias, biased_parts
+from torch_denkf.imperfect.bias import FadingBias
 from torch_denkf.modules import (
     EKFAnalysis,
     EKFTransition,
@@ -220,9 +220,9 @@ def _with_errors(transition, process_noise, initial, sensors):
     for name, sensor in sensors.items():
         observation, end = sensor.observation, begin
         if sensor.sensor_error is not None:
-            of_reading = sensor.reading_space
-            parts = biased_parts(sensor.sensor_error, transition, observation, process_noise, initial, of_reading)
-            transition, observation, process_noise, initial = parts
+            transition, observation, process_noise, initial = sensor.sensor_error.augmented(
+                transition, observation, process_noise, initial, sensor.reading_space
+            )
             end += len(sensor.sensor_error)
         made[name] = replace(sensor, observation=OfOwnErrors(observation, range(begin, end), total))
         begin = end
