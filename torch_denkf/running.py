@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
-from torch_denkf.submodel import EXPLAINED, Call, Entries, Sensor, SubModel, role
+from torch_denkf.submodel import EXPLAINED, Call, Entries, Sensor, SubModel, missing_entry, role
 
 __all__ = [
     "check_module",
@@ -83,9 +83,7 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
                 tensordict.set(("noise", own, name) if name else ("noise", own), value)
     missing = [key for key in keys if key not in entries]
     if missing and isinstance(module, TensorDictModule) and not isinstance(module, SubModel):
-        raise KeyError(
-            f"{type(module).__name__} reads {missing}, which is missing; there is {sorted(map(str, entries))}."
-        )
+        raise missing_entry(type(module).__name__, missing, entries, "Put the module that writes it in front.")
     tensordict = module(tensordict)
     return {key: tensordict.get(key) for key in map(unravel_key, module.out_keys)}
 

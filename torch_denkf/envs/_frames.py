@@ -11,6 +11,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import Transform
 
 from torch_denkf._arguments import Checked
+from torch_denkf.submodel import entry_of
 
 CHUNK = 2**20  # values in work at a time: 4 MB in float32
 
@@ -40,13 +41,7 @@ class FrameTransform(Checked, Transform):
         return torch.rand(tuple(shape), generator=self.generator, device=device) < self.p
 
     def _frame(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        frame = tensordict.get(key, None)
-        if frame is None:
-            present = sorted(map(str, tensordict.keys(True, True)))
-            raise KeyError(
-                f"{type(self).__name__} reads {key!r}, which is not there; there are {present}. Set in_keys=."
-            )
-        return frame
+        return entry_of(tensordict, key, type(self).__name__, "Set in_keys=.")
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Transforms frames of data: a sample of a replay buffer, or a whole drive; the argument stays as it is."""

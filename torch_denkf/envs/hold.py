@@ -10,6 +10,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from torch_denkf._arguments import Checked
+from torch_denkf.submodel import entry_of
 
 __all__ = ["HoldReading"]
 
@@ -48,25 +49,17 @@ class HoldReading(Checked, Transform):
     ):
         super().__init__(in_keys=[in_key, observed_key], out_keys=[out_key])
 
-    def _entry(self, tensordict: TensorDictBase, key: NestedKey, cure: str) -> Tensor:
-        value = tensordict.get(key, None)
-        if value is None:
-            present = sorted(map(str, tensordict.keys(True, True)))
-            raise KeyError(f"HoldReading reads {key!r}, which is not there; there are {present}. {cure}")
-        return value
-
     def _write(self, tensordict: TensorDictBase, before: Tensor | None) -> TensorDictBase:
-        reading = self._entry(tensordict, self.in_keys[0], "Set in_key=.")
+        reading = entry_of(tensordict, self.in_keys[0], "HoldReading", "Set in_key=.")
         cure = "Set observed_key=, or put what writes the mask, as MissingFrames does, before this transform."
-        observed = self._entry(tensordict, self.in_keys[1], cure)
+        observed = entry_of(tensordict, self.in_keys[1], "HoldReading", cure)
         observed = observed.reshape(*observed.shape, *(1,) * (reading.ndim - observed.ndim))
         before = torch.zeros_like(reading) if before is None else before
         return tensordict.set(self.out_keys[0], torch.where(observed, reading, before))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        before = self._entry(
-            tensordict, self.out_keys[0], "Start from env.reset(), and pass on what step_mdp() returns."
-        )
+        cure = "Start from env.reset(), and pass on what step_mdp() returns."
+        before = entry_of(tensordict, self.out_keys[0], "HoldReading", cure)
         return self._write(next_tensordict, before)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -87,7 +80,8 @@ class HoldReading(Checked, Transform):
         Raises:
             KeyError: if they do not.
         """
-        self._entry(tensordict, self.out_keys[0], "Append HoldReading to the environment, not to a replay buffer.")
+        cure = "Append HoldReading to the environment, not to a replay buffer."
+        entry_of(tensordict, self.out_keys[0], "HoldReading", cure)
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

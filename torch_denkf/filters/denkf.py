@@ -27,11 +27,6 @@ from torch_denkf.submodel import Update, role
 __all__ = ["DEnKF"]
 
 
-def _check_image_shape(shape: Sequence[int]) -> None:
-    if len(shape) != 3 or not all(isinstance(side, int) and side > 0 for side in shape):
-        raise ValueError(f"image_shape is (channels, height, width), positive; got {shape!r}")
-
-
 class DEnKF(Filter):
     r"""Differentiable ensemble Kalman filter: an ensemble through a stochastic network, updated by a learned sensor.
 
@@ -135,7 +130,6 @@ class DEnKF(Filter):
         """
         check_count("state_dim", state_dim)
         check_count("observation_dim", observation_dim)
-        _check_image_shape(image_shape)
         check_number("r", r, above=0)
         return cls(
             transition=LearnedTransition(StochasticMLP(state_dim, state_dim, (32, 32, 64, 64), rate=rate)),

@@ -8,6 +8,7 @@ from typing import Literal, Unpack
 from tensordict import unravel_key
 from tensordict.nn import TensorDictModuleBase
 
+from torch_denkf._checks import check_choice
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.parts import FilterParts, ReadingOptions
 from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel
@@ -89,8 +90,7 @@ class ParticleFilter(Filter):
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
         **options: Unpack[ReadingOptions],
     ):
-        if resampling not in ("systematic", "soft", "transport", None):
-            raise ValueError(f'resampling is "systematic", "soft", "transport" or None; got {resampling!r}.')
+        check_choice("resampling", resampling, ("systematic", "soft", "transport", None))
         if process_noise is not None and isinstance(transition, ResampledTransition):
             raise ValueError("A ResampledTransition holds its motion: put the process noise into that.")
         parts = FilterParts(

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_mask
 from torch_denkf.functional.manifolds import Space, is_flat, whole_parts
-from torch_denkf.submodel import Initial, role
+from torch_denkf.submodel import Initial, entry_of, role
 
 if TYPE_CHECKING:
     from torch_denkf.objectives.filter_loss import FilterLoss
@@ -158,14 +158,7 @@ class Truth:
             KeyError: if it is missing; the message ends with the ``cure``.
         """
         source = self.data if given else self.out
-        value = source.get(key, None)
-        if value is None:
-            present = ", ".join(sorted(map(str, source.keys(True, True))))
-            raise KeyError(
-                f"{type(self.loss).__name__} reads {key!r}, which is missing; there are {present}. {cure}Rename it "
-                "with loss.set_keys(...)."
-            )
-        return value
+        return entry_of(source, key, type(self.loss).__name__, f"{cure}Rename it with loss.set_keys(...).")
 
     @cached_property
     def counts(self) -> Tensor:

@@ -18,7 +18,7 @@ from torch_denkf.beliefs import is_summary
 from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record, check_belief
 from torch_denkf.filters.scan import where_rows
-from torch_denkf.submodel import Entries
+from torch_denkf.submodel import Entries, entry_of
 from torch_denkf.transforms._packaged import PackagedRun, Step
 from torch_denkf.transforms.primer import refuse_resets_of_groups
 
@@ -217,14 +217,12 @@ class DEnKFTransform(Checked, Transform):
 
     def _copy(self, source: TensorDictBase, target: dict | TensorDictBase, keys, owner: str) -> None:
         for key in keys:
-            value = source.get(key, None)
-            if value is None:
-                raise KeyError(
-                    f"The filter reads {key!r}, which {owner} does not hold; it holds "
-                    f"{sorted(map(str, source.keys(True, True)))}. Rename the key in the filter's sub-model, or put a "
-                    "transform that writes it before DEnKFTransform. It must also declare it, in its "
-                    "transform_observation_spec; a function in the place of a transform declares nothing."
-                )
+            cure = (
+                f"Looked for in {owner}. Rename the key in the filter's sub-model, or put a transform that writes it "
+                "before DEnKFTransform. It must also declare it, in its transform_observation_spec; a function in the "
+                "place of a transform declares nothing."
+            )
+            value = entry_of(source, key, "The filter", cure)
             if isinstance(target, dict):
                 target[key] = value
             else:
