@@ -10,7 +10,8 @@ from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
-from torch_denkf.submodel import EXPLAINED, Call, Entries, Sensor, SubModel, missing_entry, role
+from torch_denkf._arguments import missing_entry
+from torch_denkf.submodel import EXPLAINED, Call, Entries, Sensor, SubModel, role
 
 __all__ = [
     "check_module",
@@ -83,7 +84,7 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
                 tensordict.set(("noise", own, name) if name else ("noise", own), value)
     missing = [key for key in keys if key not in entries]
     if missing and isinstance(module, TensorDictModule) and not isinstance(module, SubModel):
-        raise missing_entry(type(module).__name__, missing, entries, "Put the module that writes it in front.")
+        raise missing_entry(type(module).__name__, missing, entries)
     tensordict = module(tensordict)
     return {key: tensordict.get(key) for key in map(unravel_key, module.out_keys)}
 

@@ -7,7 +7,7 @@ Each part is a :class:`SubModel`. What a filter must know of it in its role it d
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
@@ -16,23 +16,10 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
-from torch_denkf._arguments import Checked
+from torch_denkf._arguments import Checked, missing_entry
 from torch_denkf.functional.manifolds import Space
 
-__all__ = [
-    "Call",
-    "Entries",
-    "Initial",
-    "Noise",
-    "Sensor",
-    "SubModel",
-    "Transition",
-    "Update",
-    "entry_of",
-    "in_role",
-    "missing_entry",
-    "role",
-]
+__all__ = ["Call", "Entries", "Initial", "Noise", "Sensor", "SubModel", "Transition", "Update", "in_role", "role"]
 
 R = TypeVar("R", bound="SubModel")
 
@@ -40,29 +27,6 @@ R = TypeVar("R", bound="SubModel")
 Entries: TypeAlias = dict[NestedKey, Tensor]
 #: The noise of one call of a sub-model: one tensor, several by name, or ``None`` for the deterministic forward.
 Noise: TypeAlias = "Tensor | Mapping[str, Tensor] | None"
-
-
-def missing_entry(reader: str, missing: Iterable[NestedKey], present: Iterable[NestedKey], cure: str) -> KeyError:
-    """Returns the error for entries that are read and missing: it names the reader, them, what is there, and the cure.
-
-    Example:
-        >>> print(missing_entry("EKF", ["gps"], ["pixels", "action"], "Set observation_key."))
-        "EKF reads 'gps', which is missing. There is action, pixels. Set observation_key."
-    """
-    there = ", ".join(sorted(map(str, present))) or "nothing"
-    return KeyError(f"{reader} reads {', '.join(map(repr, missing))}, which is missing. There is {there}. {cure}")
-
-
-def entry_of(tensordict: TensorDictBase, key: NestedKey, reader: str, cure: str) -> Tensor:
-    """Returns an entry of a tensordict.
-
-    Raises:
-        KeyError: that is :func:`missing_entry`, if it is missing.
-    """
-    value = tensordict.get(key, None)
-    if value is None:
-        raise missing_entry(reader, [key], tensordict.keys(True, True), cure)
-    return value
 
 
 class Call(NamedTuple):
@@ -265,14 +229,7 @@ class SubModel(Checked, TensorDictModule):
         """
         value = entries.get(key)
         if value is None:
-            name = type(self).__name__
-            raise missing_entry(
-                name,
-                [key],
-                entries,
-                "Give the filter it (does the environment or the data have it?), put the module that writes it in "
-                f"front, or rename the key in the constructor of {name}.",
-            )
+            raise missing_entry(type(self).__name__, [key], entries)
         return value
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -78,9 +78,7 @@ class IEnKS(Filter):
     ):
         if options.get("update_at_reset"):
             raise ValueError("IEnKS corrects the state before a step: the first frame has none, so no update_at_reset.")
-        parts = FilterParts(
-            transition, sensor, observation, noise, initial=initial, process_noise=process_noise, **options
-        )
+        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, **options)
         transition = parts.moving()
         analysis = IteratedAnalysis(
             transition,

@@ -12,6 +12,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
+from torch_denkf._arguments import missing_entry
 from torch_denkf._files import write_bytes
 from torch_denkf.compilation import (
     clear_damaged_libraries,
@@ -23,7 +24,7 @@ from torch_denkf.compilation import (
 from torch_denkf.deployment.onnx_model import need_onnx, onnx_model
 from torch_denkf.deployment.package import SIGNATURE, run_onnx
 from torch_denkf.filters import Filter
-from torch_denkf.submodel import Entries, missing_entry
+from torch_denkf.submodel import Entries
 
 Format = Literal["pt2", "onnx"]
 _ONNX = "onnxruntime, or of what writes its models"

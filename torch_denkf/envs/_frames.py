@@ -10,8 +10,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import Transform
 
-from torch_denkf._arguments import Checked
-from torch_denkf.submodel import entry_of
+from torch_denkf._arguments import Checked, entry_of
 
 CHUNK = 2**20  # values in work at a time: 4 MB in float32
 

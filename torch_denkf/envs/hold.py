@@ -9,8 +9,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
-from torch_denkf._arguments import Checked
-from torch_denkf.submodel import entry_of
+from torch_denkf._arguments import Checked, entry_of
 
 __all__ = ["HoldReading"]
 

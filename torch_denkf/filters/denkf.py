@@ -86,16 +86,7 @@ class DEnKF(Filter):
                     "instead."
                 )
             options["reading_space"] = role(analysis, Update).reading_space
-        parts = FilterParts(
-            transition,
-            sensor,
-            observation,
-            noise,
-            process_noise=process_noise,
-            initial=initial,
-            sensor_error=sensor_error,
-            **options,
-        )
+        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, sensor_error, **options)
         if analysis is None:
             scheme = partial(EnsembleAnalysis, "perturbed" if sensor is None else "sensor")
             analysis = scheme(space=parts.space, **parts.reading(" or an analysis"))

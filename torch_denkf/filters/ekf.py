@@ -81,16 +81,7 @@ class EKF(Filter):
         inflation: float = 1.0,
         **options: Unpack[ReadingOptions],
     ):
-        parts = FilterParts(
-            transition,
-            sensor,
-            observation,
-            noise,
-            process_noise=process_noise,
-            initial=initial,
-            sensor_error=sensor_error,
-            **options,
-        )
+        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, sensor_error, **options)
         check_moments(type(self).__name__, initial)
         forecast = EKFTransition(
             parts.transition, parts.process_noise, stop_jacobian_gradient=stop_jacobian_gradient, space=parts.space

@@ -94,14 +94,7 @@ class ParticleFilter(Filter):
         if process_noise is not None and isinstance(transition, ResampledTransition):
             raise ValueError("A ResampledTransition holds its motion: put the process noise into that.")
         parts = FilterParts(
-            transition,
-            sensor,
-            observation,
-            noise,
-            initial=initial,
-            process_noise=process_noise,
-            optional=["noise"],
-            **options,
+            transition, sensor, observation, noise, initial, process_noise, optional=["noise"], **options
         )
         if likelihood is None:
             likelihood = GaussianLikelihood(**parts.reading(" or a likelihood"))

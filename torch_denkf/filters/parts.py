@@ -8,14 +8,13 @@ from typing import Any, Protocol, Unpack, runtime_checkable
 
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
 
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.running import check_module, reading_of
-from torch_denkf.submodel import Initial, Update, role
+from torch_denkf.submodel import Initial, role
 
 __all__ = ["FilterParts", "ReadingOptions", "SensorError", "Visibility", "check_kind", "check_moments"]
 
@@ -24,19 +23,10 @@ __all__ = ["FilterParts", "ReadingOptions", "SensorError", "Visibility", "check_
 class SensorError(Protocol):
     """Errors of a sensor that last and become part of the state: :class:`~torch_denkf.imperfect.FadingBias`."""
 
-    def augmented(
-        self,
-        transition: TensorDictModuleBase,
-        observation: TensorDictModuleBase,
-        process_noise: TensorDictModuleBase | None,
-        initial: TensorDictModuleBase,
-        reading_space: Space | None = None,
-    ) -> tuple[TensorDictModuleBase, TensorDictModuleBase, TensorDictModuleBase, TensorDictModuleBase]:
-        """Returns the modules of the state with the errors behind it."""
+    def augmented(self, transition, observation, process_noise, initial, reading_space=None):
+        """Returns transition, observation, process noise and initial belief of the state with the errors behind it."""
 
-    def augmented_matrices(
-        self, f: Tensor, h: Tensor, q: Tensor, mean: Tensor, cov: Tensor, control: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:
+    def augmented_matrices(self, f, h, q, mean, cov, control=None):
         """Returns F, H, Q, mean, covariance and B of the state with the errors behind it."""
 
 
@@ -44,7 +34,7 @@ class SensorError(Protocol):
 class Visibility(Protocol):
     """A head beside a sensor that says whether it sees: :class:`~torch_denkf.imperfect.Visibility`."""
 
-    def heeded_by(self, analysis: TensorDictModuleBase) -> Update:
+    def heeded_by(self, analysis):
         """Returns an update that lets a reading count as far as the head says."""
 
 
@@ -98,10 +88,10 @@ class FilterParts:
         sensor: TensorDictModuleBase | None,
         observation: Any,
         noise: Any,
-        *,
         initial: TensorDictModuleBase,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
         sensor_error: SensorError | None = None,
+        *,
         optional: Collection[str] = (),
         reading_space: Space | None = None,
         observation_key: NestedKey | None = None,

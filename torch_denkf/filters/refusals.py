@@ -7,9 +7,10 @@ from collections.abc import Collection, Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
+from torch_denkf._arguments import missing_entry
 from torch_denkf.filters.structure import Structure, previous_key, takes_reading
 from torch_denkf.running import in_sequences, writes
-from torch_denkf.submodel import Entries, Sensor, Update, in_role, missing_entry, role
+from torch_denkf.submodel import Entries, Sensor, Update, in_role, role
 
 __all__ = [
     "check_inputs",

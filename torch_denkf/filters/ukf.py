@@ -80,16 +80,7 @@ class UKF(Filter):
         inflation: float = 1.0,
         **options: Unpack[ReadingOptions],
     ):
-        parts = FilterParts(
-            transition,
-            sensor,
-            observation,
-            noise,
-            process_noise=process_noise,
-            initial=initial,
-            sensor_error=sensor_error,
-            **options,
-        )
+        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, sensor_error, **options)
         check_moments(type(self).__name__, initial)
         forecast = UKFTransition(
             parts.transition, parts.process_noise, alpha=alpha, beta=beta, kappa=kappa, space=parts.space

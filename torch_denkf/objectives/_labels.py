@@ -15,9 +15,10 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
+from torch_denkf._arguments import entry_of
 from torch_denkf._checks import check_mask
 from torch_denkf.functional.manifolds import Space, is_flat, whole_parts
-from torch_denkf.submodel import Initial, entry_of, role
+from torch_denkf.submodel import Initial, role
 
 if TYPE_CHECKING:
     from torch_denkf.objectives.filter_loss import FilterLoss

@@ -115,18 +115,21 @@ class DEnKFLoss(FilterLoss):
         terms: Sequence[Term] = (),
         **options: Unpack[SequenceOptions],
     ):
+        if smoothed and smoother is None:
+            raise ValueError("loss_smoothed needs to know how: smoother=EnRTS, or partial(EnKS, lag=5), for example.")
         own: list[Term] = [_terms.Members("state", "belief", state)]
         own += [_terms.Members("transition", "forecast", transition)]
         own += [_terms.Sensor(sensor), _terms.Observation(observation), _terms.Likelihood(nll), _terms.Divergence(kl)]
         own += [_terms.Visible(visible), _terms.Members("smoothed", "smoothed", smoothed)]
         super().__init__(filter, [*own, *terms], score=score, **options)
-        # In a tuple: its parameters are the filter's, and are the loss's already.
-        self._smoother = (smoother(filter) if smoother is not None and not isinstance(smoother, Smoother) else None,)
-        if (smoothed or smoother is not None) and not isinstance(self._smoother[0], Smoother):
+        made = smoother if smoother is None or isinstance(smoother, Smoother) else smoother(filter)
+        if smoother is not None and (made is smoother or not isinstance(made, Smoother)):
             raise TypeError(
-                "smoother is called with the filter and makes the Smoother of loss_smoothed, like EnRTS or "
-                f"partial(EnKS, lag=5); got {smoother!r}"
+                "smoother is called with the filter and makes a Smoother, like EnRTS or partial(EnKS, lag=5); got "
+                f"{smoother!r}"
             )
+        # In a tuple: its parameters are the filter's, and are the loss's already.
+        self._smoother = (made,)
 
     @classmethod
     def paper(cls, filter: Filter, **kwargs) -> DEnKFLoss:

@@ -12,13 +12,13 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
-from torch_denkf._arguments import Checked
+from torch_denkf._arguments import Checked, entry_of
 from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.beliefs import is_summary
 from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record, check_belief
 from torch_denkf.filters.scan import where_rows
-from torch_denkf.submodel import Entries, entry_of
+from torch_denkf.submodel import Entries
 from torch_denkf.transforms._packaged import PackagedRun, Step
 from torch_denkf.transforms.primer import refuse_resets_of_groups
 
