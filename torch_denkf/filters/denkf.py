@@ -89,7 +89,7 @@ class DEnKF(Filter):
         parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, sensor_error, **options)
         if analysis is None:
             scheme = partial(EnsembleAnalysis, "perturbed" if sensor is None else "sensor")
-            analysis = scheme(space=parts.space, **parts.reading(" or an analysis"))
+            analysis = scheme(space=parts.space, **parts.reading(", or an analysis"))
         modules = parts.in_order(transition=parts.moving(), observation=parts.observation, analysis=analysis)
         super().__init__(modules, initial=parts.initial, **parts.options)
 

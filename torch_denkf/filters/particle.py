@@ -97,7 +97,7 @@ class ParticleFilter(Filter):
             transition, sensor, observation, noise, initial, process_noise, optional=["noise"], **options
         )
         if likelihood is None:
-            likelihood = GaussianLikelihood(**parts.reading(" or a likelihood"))
+            likelihood = GaussianLikelihood(**parts.reading(", or a likelihood"))
         elif parts.reading_space is not None or parts.observation_key is not None:
             raise ValueError(
                 "reading_space and observation_key are for the default likelihood; give them to yours instead, "

@@ -133,7 +133,7 @@ class FilterParts:
         key = self.observation_key
         if key is None:
             if self.sensor is None:
-                raise ValueError(f"Without a sensor, say where the reading is: observation_key=...{or_part}.")
+                raise ValueError(f"Without a sensor, say where the reading is: observation_key=...{or_part}")
             key = reading_of(self.sensor)
         found = {"observation_key": key, "observed_key": self.observed_key, "reading_space": self.reading_space}
         if self.noise is not None:

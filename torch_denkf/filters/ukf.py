@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Unpack
+from typing import Any, Unpack
 
 from tensordict.nn import TensorDictModuleBase
 
@@ -82,17 +82,8 @@ class UKF(Filter):
     ):
         parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, sensor_error, **options)
         check_moments(type(self).__name__, initial)
-        forecast = UKFTransition(
-            parts.transition, parts.process_noise, alpha=alpha, beta=beta, kappa=kappa, space=parts.space
-        )
-        update = UKFAnalysis(
-            parts.observation,
-            alpha=alpha,
-            beta=beta,
-            kappa=kappa,
-            inflation=inflation,
-            space=parts.space,
-            **parts.reading(),
-        )
+        both: dict[str, Any] = {"alpha": alpha, "beta": beta, "kappa": kappa, "space": parts.space}
+        forecast = UKFTransition(parts.transition, parts.process_noise, **both)
+        update = UKFAnalysis(parts.observation, inflation=inflation, **both, **parts.reading())
         modules = parts.in_order(transition=forecast, analysis=update)
         super().__init__(modules, initial=parts.initial, **parts.options)
