@@ -12,7 +12,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
-from torch_denkf._arguments import Checked, entry_of
+from torch_denkf._arguments import Checked, missing_entry
 from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.beliefs import is_summary
 from torch_denkf.filters import Filter
@@ -217,12 +217,14 @@ class DEnKFTransform(Checked, Transform):
 
     def _copy(self, source: TensorDictBase, target: dict | TensorDictBase, keys, owner: str) -> None:
         for key in keys:
-            cure = (
-                f"Looked for in {owner}. Rename the key in the filter's sub-model, or put a transform that writes it "
-                "before DEnKFTransform. It must also declare it, in its transform_observation_spec; a function in the "
-                "place of a transform declares nothing."
-            )
-            value = entry_of(source, key, "The filter", cure)
+            value = source.get(key, None)
+            if value is None:
+                cure = (
+                    f"Looked for in {owner}. Rename the key in the filter's sub-model, or put a transform that writes "
+                    "it before DEnKFTransform. It must also declare it, in its transform_observation_spec; a function "
+                    "in the place of a transform declares nothing."
+                )
+                raise missing_entry("The filter", [key], source.keys(True, True), cure)
             if isinstance(target, dict):
                 target[key] = value
             else:
