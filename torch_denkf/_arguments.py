@@ -1,15 +1,15 @@
-"""One check of a constructor's arguments, as their annotations say, and one error for entries that are missing."""
+"""One check of a constructor's arguments: names, keys, flags and functions, as their annotations say."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from typing import Any
 
 import torch
 
-__all__ = ["Checked", "check_arguments", "check_key", "entry_of", "missing_entry"]
+__all__ = ["Checked", "check_arguments", "check_key"]
 
 
 class Checked:
@@ -70,33 +70,6 @@ def check_key(name: str, key: Any) -> None:
     """
     if not _is_key(key):
         raise TypeError(f"{name} is a key, a string or a tuple of strings; got {key!r}")
-
-
-def missing_entry(reader: str, missing: Iterable[Any], present: Iterable[Any], cure: str = "") -> KeyError:
-    """Returns the error for entries that are read and missing: it names the reader, them, what is there, and the cure.
-
-    Example:
-        >>> print(missing_entry("Blur", ["pixels"], ["image", "action"], "Set in_keys=."))
-        "Blur reads 'pixels', which is missing. There is action, image. Set in_keys=."
-    """
-    there = ", ".join(sorted(map(str, present))) or "nothing"
-    cure = cure or (
-        "Give the filter it (does the environment or the data have it?), put the module that writes it in front, or "
-        f"rename the key in the constructor of {reader}."
-    )
-    return KeyError(f"{reader} reads {', '.join(map(repr, missing))}, which is missing. There is {there}. {cure}")
-
-
-def entry_of(tensordict: Any, key: Any, reader: str, cure: str = "") -> torch.Tensor:
-    """Returns an entry of a tensordict.
-
-    Raises:
-        KeyError: that is :func:`missing_entry`, if it is missing.
-    """
-    value = tensordict.get(key, None)
-    if value is None:
-        raise missing_entry(reader, [key], tensordict.keys(True, True), cure)
-    return value
 
 
 _VARIABLE = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)

@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
-from torch_denkf._arguments import missing_entry
+from torch_denkf._registered import diagnosis
 from torch_denkf.submodel import EXPLAINED, Call, Entries, Sensor, SubModel, role
 
 __all__ = [
@@ -67,7 +67,7 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
             except EXPLAINED as error:
                 if torch.compiler.is_compiling():
                     raise
-                raise module.explained(error, entries) from error
+                raise diagnosis().explained(module, error, entries) from error
         if is_sequence(module):
             return run_modules(named_modules_of(module), entries, call)
     keys, optional = reads(module)
@@ -84,7 +84,7 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
                 tensordict.set(("noise", own, name) if name else ("noise", own), value)
     missing = [key for key in keys if key not in entries]
     if missing and isinstance(module, TensorDictModule) and not isinstance(module, SubModel):
-        raise missing_entry(type(module).__name__, missing, entries)
+        raise diagnosis().missing_entry(type(module).__name__, missing, entries)
     tensordict = module(tensordict)
     return {key: tensordict.get(key) for key in map(unravel_key, module.out_keys)}
 

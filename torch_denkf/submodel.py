@@ -16,7 +16,8 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
-from torch_denkf._arguments import Checked, missing_entry
+from torch_denkf._arguments import Checked
+from torch_denkf._registered import diagnosis
 from torch_denkf.functional.manifolds import Space
 
 __all__ = ["Call", "Entries", "Initial", "Noise", "Sensor", "SubModel", "Transition", "Update", "in_role", "role"]
@@ -229,7 +230,7 @@ class SubModel(Checked, TensorDictModule):
         """
         value = entries.get(key)
         if value is None:
-            raise missing_entry(type(self).__name__, [key], entries)
+            raise diagnosis().missing_entry(type(self).__name__, [key], entries)
         return value
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -245,30 +246,10 @@ class SubModel(Checked, TensorDictModule):
         try:
             written = self.on_entries(entries, Call(tensordict.batch_size))
         except EXPLAINED as error:
-            raise self.explained(error, entries) from error
+            raise diagnosis().explained(self, error, entries) from error
         for key, value in written.items():
             tensordict.set(key, value)
         return tensordict
-
-    def explained(self, error: Exception, entries: Entries) -> Exception:
-        """The error with what was read, and constants, in its message; one of another kind as it is.
-
-        Raises:
-            TypeError: if entries and parameters differ in precision, or a mask is not boolean.
-        """
-        self._explain_dtypes(error, entries)
-        if type(error) not in EXPLAINED:  # it may not be made of a message alone
-            return error
-        return type(error)(f"{error} {self._what_there_was(entries)}")
-
-    def _what_there_was(self, entries: Entries) -> str:
-        """What was read, and constants, with their shapes: for the message of an error."""
-        values = {key: entries.get(key) for key in (*self.in_keys, *self.optional_keys)}
-        read = [_shown(key, value) for key, value in values.items() if isinstance(value, Tensor)]
-        named = (*self.named_buffers(recurse=False), *self.named_parameters(recurse=False))
-        own = [f"{name} {list(value.shape)}" for name, value in named]
-        text = f"({type(self).__name__} read {', '.join(read) or 'nothing'}"
-        return f"{text}; its constants are {', '.join(own)})" if own else f"{text})"
 
     def _noise(self, entries: Entries, values: Sequence[Tensor | None], call: Call) -> Noise:
         names = self.noise_names
@@ -301,26 +282,6 @@ class SubModel(Checked, TensorDictModule):
                 )
         return given
 
-    def _explain_dtypes(self, error: Exception, entries: Entries) -> None:
-        if "bool" in str(error):
-            for key in self.optional_keys:  # masks, and counts of steps
-                mask = entries.get(key)
-                if mask is not None and mask.dtype not in (torch.bool, torch.int64):
-                    raise TypeError(
-                        f"{type(self).__name__} reads the mask {key!r}, which must be boolean, True where observed; "
-                        f"got {mask.dtype}. Convert it with .bool()."
-                    ) from error
-        own = {p.dtype for p in (*self.parameters(), *self.buffers()) if p.is_floating_point()}
-        values = {key: entries.get(key) for key in (*self.in_keys, *self.optional_keys)}
-        given = {key: v.dtype for key, v in values.items() if v is not None and v.is_floating_point()}
-        if len(own | set(given.values())) > 1 and any(word in str(error) for word in ("dtype", "scalar type")):
-            raise TypeError(
-                f"{type(self).__name__} computes in {', '.join(map(str, own)) or 'what it is given'} and got "
-                + ", ".join(f"{key!r} in {dtype}" for key, dtype in given.items())
-                + ". Convert the data (torchrl's DoubleToFloat(), or tensordict.float()) or the filter "
-                "(filter.double())."
-            ) from error
-
 
 class Sensor(SubModel):
     """Makes a reading, its noise, or a mask of it.
@@ -346,6 +307,7 @@ class Initial(SubModel):
         ensemble_size: E; ``None`` for a belief without members.
         space: in which the states live; ``None`` for plain numbers.
         input_dim: size of what it reads, where that is not S.
+        observed_key: a mask that hides what it reads; it then writes its prior.
 
     Example:
         >>> from tensordict import TensorDict
@@ -364,6 +326,7 @@ class Initial(SubModel):
     ensemble_size: int | None = None
     space: Space | None = None
     input_dim: int | None = None
+    observed_key: NestedKey | None = None
 
     def derived(self, carried: Entries) -> Entries:
         """Returns further entries of the belief that follow from those that are carried on, by key."""
@@ -532,7 +495,3 @@ def in_role(module: nn.Module, kind: type[R]) -> list[R]:
 RECORDERS: list[Callable[[str, SubModel, dict[str, int]], None]] = []
 #: Errors that can be raised again with more words.
 EXPLAINED = (RuntimeError, TypeError, ValueError, IndexError)
-
-
-def _shown(key: NestedKey, value: Tensor) -> str:
-    return f"{key!r} {list(value.shape)} {str(value.dtype).removeprefix('torch.')}"

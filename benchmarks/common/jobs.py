@@ -12,8 +12,8 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from torch_denkf._files import write_text
-from torch_denkf._workers import follow_parent
+from torch_denkf.deployment.files import write_text
+from torch_denkf.deployment.workers import follow_parent
 
 
 def once(file: Path, rows: Callable[[], list[dict]]) -> None:

@@ -10,7 +10,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # after the choice of a back-end without a window
 
-from torch_denkf._files import replacing
+from torch_denkf.deployment.files import replacing
 
 
 def draw_frontier(

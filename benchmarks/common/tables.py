@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from torch_denkf._files import replacing, write_text
+from torch_denkf.deployment.files import replacing, write_text
 
 
 @dataclass(frozen=True)

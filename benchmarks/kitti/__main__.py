@@ -15,8 +15,8 @@ from benchmarks.kitti.past import compare
 from benchmarks.kitti.study import Study, make_jobs, rows_of, run_jobs
 from benchmarks.kitti.tables import COLUMNS, markdown
 from benchmarks.kitti.training import Budget
-from torch_denkf._files import write_text
 from torch_denkf.applications.car import write_drives
+from torch_denkf.deployment.files import write_text
 
 
 def smoke(study: Study) -> Study:

@@ -21,8 +21,8 @@ from benchmarks.kitti.readings import read_spans
 from benchmarks.kitti.study import Job, Study, make_jobs
 from benchmarks.kitti.tables import by_drive
 from benchmarks.kitti.training import calibration_error, load_filter
-from torch_denkf._files import write_text
 from torch_denkf.applications.car.odometry.streams import all_frames
+from torch_denkf.deployment.files import write_text
 
 LAGS, THRESHOLDS = (4, 16, 64), (0.0, 1.0, 2.0, 3.0)  # steps; standard deviations, 0 believes every correlation
 _IDENTITY = ("filter", "members", "lags", "threshold")

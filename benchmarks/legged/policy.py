@@ -28,10 +28,10 @@ from benchmarks.legged.pictures import Camera
 from benchmarks.legged.task import ROWS, Ground, Robot
 from benchmarks.legged.training import LSTM, VAR, VELOCITY, trained_lstm
 from benchmarks.legged.walk import FASTEST, Walk, acted, play, up_of
-from torch_denkf._files import replacing
 from torch_denkf.applications.legged import QUADRUPED, LearnedContacts, legged_filter
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.deployment import export_step, load_step
+from torch_denkf.deployment.files import replacing
 from torch_denkf.functional.manifolds import rotate
 from torch_denkf.plots import write_video
 from torch_denkf.transforms import DEnKFTransform

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from benchmarks.common.tables import head, line
 from benchmarks.speed.pairs import MET
-from torch_denkf._files import write_text
+from torch_denkf.deployment.files import write_text
 
 
 def number(value: float | None, digits: int = 2) -> str:

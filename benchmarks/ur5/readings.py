@@ -16,8 +16,8 @@ from torch import Tensor
 
 from benchmarks.ur5.demos import STATE
 from benchmarks.ur5.motion import with_rates
-from torch_denkf._files import write_bytes
 from torch_denkf.applications.ur5 import UR5ExperienceReplay
+from torch_denkf.deployment.files import write_bytes
 from torch_denkf.envs import SaltAndPepper
 from torch_denkf.modules import ImageSensor
 from torch_denkf.monitoring import BlackIsMissing

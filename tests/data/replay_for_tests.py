@@ -139,5 +139,5 @@ def counting_bars(monkeypatch):
         __enter__ = lambda self: self  # noqa: E731
         __exit__ = close
 
-    monkeypatch.setattr("torch_denkf._progress.tqdm", Bar)
+    monkeypatch.setattr("torch_denkf.deployment.progress.tqdm", Bar)
     return bars

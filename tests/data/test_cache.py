@@ -18,11 +18,11 @@ import tensordict
 import torch
 from tensordict import TensorDict
 
-from torch_denkf._files import sweep
 from torch_denkf.cli.cache import Cache
 from torch_denkf.data import cache_entry
 from torch_denkf.data.cache import cached, entries_of, forget
 from torch_denkf.data.cache_entry import END, MANIFEST, CachedTensor, DamagedEntry, check_entry, is_entry, open_entry
+from torch_denkf.deployment.files import sweep
 
 ROOT = Path(__file__).parents[2]
 NAME = "drive-0123456789abcdef"

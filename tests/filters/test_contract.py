@@ -180,7 +180,7 @@ def test_compiled_is_eager(float64, name):
         step = filter.step(out[:, 3].select(*filter.carry_keys, *frames.keys()).exclude("noise"))
         gradient = torch.autograd.grad(out["belief", "mean"].square().sum(), frames["observation"])
         outs.append((out, step, gradient[0]))
-    assert {kind[0] for kind in filter.compiled._functions} == {"first", "chunk", "step"}
+    assert {kind[0] for kind in filter.compiled._functions} == {"chunk", "step"}
     for eager, compiled in zip(*outs, strict=True):
         if isinstance(eager, torch.Tensor):
             torch.testing.assert_close(compiled, eager, rtol=0, atol=1e-11)

@@ -312,7 +312,7 @@ def test_the_bar_shows_terms_and_errors(tmp_path, monkeypatch):
         def set_postfix(self, values, refresh):
             shown.append(sorted(values))
 
-    monkeypatch.setattr(sys.modules["torch_denkf._progress"], "tqdm", Bar)
+    monkeypatch.setattr(sys.modules["torch_denkf.deployment.progress"], "tqdm", Bar)
     net = nn.Linear(2, 1)
     trainer = FilterTrainer(net, [line_stage(net)], out=tmp_path, device="cpu", validate=lambda: {"error": 1.0})
     trainer.fit()

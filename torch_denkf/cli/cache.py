@@ -46,8 +46,8 @@ class Cache(Command):
 
     def run(self) -> int:
         """Goes over all entries."""
-        from torch_denkf._files import sweep
         from torch_denkf.data.cache import entries_of, forget, usual_folder
+        from torch_denkf.deployment.files import sweep
 
         if self.what != "clear" and (self.damaged or self.older_than is not None):
             raise ValueError("--damaged and --older-than belong to denkf cache clear")

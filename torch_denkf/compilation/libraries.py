@@ -16,13 +16,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from torch_denkf._files import free_space
 from torch_denkf._lock import take_lock
 
-__all__ = ["clear_damaged_libraries", "clear_full_cache", "is_whole"]
+__all__ = ["clear_damaged_libraries", "clear_full_cache", "free_space", "is_whole"]
 
 _LOG = logging.getLogger("torch_denkf")
 _HEADER, _64_BITS = 64, 2  # bytes of ELF's header; its class
+
+
+def free_space(folder: Path) -> str:
+    """How much a user may still write to a folder, or to the nearest one above that is there.
+
+    Example:
+        >>> free_space(Path("/"))
+        '... MB free'
+    """
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    status = os.statvfs(folder)
+    free = status.f_bavail * status.f_frsize
+    return f"{free / 1e6:.1f} MB free" if free >= 1e6 else f"{free / 1e3:.0f} kB free"
 
 
 def clear_damaged_libraries(cache: Path | None = None) -> list[Path]:

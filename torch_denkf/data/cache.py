@@ -12,8 +12,8 @@ from pathlib import Path
 
 from tensordict import TensorDict
 
-from torch_denkf._files import clear_errors, place_beside, sweep, sync
 from torch_denkf.data.cache_entry import DamagedEntry, is_entry, open_entry, write_entry
+from torch_denkf.deployment.files import clear_errors, place_beside, sweep, sync
 
 __all__ = ["cache_folder", "cached", "entries_of", "forget", "stamp", "usual_folder"]
 

@@ -25,7 +25,7 @@ import torch
 from tensordict import TensorDict, is_leaf_nontensor
 from torch import Tensor
 
-from torch_denkf._files import reserve, sync, write_text
+from torch_denkf.deployment.files import reserve, sync, write_text
 
 __all__ = [
     "MANIFEST",

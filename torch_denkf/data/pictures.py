@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_denkf._files import clear_errors, reserve
+from torch_denkf.deployment.files import clear_errors, reserve
 
 __all__ = [
     "JoinedPictures",

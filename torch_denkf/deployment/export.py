@@ -12,8 +12,6 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
-from torch_denkf._arguments import missing_entry
-from torch_denkf._files import write_bytes
 from torch_denkf.compilation import (
     clear_damaged_libraries,
     clear_full_cache,
@@ -21,8 +19,10 @@ from torch_denkf.compilation import (
     refuse_other_numbers,
     trace_below_autograd,
 )
+from torch_denkf.deployment.files import write_bytes
 from torch_denkf.deployment.onnx_model import need_onnx, onnx_model
 from torch_denkf.deployment.package import SIGNATURE, run_onnx
+from torch_denkf.diagnosis import missing_entry
 from torch_denkf.filters import Filter
 from torch_denkf.submodel import Entries
 

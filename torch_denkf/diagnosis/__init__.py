@@ -11,9 +11,14 @@ from torch_denkf.diagnosis.ceiling import CeilingReached
 from torch_denkf.diagnosis.check import check_analysis
 from torch_denkf.diagnosis.collapse import NarrowEnsemble
 from torch_denkf.diagnosis.composition import check_composition as check_composition
+from torch_denkf.diagnosis.errors import entry_of as entry_of
+from torch_denkf.diagnosis.errors import explained as explained
+from torch_denkf.diagnosis.errors import missing_entry as missing_entry
 from torch_denkf.diagnosis.masks import UnreadMasks
 from torch_denkf.diagnosis.policy import PolicyStart
 from torch_denkf.diagnosis.shapes import ReadingRanks
+from torch_denkf.diagnosis.slices import UnmarkedSlices
+from torch_denkf.diagnosis.slices import check_slices as check_slices
 
 __all__ = [
     "check_analysis",
@@ -22,4 +27,4 @@ __all__ = [
 
 def default_observers() -> list[Any]:
     """Returns the observers that a new filter has."""
-    return [ReadingRanks(), UnreadMasks(), CeilingReached(), NarrowEnsemble(), PolicyStart()]
+    return [UnmarkedSlices(), ReadingRanks(), UnreadMasks(), CeilingReached(), NarrowEnsemble(), PolicyStart()]

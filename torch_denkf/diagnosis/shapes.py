@@ -30,7 +30,7 @@ class ReadingRanks(Once):
         Raises:
             ValueError: that names the observation and its shape.
         """
-        structure, size = filter.structure, record.tensordict.batch_size
+        structure, size = filter.structure, record.batch_size
         if self._known[0] is not structure:
             self._known = structure, list(_read_as_they_are(structure))
         for key in self._known[1]:
@@ -39,7 +39,7 @@ class ReadingRanks(Once):
                 self._check(structure, record, key, value)
 
     def _check(self, structure: Structure, record: Record, key: NestedKey, value: Tensor) -> None:
-        members, size = None, record.tensordict.batch_size
+        members, size = None, record.batch_size
         for kind in structure.kinds:
             points = record.entries.get(kind.carry[0]) if isinstance(kind, Ensemble | Particles) else None
             members = members if points is None else points.shape[-2]

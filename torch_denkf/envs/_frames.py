@@ -10,7 +10,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import Transform
 
-from torch_denkf._arguments import Checked, entry_of
+from torch_denkf._arguments import Checked
+from torch_denkf._registered import diagnosis
 
 CHUNK = 2**20  # values in work at a time: 4 MB in float32
 
@@ -40,7 +41,7 @@ class FrameTransform(Checked, Transform):
         return torch.rand(tuple(shape), generator=self.generator, device=device) < self.p
 
     def _frame(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        return entry_of(tensordict, key, type(self).__name__, "Set in_keys=.")
+        return diagnosis().entry_of(tensordict, key, type(self).__name__, "Set in_keys=.")
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Transforms frames of data: a sample of a replay buffer, or a whole drive; the argument stays as it is."""

@@ -9,7 +9,8 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
-from torch_denkf._arguments import Checked, entry_of
+from torch_denkf._arguments import Checked
+from torch_denkf._registered import diagnosis
 
 __all__ = ["HoldReading"]
 
@@ -49,16 +50,16 @@ class HoldReading(Checked, Transform):
         super().__init__(in_keys=[in_key, observed_key], out_keys=[out_key])
 
     def _write(self, tensordict: TensorDictBase, before: Tensor | None) -> TensorDictBase:
-        reading = entry_of(tensordict, self.in_keys[0], "HoldReading", "Set in_key=.")
+        reading = diagnosis().entry_of(tensordict, self.in_keys[0], "HoldReading", "Set in_key=.")
         cure = "Set observed_key=, or put what writes the mask, as MissingFrames does, before this transform."
-        observed = entry_of(tensordict, self.in_keys[1], "HoldReading", cure)
+        observed = diagnosis().entry_of(tensordict, self.in_keys[1], "HoldReading", cure)
         observed = observed.reshape(*observed.shape, *(1,) * (reading.ndim - observed.ndim))
         before = torch.zeros_like(reading) if before is None else before
         return tensordict.set(self.out_keys[0], torch.where(observed, reading, before))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         cure = "Start from env.reset(), and pass on what step_mdp() returns."
-        before = entry_of(tensordict, self.out_keys[0], "HoldReading", cure)
+        before = diagnosis().entry_of(tensordict, self.out_keys[0], "HoldReading", cure)
         return self._write(next_tensordict, before)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -80,7 +81,7 @@ class HoldReading(Checked, Transform):
             KeyError: if they do not.
         """
         cure = "Append HoldReading to the environment, not to a replay buffer."
-        entry_of(tensordict, self.out_keys[0], "HoldReading", cure)
+        diagnosis().entry_of(tensordict, self.out_keys[0], "HoldReading", cure)
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -148,7 +148,7 @@ class Filter(Checked, TensorDictSequential):
         self.init_key = unravel_key(init_key)
         self.control_keys = [unravel_key(key) for key in control_keys]
         self.forecast_keys, self.check_finite = dict(forecast_keys or {}), check_finite
-        self._options: dict[str, Any] = {
+        self.fixed_options: dict[str, Any] = {
             "update_at_reset": update_at_reset,
             "variance_ceiling": variance_ceiling,
             "prefix": prefix,
@@ -186,17 +186,17 @@ class Filter(Checked, TensorDictSequential):
     @property
     def update_at_reset(self) -> bool:
         """Whether the initial belief is updated with the first frame."""
-        return self._options["update_at_reset"]
+        return self.fixed_options["update_at_reset"]
 
     @property
     def variance_ceiling(self) -> float | None:
         """Ceiling of the belief's variances."""
-        return self._options["variance_ceiling"]
+        return self.fixed_options["variance_ceiling"]
 
     @property
     def prefix(self) -> str | None:
         """Name under which the filter's own entries stand."""
-        return self._options["prefix"]
+        return self.fixed_options["prefix"]
 
     def with_options(self, **options: Unpack[FilterOptions]) -> Filter:
         """Returns a filter of the same modules with other options, see the class.
@@ -209,10 +209,10 @@ class Filter(Checked, TensorDictSequential):
             [('imu', 'belief', 'mean'), ('imu', 'belief', 'cov')]
         """
         new = _shallow(self)
-        new._options = {**self._options}
+        new.fixed_options = {**self.fixed_options}
         for name, value in options.items():
-            if name in new._options:
-                new._options[name] = value
+            if name in new.fixed_options:
+                new.fixed_options[name] = value
             else:
                 setattr(new, name, value)
         return new._renewed(self)
@@ -404,7 +404,7 @@ class Filter(Checked, TensorDictSequential):
             entries.update({key: where_rows(reset, written[key], entries[key]) for key in structure.carry})
         following = {("next", *previous_key(key)): written[key] for key in structure.carry}
         following["next", *KNOWN] = torch.ones(*size, 1, dtype=torch.bool, device=written[structure.carry[0]].device)
-        record = Record("policy", tensordict, entries, {**written, **following})
+        record = Record("policy", tensordict, size, entries, {**written, **following})
         return self.write(tensordict, self.finished(record, given))
 
     def step(
@@ -441,7 +441,7 @@ class Filter(Checked, TensorDictSequential):
             written = self.steps.step(entries, Call(size), partial=True)
         else:
             written = (self.steps if self.compiled is None else self.compiled.of(self)).step(entries, Call(size))
-        return self.write(tensordict, self.finished(Record("step", tensordict, entries, written)))
+        return self.write(tensordict, self.finished(Record("step", tensordict, size, entries, written)))
 
     def predict(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
         """A step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does.
@@ -507,7 +507,11 @@ class Filter(Checked, TensorDictSequential):
         entries = {key: value for key, value in entries.items() if key not in without}
         if self.update_at_reset or not set(structure.frame_keys).isdisjoint(chain(*reads(self.initial))):
             written = steps.run(structure.frames, entries, call, bool(without))
-        start = self.initial_belief(entries, call)
+        hidden, mask = dict(entries), role(self.initial, Initial).observed_key
+        if without and mask is not None and not entries.keys() >= {*reads(self.initial)[0]}:
+            hidden = {**self._nothing(call.batch_size), **entries}
+            hidden[mask] = torch.zeros(*call.batch_size, 1, dtype=torch.bool, device=tensordict.device)
+        start = self.initial_belief(hidden, call)
         if self.update_at_reset:
             written.update(steps.begin(entries, call, start, bool(without)))
         else:
@@ -567,16 +571,16 @@ class Filter(Checked, TensorDictSequential):
         unknown = [key for key in kept if key not in inner.values()]
         if unknown:
             raise ValueError(f"keep names {unknown}; the filter writes {list(inner)}.")
-        rows, marks = as_rows(tensordict, starts_of(tensordict, self.init_key))
-        outputs = self._scan(rows, marks, detach_every, kept)
+        outputs, rows = self._scan(tensordict, detach_every, kept)
         if rows is not tensordict:
             outputs = {key: value.flatten(0, 1) for key, value in outputs.items()}
         return self.write(tensordict, {key: outputs[key] for key in kept})
 
     def _scan(
-        self, rows: TensorDictBase, marks: Tensor | None, detach_every: int | None, keep: Sequence[NestedKey]
-    ) -> Entries:
-        """Returns the outputs ``keep`` of sequences ``[*B, T]`` that begin at ``marks``, and at their first element."""
+        self, tensordict: TensorDictBase, detach_every: int | None, keep: Sequence[NestedKey]
+    ) -> tuple[Entries, TensorDictBase]:
+        """Returns the outputs ``keep`` of sequences ``[*B, T]``, and the tensordict with slices in rows."""
+        rows, marks = as_rows(tensordict, starts_of(tensordict, self.init_key))
         structure, steps, size = self.structure, self.steps, rows.batch_size
         entries, call = self.entries_of(rows), Call(size, time=True)
         given = list(entries.values())
@@ -602,7 +606,7 @@ class Filter(Checked, TensorDictSequential):
             )[1]
         steps.blank(outputs, gathered.fresh)
         outputs.update({key: frames[key] for key in keep if key in frames})
-        return self.finished(Record("sequence", rows, entries, outputs), given)
+        return self.finished(Record("sequence", tensordict, size, entries, outputs), given), rows
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:
         """``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
@@ -650,7 +654,7 @@ class Filter(Checked, TensorDictSequential):
         """Sets entries, under their names outside of the filter; looks each nested tensordict up once."""
         owners: dict[tuple, Any] = {}
         for key, value in written.items():
-            if self._options["prefix"] is not None:
+            if self.fixed_options["prefix"] is not None:
                 key = self.outer(key)
             prefix = () if isinstance(key, str) else key[:-1]
             owner = tensordict if not prefix else owners.get(prefix)

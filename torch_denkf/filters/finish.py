@@ -25,14 +25,16 @@ class Record(NamedTuple):
 
     Attributes:
         way: ``"step"``, ``"sequence"``, ``"policy"`` or ``"environment"``.
-        tensordict: what the filter read from.
-        entries: what its modules read.
+        tensordict: what the filter read from, as it was given.
+        batch_size: of the entries; differs from the tensordict's where slices lie end to end.
+        entries: what the modules read.
         written: what they wrote; of a sequence ``[*B, T, ...]``.
         env: the environment, where there is one.
     """
 
     way: Literal["step", "sequence", "policy", "environment"]
     tensordict: TensorDictBase
+    batch_size: torch.Size
     entries: Entries
     written: Entries
     env: EnvBase | None = None

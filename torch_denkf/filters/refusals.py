@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
-from torch_denkf._arguments import missing_entry
+from torch_denkf._registered import diagnosis
 from torch_denkf.filters.structure import Structure, previous_key, takes_reading
 from torch_denkf.running import in_sequences, writes
 from torch_denkf.submodel import Entries, Sensor, Update, in_role, role
@@ -58,7 +58,7 @@ def check_inputs(
         readers = [
             type(m).__name__ for _, m in structure.modules if not set(missing).isdisjoint(map(unravel_key, m.in_keys))
         ]
-        raise missing_entry(
+        raise diagnosis().missing_entry(
             ", ".join(readers) or name,
             missing,
             tensordict.keys(True, True),

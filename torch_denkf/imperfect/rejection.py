@@ -13,8 +13,9 @@ from torch.utils.weak import WeakIdKeyDictionary
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
-from torch_denkf._arguments import Checked, check_key, entry_of
+from torch_denkf._arguments import Checked, check_key
 from torch_denkf._checks import check_mask, check_number, flag_value
+from torch_denkf.diagnosis import entry_of
 from torch_denkf.functional.manifolds import Euclidean, Space, places_of
 from torch_denkf.submodel import Entries
 

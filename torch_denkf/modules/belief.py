@@ -3,10 +3,9 @@ r"""Initial beliefs: the first ensemble :math:`X_0 = [x^1_0, \dots, x^E_0]` of a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf._checks import check_count, check_values
@@ -188,15 +187,7 @@ class FromSensor(_InitialEnsemble):
         register_location(self, "mean", mean)
         check_dims("dims", dims, once=True, size=self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
-        self.input_dim = len(self.dims)
-
-    def on_entries(self, entries, call):
-        """The belief; without its reading the prior."""
-        if all(key in entries for key in self.in_keys):
-            return super().on_entries(entries, call)
-        mean, std = (part.expand(*call.batch_size, -1) for part in (self.mean, self.std))
-        noise = cast("torch.Tensor | None", self._noise(entries, [], call))
-        return self.by_key(self._members(mean, std, noise, call.batch_size))
+        self.input_dim, self.observed_key = len(self.dims), unravel_key(observed_key)
 
     def compute(self, reading, variance, observed=None, *, noise, batch_size):
         """The belief."""

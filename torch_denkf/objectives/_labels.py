@@ -15,8 +15,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-from torch_denkf._arguments import entry_of
 from torch_denkf._checks import check_mask
+from torch_denkf._registered import diagnosis
 from torch_denkf.functional.manifolds import Space, is_flat, whole_parts
 from torch_denkf.submodel import Initial, role
 
@@ -159,7 +159,8 @@ class Truth:
             KeyError: if it is missing; the message ends with the ``cure``.
         """
         source = self.data if given else self.out
-        return entry_of(source, key, type(self.loss).__name__, f"{cure}Rename it with loss.set_keys(...).")
+        cure = f"{cure}Rename it with loss.set_keys(...)."
+        return diagnosis().entry_of(source, key, type(self.loss).__name__, cure)
 
     @cached_property
     def counts(self) -> Tensor:

@@ -14,7 +14,6 @@ from torchrl.objectives import LossModule
 
 from torch_denkf._arguments import Checked, check_key
 from torch_denkf._checks import check_choice, check_number
-from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.tensors import as_floating, check_dims
@@ -301,7 +300,6 @@ class FilterLoss(Checked, LossModule):
 
     def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The batch with what the filter, or its part, writes."""
-        refuse_unmarked_slices(tensordict, self.filter.init_key)
         return self.filter.inside(self._filters().sequence(tensordict.copy(), detach_every=self.detach_every))
 
     def _filters(self):

@@ -11,7 +11,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torch_denkf._files import replacing
+from torch_denkf.deployment.files import replacing
 from torch_denkf.plots._axes import times_of
 from torch_denkf.plots._belief import Truth, entry_of, read_belief
 from torch_denkf.plots._frames import as_picture, write_gif, write_mp4

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from torch_denkf import _registered
-from torch_denkf._files import write_text
+from torch_denkf.deployment.files import write_text
 from torch_denkf.deployment.folder import load_folder, save_folder
 from torch_denkf.filters import Filter
 

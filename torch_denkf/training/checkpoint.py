@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from torch_denkf._files import write_bytes
+from torch_denkf.deployment.files import write_bytes
 
 __all__ = ["read_checkpoint", "write_checkpoint"]
 

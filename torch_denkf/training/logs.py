@@ -9,7 +9,7 @@ from pathlib import Path
 from torchrl.record.loggers import CSVLogger, TensorboardLogger
 from torchrl.record.loggers.common import Logger
 
-from torch_denkf._files import clear_errors
+from torch_denkf.deployment.files import clear_errors
 
 __all__ = ["RunLogs"]
 

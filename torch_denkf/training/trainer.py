@@ -15,7 +15,7 @@ from torchrl.record.loggers.common import Logger
 
 from torch_denkf._checks import check_count
 from torch_denkf._lock import locked
-from torch_denkf._progress import progress_bar
+from torch_denkf.deployment.progress import progress_bar
 from torch_denkf.training.checkpoint import check_settings, check_state, read_checkpoint, write_checkpoint
 from torch_denkf.training.distributed import Processes
 from torch_denkf.training.earlier import set_aside

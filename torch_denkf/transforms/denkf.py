@@ -12,8 +12,8 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
-from torch_denkf._arguments import Checked, missing_entry
-from torch_denkf._one_sequence import refuse_unmarked_slices
+from torch_denkf._arguments import Checked
+from torch_denkf._registered import diagnosis
 from torch_denkf.beliefs import is_summary
 from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record, check_belief
@@ -169,7 +169,7 @@ class DEnKFTransform(Checked, Transform):
         self, entries: Entries, written: Mapping[NestedKey, torch.Tensor], next_tensordict: TensorDictBase
     ) -> TensorDictBase:
         kept = {key: written[key] for key in self._names}
-        record = Record("environment", next_tensordict, entries, kept, self.parent)
+        record = Record("environment", next_tensordict, next_tensordict.batch_size, entries, kept, self.parent)
         kept = self.filter.finished(record, check=self.check_finite)
         for key, name in self._names.items():
             next_tensordict.set(name, kept[key])
@@ -224,7 +224,7 @@ class DEnKFTransform(Checked, Transform):
                     "it before DEnKFTransform. It must also declare it, in its transform_observation_spec; a function "
                     "in the place of a transform declares nothing."
                 )
-                raise missing_entry("The filter", [key], source.keys(True, True), cure)
+                raise diagnosis().missing_entry("The filter", [key], source.keys(True, True), cure)
             if isinstance(target, dict):
                 target[key] = value
             else:
@@ -313,7 +313,6 @@ class DEnKFTransform(Checked, Transform):
         Raises:
             ValueError: if a flat batch seems to hold several sequences that are not marked.
         """
-        refuse_unmarked_slices(tensordict, self.filter.init_key)
         with self._grad_mode(), set_recurrent_mode(True):
             return self.filter(tensordict)
 

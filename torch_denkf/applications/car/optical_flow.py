@@ -9,11 +9,12 @@ from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
-from torch_denkf._arguments import Checked, entry_of
+from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_number
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
 from torch_denkf.applications.car.vision.motion import grey_picture, image_motion
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
+from torch_denkf.diagnosis import entry_of
 from torch_denkf.modules.tensors import as_floating
 
 __all__ = ["OpticalFlow"]

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from torch_denkf._progress import progress_bar
 from torch_denkf.applications.reacher.encoders import ENCODER_STD, reacher_env
 from torch_denkf.applications.reacher.filter import ReacherFilter, reacher
+from torch_denkf.deployment.progress import progress_bar
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.objectives import DEnKFLoss
 from torch_denkf.pretrained.folders import save_pretrained

@@ -11,10 +11,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from torch_denkf._progress import progress_bar
 from torch_denkf.applications.ur5.data.replay import UR5ExperienceReplay
 from torch_denkf.applications.ur5.envs.collect import collect_ur5_demos
 from torch_denkf.applications.ur5.filter import JOINTS, UR5TableFilter, UR5TableSettings, ur5_table
+from torch_denkf.deployment.progress import progress_bar
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.metrics import interval_coverage

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torch_denkf._progress import progress_bar
 from torch_denkf.data.cache import cache_folder, cached, stamp
 from torch_denkf.data.lerobot.files import (
     EpisodeFiles,
@@ -27,6 +26,7 @@ from torch_denkf.data.lerobot.files import (
 from torch_denkf.data.lerobot.sound import mask_rows, sound_times
 from torch_denkf.data.pictures import image_store, scaled, text_of_size
 from torch_denkf.data.video import frames_at_times
+from torch_denkf.deployment.progress import progress_bar
 
 _FORMAT = 2  # part of the cache's key: raise it when what is stored changes
 

@@ -15,10 +15,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from torch_denkf._checks import check_count
-from torch_denkf._files import replacing
-from torch_denkf._progress import progress_bar
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
 from torch_denkf.cli.command import Command, alone_in, say
+from torch_denkf.deployment.files import replacing
+from torch_denkf.deployment.progress import progress_bar
 
 __all__ = ["Demo"]
 

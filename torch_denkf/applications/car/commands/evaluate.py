@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torch_denkf._checks import check_count
-from torch_denkf._files import write_text
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
 from torch_denkf.cli.command import Command, alone_in, say
+from torch_denkf.deployment.files import write_text
 
 __all__ = ["Evaluate"]
 

@@ -24,9 +24,9 @@ from statistics import median
 from tyro.conf import Positional
 
 from torch_denkf._checks import check_count
-from torch_denkf._progress import progress_bar
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
 from torch_denkf.cli.command import Command, alone_in, say
+from torch_denkf.deployment.progress import progress_bar
 
 __all__ = ["Odometry"]
 

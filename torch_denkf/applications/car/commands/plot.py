@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from torch_denkf._files import replacing
 from torch_denkf.cli.command import Command, say
+from torch_denkf.deployment.files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

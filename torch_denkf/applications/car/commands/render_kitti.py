@@ -20,9 +20,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from torch_denkf._checks import check_count
-from torch_denkf._progress import progress_bar
 from torch_denkf.applications.car.street.camera import KITTI_FOCAL
 from torch_denkf.cli.command import Command, say
+from torch_denkf.deployment.progress import progress_bar
 
 __all__ = ["RenderKITTI"]
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from tensordict import TensorDict, TensorDictBase
 
-from torch_denkf._progress import progress_bar
 from torch_denkf.applications.car.kitti.drive import _frame_files, list_kitti_drives, read_kitti_drive
 from torch_denkf.applications.car.kitti.motion import with_motion
 from torch_denkf.data.episodes import Episode
+from torch_denkf.deployment.progress import progress_bar
 
 PAIRS = (("image_2", "image_3"), ("image_0", "image_1"))
 

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from torch import Tensor
 
-from torch_denkf._files import replacing
 from torch_denkf.applications.car.kitti.files import write_poses
 from torch_denkf.applications.car.vision.poses import state_to_poses
+from torch_denkf.deployment.files import replacing
 
 __all__ = ["write_trajectory"]
 

@@ -15,13 +15,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from torch_denkf._files import clear_errors, place_beside, sync
-from torch_denkf._workers import follow_parent
 from torch_denkf.applications.car.kitti.files import write_poses
 from torch_denkf.applications.car.street.camera import Camera
 from torch_denkf.applications.car.street.renderer import Renderer
 from torch_denkf.applications.car.street.roadside import roadside_scene
 from torch_denkf.applications.car.vision.poses import KITTI_DT, poses_to_state
+from torch_denkf.deployment.files import clear_errors, place_beside, sync
+from torch_denkf.deployment.workers import follow_parent
 
 FORMAT = 3  # raise it when drives of the same options come out differently
 MARKER = "drive.json"

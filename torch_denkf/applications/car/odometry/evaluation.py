@@ -14,14 +14,14 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf._checks import check_number
-from torch_denkf._files import replacing
-from torch_denkf._progress import progress_bar
 from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
 from torch_denkf.applications.car.metrics.odometry import dead_reckoning, kitti_endpoint_error
 from torch_denkf.applications.car.odometry.filter import VELOCITIES, CarFilter
 from torch_denkf.applications.car.odometry.scores import filter_readings, first_state
 from torch_denkf.applications.car.odometry.streams import Drive, all_frames, lose_frames, read_spans
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
+from torch_denkf.deployment.files import replacing
+from torch_denkf.deployment.progress import progress_bar
 from torch_denkf.metrics import interval_coverage
 
 __all__ = ["COLUMNS", "evaluate_car_filter", "markdown_table", "write_rows"]

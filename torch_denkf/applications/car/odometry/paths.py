@@ -13,8 +13,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf._checks import read_lines
-from torch_denkf._files import replacing
 from torch_denkf.applications.car.odometry.tracking import TrackedBelief
+from torch_denkf.deployment.files import replacing
 from torch_denkf.functional.moments import ensemble_cov
 
 __all__ = ["PATH_COLUMNS", "read_path", "write_path"]

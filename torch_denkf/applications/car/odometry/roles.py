@@ -9,10 +9,10 @@ from typing import Any
 
 import torch
 
-from torch_denkf._progress import progress_bar
 from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.applications.car.odometry.streams import Drive
+from torch_denkf.deployment.progress import progress_bar
 
 __all__ = ["assign_roles", "drives_by_role", "recorded_drives", "rendered_drives"]
 

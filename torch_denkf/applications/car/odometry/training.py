@@ -12,7 +12,6 @@ from tensordict import TensorDict
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf._progress import progress_bar
 from torch_denkf.applications.car.odometry.batches import PairSampler, ReadingSampler
 from torch_denkf.applications.car.odometry.filter import VELOCITIES, CarFilter, CarSettings
 from torch_denkf.applications.car.odometry.roles import drives_by_role, recorded_drives, rendered_drives
@@ -27,6 +26,7 @@ from torch_denkf.applications.car.odometry.scores import (
 )
 from torch_denkf.applications.car.odometry.streams import Drive, read_spans
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
+from torch_denkf.deployment.progress import progress_bar
 from torch_denkf.pretrained.folders import save_pretrained
 from torch_denkf.training import FilterTrainer, Stage
 

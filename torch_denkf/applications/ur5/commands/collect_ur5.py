@@ -26,11 +26,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torch_denkf._checks import check_count
-from torch_denkf._progress import progress_bar
 from torch_denkf.applications.ur5.data import files
 from torch_denkf.applications.ur5.envs.collect import EPISODE, collect_ur5_demos
 from torch_denkf.applications.ur5.simulation.names import TASKS, DomainName, TaskName
 from torch_denkf.cli.command import Command, say
+from torch_denkf.deployment.progress import progress_bar
 
 __all__ = ["CollectUR5"]
 

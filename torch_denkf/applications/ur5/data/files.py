@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 
 from torch_denkf._checks import check_count, read_lines
-from torch_denkf._files import clear_errors, write_bytes, write_text
 from torch_denkf.applications.ur5.simulation.names import DOMAIN_NAMES, TASKS
+from torch_denkf.deployment.files import clear_errors, write_bytes, write_text
 
 COLLECTION = "collection.json"
 MANIFEST = "demos.jsonl"

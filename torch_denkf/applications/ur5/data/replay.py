@@ -8,12 +8,12 @@ from typing import Unpack
 
 from torch import Tensor
 
-from torch_denkf._progress import progress_bar
 from torch_denkf.applications.ur5.data.cache import read_demos, read_entries
 from torch_denkf.applications.ur5.data.rows import UR5Episode, demo_episodes, demo_rows, is_for_tests
 from torch_denkf.data.options import ReplayOptions, check_options
 from torch_denkf.data.pictures import JoinedPictures, float_pictures
 from torch_denkf.data.replay import EpisodeReplay
+from torch_denkf.deployment.progress import progress_bar
 
 __all__ = ["UR5ExperienceReplay"]
 

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf._workers import follow_parent
 from torch_denkf.applications.ur5.data.files import Demo, Entry, write_demo
 from torch_denkf.applications.ur5.envs.expert import UR5Expert
 from torch_denkf.applications.ur5.envs.table import STEPS, UR5TableEnv
 from torch_denkf.applications.ur5.simulation.names import DOMAIN_NAMES, TASKS, DomainName, TaskName
 from torch_denkf.data.pictures import check_size
+from torch_denkf.deployment.workers import follow_parent
 
 DRAWS = 20  # episodes tried for a demo; the expert seldom fails
 

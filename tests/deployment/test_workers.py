@@ -27,7 +27,7 @@ PROGRAM = """
 import os, time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from torch_denkf._workers import follow_parent
+from torch_denkf.deployment.workers import follow_parent
 
 if __name__ == "__main__":
     with ProcessPoolExecutor(2, get_context("spawn"), initializer=follow_parent) as pool:

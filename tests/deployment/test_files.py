@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from torch_denkf._files import replacing, reserve, write_bytes, write_text
 from torch_denkf._lock import locked
+from torch_denkf.deployment.files import replacing, reserve, write_bytes, write_text
 
 ROOT = Path(__file__).parents[1]
 
@@ -24,7 +24,7 @@ def start(code, *arguments):
 
 WRITES = """
 import sys
-from torch_denkf._files import replacing
+from torch_denkf.deployment.files import replacing
 with replacing(sys.argv[1]) as beside:
     beside.write_text("half")
     print("ready", flush=True)

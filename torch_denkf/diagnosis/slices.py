@@ -1,4 +1,4 @@
-"""Whether a flat batch is one sequence: several of them end to end must say where each begins."""
+"""Raises where a flat batch holds several sequences end to end and does not mark where each begins."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from torch_denkf._slices import starts_of
+from torch_denkf.diagnosis.once import Once
+from torch_denkf.filters.base import Filter
+from torch_denkf.filters.finish import Record
 
-__all__ = ["refuse_unmarked_slices"]
+__all__ = ["UnmarkedSlices", "check_slices"]
 
 #: Last names of entries that number an episode, and of those that count its steps.
 _EPISODES = ("episode", "episode_index", "traj_ids")
@@ -23,8 +26,18 @@ _CURE = (
 )
 
 
-def refuse_unmarked_slices(tensordict: TensorDictBase, init_key: NestedKey) -> None:
-    """Refuses a batch ``[N]`` that seems to hold several sequences and does not say where they begin.
+class UnmarkedSlices(Once):
+    """Raises where a filter reads slices of several episodes end to end, and nothing marks where they begin."""
+
+    ways = ("sequence",)
+
+    def __call__(self, filter: Filter, record: Record) -> None:
+        """Looks at a flat batch, see :func:`check_slices`."""
+        check_slices(record.tensordict, filter.init_key)
+
+
+def check_slices(tensordict: TensorDictBase, init_key: NestedKey) -> None:
+    """Raises for a batch ``[N]`` that seems to hold several sequences and does not say where they begin.
 
     A filter would go from the end of one slice to the beginning of the next as if no time had passed. Frames without a
     ``"next"`` part, a number of the episode and a clock are taken for one sequence, and so is what goes on without a
@@ -42,12 +55,12 @@ def refuse_unmarked_slices(tensordict: TensorDictBase, init_key: NestedKey) -> N
     Example:
         >>> from tensordict import TensorDict
         >>> rows = TensorDict({"y": torch.zeros(4, 1), "episode": torch.tensor([0, 0, 1, 1])}, [4])
-        >>> refuse_unmarked_slices(rows, "is_init")
+        >>> check_slices(rows, "is_init")
         Traceback (most recent call last):
         ...
         ValueError: The batch [4] seems to hold several sequences: 'episode' changes at 2, and nothing marks ...
         >>> rows["is_init"] = torch.tensor([True, False, True, False])
-        >>> refuse_unmarked_slices(rows, "is_init")
+        >>> check_slices(rows, "is_init")
     """
     if tensordict.ndim != 1 or tensordict.batch_size[0] < 2 or torch.compiler.is_compiling():
         return

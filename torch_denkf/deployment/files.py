@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import IO
 
 from torch_denkf._lock import take_lock
+from torch_denkf.compilation.libraries import free_space
 
 __all__ = [
     "clear_errors",
-    "free_space",
     "place_beside",
     "replacing",
     "reserve",
@@ -32,20 +32,6 @@ _UNLOCKED = 3600.0  # s without a change, after which a half written place witho
 _BLOCK = 1 << 24
 #: Errors of the disk, not of the path.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-
-
-def free_space(folder: Path) -> str:
-    """How much a user may still write to a folder, or to the nearest one above that is there.
-
-    Example:
-        >>> free_space(Path("/"))
-        '... MB free'
-    """
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    status = os.statvfs(folder)
-    free = status.f_bavail * status.f_frsize
-    return f"{free / 1e6:.1f} MB free" if free >= 1e6 else f"{free / 1e3:.0f} kB free"
 
 
 @contextmanager
