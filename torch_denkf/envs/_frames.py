@@ -41,7 +41,10 @@ class FrameTransform(Checked, Transform):
         return torch.rand(tuple(shape), generator=self.generator, device=device) < self.p
 
     def _frame(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        return diagnosis().entry_of(tensordict, key, type(self).__name__, "Set in_keys=.")
+        frame = tensordict.get(key, None)
+        if frame is None:
+            raise diagnosis().missing_entry(type(self).__name__, [key], tensordict.keys(True, True), "Set in_keys=.")
+        return frame
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Transforms frames of data: a sample of a replay buffer, or a whole drive; the argument stays as it is."""

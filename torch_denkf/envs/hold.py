@@ -49,17 +49,23 @@ class HoldReading(Checked, Transform):
     ):
         super().__init__(in_keys=[in_key, observed_key], out_keys=[out_key])
 
+    def _entry(self, tensordict: TensorDictBase, key: NestedKey, cure: str) -> Tensor:
+        value = tensordict.get(key, None)
+        if value is None:
+            raise diagnosis().missing_entry("HoldReading", [key], tensordict.keys(True, True), cure)
+        return value
+
     def _write(self, tensordict: TensorDictBase, before: Tensor | None) -> TensorDictBase:
-        reading = diagnosis().entry_of(tensordict, self.in_keys[0], "HoldReading", "Set in_key=.")
+        reading = self._entry(tensordict, self.in_keys[0], "Set in_key=.")
         cure = "Set observed_key=, or put what writes the mask, as MissingFrames does, before this transform."
-        observed = diagnosis().entry_of(tensordict, self.in_keys[1], "HoldReading", cure)
+        observed = self._entry(tensordict, self.in_keys[1], cure)
         observed = observed.reshape(*observed.shape, *(1,) * (reading.ndim - observed.ndim))
         before = torch.zeros_like(reading) if before is None else before
         return tensordict.set(self.out_keys[0], torch.where(observed, reading, before))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         cure = "Start from env.reset(), and pass on what step_mdp() returns."
-        before = diagnosis().entry_of(tensordict, self.out_keys[0], "HoldReading", cure)
+        before = self._entry(tensordict, self.out_keys[0], cure)
         return self._write(next_tensordict, before)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -81,7 +87,7 @@ class HoldReading(Checked, Transform):
             KeyError: if they do not.
         """
         cure = "Append HoldReading to the environment, not to a replay buffer."
-        diagnosis().entry_of(tensordict, self.out_keys[0], "HoldReading", cure)
+        self._entry(tensordict, self.out_keys[0], cure)
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -14,11 +14,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf._checks import check_count
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
+from torch_denkf.filters.parts import check_kind
 from torch_denkf.fusion._updates import Updates
 from torch_denkf.fusion.joint_moments import JOINT_PAST, JointForecast, PresentOfJoint, joint_space
 from torch_denkf.fusion.parts import OfOwnErrors
 from torch_denkf.fusion.sensor import FusedSensor, wire
-from torch_denkf.imperfect.bias import FadingBias
 from torch_denkf.modules import (
     EKFAnalysis,
     EKFTransition,
@@ -204,8 +204,7 @@ def _with_errors(transition, process_noise, initial, sensors):
     """Transition, process noise, initial belief and sensors of the state with the sensors' lasting errors behind it."""
     given = [sensor.sensor_error for sensor in sensors.values() if sensor.sensor_error is not None]
     for error in given:
-        if not isinstance(error, FadingBias):
-            raise TypeError(f"sensor_error is a FadingBias, or None; got {type(error).__name__}")
+        check_kind("sensor_error", error)
     total = sum(map(len, given))
     if not total:
         return transition, process_noise, initial, sensors

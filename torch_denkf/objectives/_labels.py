@@ -159,8 +159,11 @@ class Truth:
             KeyError: if it is missing; the message ends with the ``cure``.
         """
         source = self.data if given else self.out
-        cure = f"{cure}Rename it with loss.set_keys(...)."
-        return diagnosis().entry_of(source, key, type(self.loss).__name__, cure)
+        value = source.get(key, None)
+        if value is None:
+            cure = f"{cure}Rename it with loss.set_keys(...)."
+            raise diagnosis().missing_entry(type(self.loss).__name__, [key], source.keys(True, True), cure)
+        return value
 
     @cached_property
     def counts(self) -> Tensor:
