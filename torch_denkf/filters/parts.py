@@ -80,6 +80,16 @@ class FilterParts:
 
     Raises:
         TypeError: for what is no module, no error of a sensor, no visibility.
+
+    Example:
+        >>> import torch
+        >>> from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
+        >>> prior, r = GaussianPrior([0.0], [1.0], ensemble_size=8), ConstantNoise([0.1], in_key="reading")
+        >>> motion, keys = LearnedTransition(torch.sin), {"observation_key": "reading"}
+        >>> parts = FilterParts(motion, None, Select([0]), r, prior, process_noise=0.1, **keys)
+        >>> update = EnsembleAnalysis("etkf", space=parts.space, **parts.reading())
+        >>> list(parts.in_order(transition=parts.moving(), observation=parts.observation, analysis=update))
+        ['noise', 'transition', 'observation', 'analysis']
     """
 
     def __init__(
