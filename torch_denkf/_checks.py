@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from numbers import Integral, Real
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -29,8 +28,6 @@ __all__ = [
     "check_values",
     "flag_value",
     "has_values",
-    "read_lines",
-    "read_number",
 ]
 
 
@@ -363,35 +360,3 @@ def _range(above=None, least=None, below=None, most=None, infinite: bool = False
 
 def _end(cure: str) -> str:
     return f". {cure}" if cure else ""
-
-
-# ----------------------------------------------------------------------------------------------------------- text
-
-
-def read_number(text: str) -> float:
-    """The number that a text is; ``1_3`` is none, although Python reads 13.
-
-    Raises:
-        ValueError: if it is none.
-    """
-    if "_" in text:
-        raise ValueError(f"could not convert string to float: {text!r}")
-    return float(text)
-
-
-def read_lines(file: Path) -> list[str]:
-    """The lines of a text file in UTF-8.
-
-    Raises:
-        ValueError: if it is no such text; the message names the file and the line.
-    """
-    data = file.read_bytes()
-    try:
-        return data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        byte = data[error.start]
-        raise ValueError(
-            f"{file}:{line} is no text in UTF-8 (byte 0x{byte:02x}); is the file compressed or damaged? Download or "
-            "copy it anew, or convert it to UTF-8"
-        ) from error

@@ -40,6 +40,11 @@ def compiler() -> ModuleType:
     return import_module("torch_denkf.compilation")
 
 
+def deployment() -> ModuleType:
+    """The room of packaged steps."""
+    return import_module("torch_denkf.deployment")
+
+
 def diagnosis() -> ModuleType:
     """The room of a filter's default observers."""
     return import_module("torch_denkf.diagnosis")

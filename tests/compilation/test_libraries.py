@@ -16,8 +16,8 @@ from tensordict import TensorDict
 
 from tests.conftest import COMPILED
 from tests.filters.factories import has_compiler, linear_kalman
-from torch_denkf._lock import locked
 from torch_denkf.compilation.libraries import clear_damaged_libraries, is_whole
+from torch_denkf.compilation.lock import locked
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from torch_denkf._lock import locked
+from torch_denkf.compilation.lock import locked
 from torch_denkf.deployment.files import replacing, reserve, write_bytes, write_text
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def start(code, *arguments):
@@ -35,7 +35,7 @@ with replacing(sys.argv[1]) as beside:
 LOCKS = """
 import sys
 from pathlib import Path
-from torch_denkf._lock import locked
+from torch_denkf.compilation.lock import locked
 with locked(Path(sys.argv[1]), ".lock", "is writing to it"):
     print("ready", flush=True)
     sys.stdin.read()

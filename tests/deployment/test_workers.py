@@ -47,7 +47,7 @@ def running(pid: int) -> bool:
 def test_workers_of_a_killed_parent_end(tmp_path):
     file = tmp_path / "program.py"
     file.write_text(PROGRAM)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     with subprocess.Popen([sys.executable, str(file)], stdout=subprocess.PIPE, text=True, env=environment) as run:
         workers = [int(pid) for pid in run.stdout.readline().split()]
         assert len(workers) == 2
@@ -69,7 +69,7 @@ def test_workers_of_a_study_end_with_it(tmp_path, how):
     file, folder = tmp_path / "study.py", tmp_path / "begun"
     file.write_text(STUDY)
     folder.mkdir()
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "FOLDER": str(folder)}
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "FOLDER": str(folder)}
     with subprocess.Popen([sys.executable, str(file)], stderr=subprocess.DEVNULL, env=environment) as run:
         until = time.monotonic() + 120
         while len(workers := [int(path.name) for path in folder.iterdir()]) < 2:

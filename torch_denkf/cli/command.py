@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import ClassVar
 
-from torch_denkf._lock import locked
+from torch_denkf.compilation.lock import locked
 
 __all__ = ["Command", "alone_in", "meant", "say"]
 

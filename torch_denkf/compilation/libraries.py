@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from torch_denkf._lock import take_lock
+from torch_denkf.compilation.lock import take_lock
 
 __all__ = ["clear_damaged_libraries", "clear_full_cache", "free_space", "is_whole"]
 

@@ -3,6 +3,7 @@
 :func:`load_step` needs torch alone. :func:`export_step`, which needs all of torch_denkf, is imported when it is used.
 """
 
+from torch_denkf.deployment.in_environment import PackagedRun as PackagedRun
 from torch_denkf.deployment.package import load_step
 
 __all__ = [

@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from torch_denkf._lock import take_lock
 from torch_denkf.compilation.libraries import free_space
+from torch_denkf.compilation.lock import take_lock
 
 __all__ = [
     "clear_errors",

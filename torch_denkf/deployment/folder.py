@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 import torch_denkf
-from torch_denkf._lock import locked
+from torch_denkf.compilation.lock import locked
 from torch_denkf.deployment.files import sync, write_bytes, write_text
 from torch_denkf.deployment.rebuilt import build_from, refuse_another
 

@@ -145,8 +145,7 @@ class Filter(Checked, TensorDictSequential):
         check_module("initial", initial)
         super().__init__(*modules)
         self.initial = initial
-        self.init_key = unravel_key(init_key)
-        self.control_keys = [unravel_key(key) for key in control_keys]
+        self.init_key, self.control_keys = unravel_key(init_key), list(control_keys)
         self.forecast_keys, self.check_finite = dict(forecast_keys or {}), check_finite
         self.fixed_options: dict[str, Any] = {
             "update_at_reset": update_at_reset,
@@ -164,7 +163,8 @@ class Filter(Checked, TensorDictSequential):
     def _sort(self) -> None:
         """Sorts the modules, and looks up once what each run reads and writes."""
         modules = named_modules_of(self)
-        structure = Structure.of(modules, self.initial, self.control_keys, self.forecast_keys)
+        controls = [unravel_key(key) for key in self.control_keys]
+        structure = Structure.of(modules, self.initial, controls, self.forecast_keys)
         diagnosis().check_composition(modules, structure)
         if self.variance_ceiling is not None:
             ceiling = VarianceCeiling(structure.kinds, structure.belief, self.variance_ceiling)
@@ -712,7 +712,12 @@ class Filter(Checked, TensorDictSequential):
         else:
             row = {key: value.new_zeros(1, *value.shape[len(size) :]) for key, value in row.items()}
         call = Call(torch.Size([1] if size else []))
-        with torch.random.fork_rng(devices=[]), set_recurrent_mode(False), recorded_draws(self, self._random) as drawn:
+        devices = {value.device for value in row.values() if value.is_cuda}
+        with (
+            torch.random.fork_rng(devices=devices),
+            set_recurrent_mode(False),
+            recorded_draws(self, self._random) as drawn,
+        ):
             start = run_module(self.initial, {**self._nothing(call.batch_size), **row}, call.part("initial"))
             # Where an entry has not come yet, what reads it asks for what it did before; the step itself raises.
             with suppress(KeyError, *EXPLAINED):

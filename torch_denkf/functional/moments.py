@@ -24,7 +24,8 @@ def ensemble_mean(ensemble: Tensor) -> Tensor:
         >>> ensemble_mean(torch.tensor([[1.0, 2.0], [3.0, 6.0]]))
         tensor([2., 4.])
     """
-    check_ensemble("ensemble", ensemble)
+    if ensemble.ndim < 2 or not ensemble.shape[-2]:
+        check_ensemble("ensemble", ensemble)
     return ensemble.mean(-2)
 
 
@@ -68,7 +69,8 @@ def ensemble_var(ensemble: Tensor, mean: Tensor | None = None) -> Tensor:
         >>> ensemble_var(torch.tensor([[1.0, 2.0], [3.0, 6.0]]))
         tensor([2., 8.])
     """
-    check_ensemble("ensemble", ensemble, min_size=2)
+    if ensemble.ndim < 2 or ensemble.shape[-2] < 2:
+        check_ensemble("ensemble", ensemble, min_size=2)
     # Twice as fast as var() over a dimension that is not the last, which takes one number at a time; both are exact.
     anomalies = ensemble - (ensemble.mean(-2) if mean is None else mean).unsqueeze(-2)
     return anomalies.square().sum(-2) / (ensemble.shape[-2] - 1)

@@ -113,7 +113,7 @@ class EnsembleUpdate(Update):
 
     def on_entries(self, entries, call):
         """The belief and the diagnostics."""
-        return super().on_entries(self.aligned(entries), call)
+        return super().on_entries(entries if self.reading_space is None else self.aligned(entries), call)
 
     def aligned(self, entries: Entries) -> Entries:
         """Maps predictions and the reading to plain numbers, see :meth:`~torch_denkf.functional.manifolds.Space.align`.

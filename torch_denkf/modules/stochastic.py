@@ -232,13 +232,13 @@ class StochasticMLP(nn.Module):
             run = list(zip(self.layers, (*factors, None), strict=True))
         else:
             run = list(zip(self.layers, repeat(None)))
-        hidden = x
+        hidden, recorded = x, torch.is_grad_enabled()
         for layer, factor in run[:-1]:
             hidden = layer(hidden)
             if factor is None:
                 hidden = self.activation(hidden)
             elif isinstance(self.activation, nn.ReLU):
-                hidden = dropped_relu(hidden, factor, self.rate)
+                hidden = dropped_relu(hidden, factor, self.rate) if recorded else (hidden * factor).relu_()
             else:
                 hidden = self.activation(hidden) * factor
         out = run[-1][0](hidden)

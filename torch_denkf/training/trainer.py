@@ -14,7 +14,7 @@ from torchrl.checkpoint import GlobalRNGState
 from torchrl.record.loggers.common import Logger
 
 from torch_denkf._checks import check_count
-from torch_denkf._lock import locked
+from torch_denkf.compilation.lock import locked
 from torch_denkf.deployment.progress import progress_bar
 from torch_denkf.training.checkpoint import check_settings, check_state, read_checkpoint, write_checkpoint
 from torch_denkf.training.distributed import Processes

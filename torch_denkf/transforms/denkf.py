@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 
 import torch
@@ -13,13 +13,12 @@ from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf._arguments import Checked
-from torch_denkf._registered import diagnosis
+from torch_denkf._registered import deployment, diagnosis
 from torch_denkf.beliefs import is_summary
 from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record, check_belief
 from torch_denkf.filters.scan import where_rows
 from torch_denkf.submodel import Entries
-from torch_denkf.transforms._packaged import PackagedRun, Step
 from torch_denkf.transforms.primer import refuse_resets_of_groups
 
 __all__ = ["DEnKFTransform"]
@@ -93,7 +92,7 @@ class DEnKFTransform(Checked, Transform):
         store_ensemble: bool = True,
         no_grad: bool = True,
         check_finite: bool = True,
-        packaged: Step | None = None,
+        packaged: Callable[[Mapping[str, torch.Tensor]], Mapping[str, torch.Tensor]] | None = None,
     ):
         if not isinstance(filter, Filter):
             if not isinstance(filter, TensorDictSequential) or initial is None:
@@ -126,7 +125,7 @@ class DEnKFTransform(Checked, Transform):
             raise ValueError("A packaged step records no graph; leave out packaged=, or no_grad=False.")
         self._packaged = None
         if packaged is not None:
-            self._packaged = PackagedRun(
+            self._packaged = deployment().PackagedRun(
                 packaged,
                 carry={key: self._names[key] for key in structure.carry},
                 controls=self._controls,

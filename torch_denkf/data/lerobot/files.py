@@ -23,9 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from torch_denkf._checks import check_count, check_number, read_lines
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.data.parquet import read_parquet
 from torch_denkf.data.pictures import decode_picture
+from torch_denkf.data.text import read_lines
 
 VERSIONS = {"v2.0": 2, "v2.1": 2, "v3.0": 3}
 MOST_ROWS = 10**8  # of a data set: 38 days at 30 a second

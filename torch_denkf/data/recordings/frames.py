@@ -16,10 +16,11 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torch_denkf._checks import check_number, read_number
+from torch_denkf._checks import check_number
 from torch_denkf.data.cache import cache_folder, cached, stamp
 from torch_denkf.data.pictures import CURE, decode_picture, scaled, text_of_size, unnamed_file
 from torch_denkf.data.recordings.tables import SECONDS, Unit, check_stream, check_times, read_numbers
+from torch_denkf.data.text import read_number
 from torch_denkf.data.video import NOT_DECODED, decoded_frames, say_if_cut
 from torch_denkf.deployment.files import clear_errors
 from torch_denkf.deployment.progress import progress_bar

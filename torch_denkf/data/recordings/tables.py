@@ -13,8 +13,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from torch_denkf._checks import check_number, read_number
+from torch_denkf._checks import check_number
 from torch_denkf.data.parquet import read_parquet
+from torch_denkf.data.text import read_number
 from torch_denkf.data.times import Way
 
 __all__ = ["Readings", "Table", "Unit", "check_times", "read_numbers"]

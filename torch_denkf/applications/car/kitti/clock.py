@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torch_denkf._checks import read_lines, read_number
 from torch_denkf.applications.car.vision.poses import KITTI_DT
+from torch_denkf.data.text import read_lines, read_number
 from torch_denkf.data.times import MOST_WRONG, filled, sound
 
 __all__ = ["GAP", "Times", "read_times"]

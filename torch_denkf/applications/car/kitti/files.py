@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torch_denkf._checks import read_lines, read_number
+from torch_denkf.data.text import read_lines, read_number
 from torch_denkf.deployment.files import replacing
 
 FARTHEST = 1e6  # m from the origin: float32, which states are in, then still tells 6 cm apart

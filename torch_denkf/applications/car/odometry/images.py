@@ -13,9 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from torch_denkf._checks import read_number
 from torch_denkf.applications.car.kitti.files import read_calibration
 from torch_denkf.data.pictures import is_bomb
+from torch_denkf.data.text import read_number
 
 __all__ = ["FrameSource", "read_camera", "read_frames", "read_times"]
 

@@ -12,8 +12,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torch_denkf._checks import read_lines
 from torch_denkf.applications.car.odometry.tracking import TrackedBelief
+from torch_denkf.data.text import read_lines
 from torch_denkf.deployment.files import replacing
 from torch_denkf.functional.moments import ensemble_cov
 

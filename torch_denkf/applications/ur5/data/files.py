@@ -24,8 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from torch_denkf._checks import check_count, read_lines
+from torch_denkf._checks import check_count
 from torch_denkf.applications.ur5.simulation.names import DOMAIN_NAMES, TASKS
+from torch_denkf.data.text import read_lines
 from torch_denkf.deployment.files import clear_errors, write_bytes, write_text
 
 COLLECTION = "collection.json"

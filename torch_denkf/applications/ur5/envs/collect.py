@@ -13,11 +13,11 @@ from dataclasses import asdict
 from pathlib import Path
 
 from torch_denkf._checks import check_count
-from torch_denkf._lock import locked
 from torch_denkf.applications.ur5.data import files
 from torch_denkf.applications.ur5.data.files import COLLECTION, Entry
 from torch_denkf.applications.ur5.envs.episodes import Options, make_demos
 from torch_denkf.applications.ur5.simulation.names import TASKS, DomainName, TaskName
+from torch_denkf.compilation.lock import locked
 
 __all__ = ["collect_ur5_demos"]
 
