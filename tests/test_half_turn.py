@@ -20,7 +20,7 @@ from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter, ParticleFilter
 from torch_denkf.functional.localisation import Neighbours
 from torch_denkf.functional.manifolds import Circle, Euclidean, Flat, Opposite
 from torch_denkf.fusion import FusedFilter, FusedSensor, SensorAttention
-from torch_denkf.imperfect import Visible
+from torch_denkf.imperfect import FadingBias, Visible
 from torch_denkf.modules import (
     ConstantNoise,
     EKFTransition,
@@ -139,9 +139,9 @@ def kalman(turn):
     return KalmanFilter(MOVE, both, process_noise=Q, noise=R, **prior, reading_space=PLANE)
 
 
-def gaussian(kind):
+def gaussian(kind, **more):
     def make(turn):
-        options = {"initial": moments(turn), "reading_space": PLANE}
+        options = {"initial": moments(turn), "reading_space": PLANE, **more}
         if kind is BackpropKF:
             return BackpropKF(
                 MOVE, Sensor("samples"), torch.eye(2), noise(), process_noise_cov=Q.square().diag(), **options
@@ -229,6 +229,7 @@ FILTERS = {
     "local with a lag": lambda turn: FixedLag(local()(turn), 3),
     "Kalman": kalman,
     **{kind.__name__: gaussian(kind) for kind in (EKF, UKF, BackpropKF)},
+    "EKF with errors that last": lambda turn: gaussian(EKF, sensor_error=FadingBias([0.1, 0.1], 5.0))(turn),
     "IEnKS": iterated,
     "particles": particles(),
     "particles, learned": particles(learned_likelihood),

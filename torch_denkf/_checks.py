@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 __all__ = [
+    "check_choice",
     "check_count",
     "check_covariance",
     "check_ensemble",
@@ -191,6 +192,23 @@ def check_count(name: str, value: Any, *, least: int = 1, most: int | None = Non
         raise ValueError(f"{name} must be a whole number, at least {least}; got {value!r}" + _end(cure))
     if most is not None and int(value) > most:
         raise ValueError(f"{name} must be a whole number, at most {most}; got {value!r}" + _end(cure))
+
+
+def check_choice(name: str, value: Any, choices: Sequence[str | None]) -> None:
+    """Raise unless ``value`` is one of several words.
+
+    Raises:
+        ValueError: if it is none of them.
+
+    Example:
+        >>> check_choice("scheme", "sqrt", ["soft", "hard", None])
+        Traceback (most recent call last):
+        ...
+        ValueError: scheme is "soft", "hard" or None; got 'sqrt'.
+    """
+    if value not in choices:
+        *others, last = ("None" if choice is None else f'"{choice}"' for choice in choices)
+        raise ValueError(f"{name} is {', '.join(others)} or {last}; got {value!r}.")
 
 
 def check_values(

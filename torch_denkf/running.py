@@ -84,9 +84,7 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
                 tensordict.set(("noise", own, name) if name else ("noise", own), value)
     missing = [key for key in keys if key not in entries]
     if missing and isinstance(module, TensorDictModule) and not isinstance(module, SubModel):
-        raise KeyError(
-            f"{type(module).__name__} reads {missing}, which is missing; there is {sorted(map(str, entries))}."
-        )
+        raise diagnosis().missing_entry(type(module).__name__, missing, entries)
     tensordict = module(tensordict)
     return {key: tensordict.get(key) for key in map(unravel_key, module.out_keys)}
 

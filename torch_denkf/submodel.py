@@ -230,12 +230,7 @@ class SubModel(Checked, TensorDictModule):
         """
         value = entries.get(key)
         if value is None:
-            present = ", ".join(sorted(map(str, entries))) or "nothing"
-            raise KeyError(
-                f"{type(self).__name__} reads {key!r}, which is missing. There is {present}. Give the filter it "
-                "(does the environment or the data have it?), put the module that writes it in front, or rename the "
-                f"key in the constructor of {type(self).__name__}."
-            )
+            raise diagnosis().missing_entry(type(self).__name__, [key], entries)
         return value
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -213,6 +213,9 @@ WRONG_TYPES = {
     "E": (lambda: GaussianPrior([0.0], [1.0], ensemble_size=8.0), "ensemble_size", "8.0"),
     "dt": (lambda: UnicycleTransition(NET, dt=torch.tensor(0.1)), "dt", "Tensor"),
     "dims": (lambda: Select([0.5]), "dims", "0.5"),
+    "error of a sensor": (lambda: KalmanFilter(**PARTS, sensor_error=1.0), "sensor_error is a FadingBias", "float"),
+    "error of an EKF's": (lambda: linear_filter("EKF", sensor_error=1.0), "sensor_error is a FadingBias", "float"),
+    "visibility": (lambda: linear_filter("UKF", visibility=Select([0])), "visibility is a Visibility", "Select"),
 }
 
 

@@ -430,7 +430,7 @@ def test_a_bad_mask_is_named(mask):
 
 
 def test_a_reading_that_is_not_there_is_named():
-    with pytest.raises(KeyError, match=r"RejectReadings reads 'gps', which is not there; there are \['x'\]"):
+    with pytest.raises(KeyError, match=r"RejectReadings reads 'gps', which is missing. There is x."):
         RejectReadings({"gps": "seen"})(of("x", [1.0]))
 
 

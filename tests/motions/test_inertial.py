@@ -9,9 +9,9 @@ import torch
 from torch.testing import assert_close
 
 from tests.motions.steps_for_tests import INERTIAL, inertial_state, random_points, step
-from torch_denkf.functional.inertial import move_inertially
 from torch_denkf.functional.manifolds import SE23, SO3, rotate, rotation_matrix, skew
 from torch_denkf.motions import AttitudeMotion, Gravity, InertialMotion
+from torch_denkf.motions.inertial import move_inertially
 
 pytestmark = pytest.mark.usefixtures("float64")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, Unpack
 
 import torch
@@ -10,7 +9,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_covariance, check_one_dtype, check_shape, check_square, check_values
-from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
+from torch_denkf.filters import Filter
+from torch_denkf.filters.parts import FilterParts, ReadingOptions, check_moments
 from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition
 from torch_denkf.modules.tensors import as_floating
 from torch_denkf.submodel import Initial, role
@@ -18,7 +18,7 @@ from torch_denkf.submodel import Initial, role
 __all__ = ["BackpropKF"]
 
 
-class BackpropKF(GaussianFilter):
+class BackpropKF(Filter):
     r"""Linear-Gaussian filter of :math:`x_t = A x_{t-1} + B a + N(0, Q)`, :math:`z_t = C x_t + N(0, R_t)`.
 
     A sensor network reads :math:`z_t` from the frame and a noise network :math:`R_t`; both are trained through the
@@ -39,8 +39,9 @@ class BackpropKF(GaussianFilter):
             :class:`~torch_denkf.modules.GaussianAround`.
         control: B, ``[S, A]``; ``None`` for none.
         trainable: whether A and B are parameters.
-        **options: ``inflation``, ``reading_space``, ``observation_key``, ``observed_key``, ``visibility`` and what
-            every filter takes, see :class:`GaussianOptions`. Of ``control_keys`` the first drives the transition
+        inflation: factor on the belief's standard deviations, where anything is observed.
+        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``visibility`` and what every filter takes,
+            see :class:`~torch_denkf.filters.parts.ReadingOptions`. Of ``control_keys`` the first drives the transition
             where ``control`` is given.
 
     Raises:
@@ -72,7 +73,8 @@ class BackpropKF(GaussianFilter):
         initial: TensorDictModuleBase,
         control: torch.Tensor | None = None,
         trainable: bool = False,
-        **options: Unpack[GaussianOptions],
+        inflation: float = 1.0,
+        **options: Unpack[ReadingOptions],
     ):
         a, c = as_floating(transition, "transition"), as_floating(observation, "observation")
         check_square("transition", a)
@@ -92,6 +94,7 @@ class BackpropKF(GaussianFilter):
         if control is not None:
             action = {"control": control, "action_key": options.get("control_keys", ("action",))[0]}
         forecast = LinearTransition(transition, process_noise_cov, trainable=trainable, **action)
-        super().__init__(
-            sensor, noise, forecast, partial(KalmanAnalysis, observation, None), initial=initial, **options
-        )
+        parts = FilterParts(forecast, sensor, None, noise, initial=initial, optional=["observation"], **options)
+        check_moments(type(self).__name__, initial)
+        update = KalmanAnalysis(observation, None, inflation=inflation, **parts.reading())
+        super().__init__(parts.in_order(transition=forecast, analysis=update), initial=initial, **parts.options)

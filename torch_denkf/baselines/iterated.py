@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Unpack
 
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.baselines.iterated_analysis import IteratedAnalysis, with_smoothed
 from torch_denkf.filters import Filter
-from torch_denkf.filters.options import FilterOptions
-from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules import NoisyTransition, as_process_noise
-from torch_denkf.running import check_module
-from torch_denkf.submodel import Initial, role
+from torch_denkf.filters.parts import FilterParts, ReadingOptions
 
 __all__ = ["IEnKS"]
 
@@ -39,10 +33,8 @@ class IEnKS(Filter):
         rotate: random mean-preserving rotation of them.
         process_noise: Q of the motion: standard deviations ``[S]`` (a number for all), or a module that writes Q, see
             :mod:`torch_denkf.modules.process_noise`. ``None``: the motion is exact.
-        reading_space: in which the reading lives; ``None`` for plain numbers. The initial belief has that of the state.
-        observation_key: the reading; the sensor's by default.
-        **kwargs: ``control_keys``, ``init_key``, ``forecast_keys``, ``variance_ceiling`` and ``check_finite`` of
-            :class:`~torch_denkf.filters.Filter`.
+        **options: ``reading_space``, ``observation_key``, ``observed_key`` and what every filter takes, see
+            :class:`~torch_denkf.filters.parts.ReadingOptions`; neither ``update_at_reset`` nor ``visibility``.
 
     Raises:
         ValueError: if a model draws noise of its own, it is not clear where the reading is, or ``update_at_reset`` is
@@ -82,32 +74,20 @@ class IEnKS(Filter):
         inflation: float = 1.0,
         rotate: bool = False,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
-        reading_space: Space | None = None,
-        observation_key: NestedKey | None = None,
-        **kwargs: Unpack[FilterOptions],
+        **options: Unpack[ReadingOptions],
     ):
-        if kwargs.get("update_at_reset"):
+        if options.get("update_at_reset"):
             raise ValueError("IEnKS corrects the state before a step: the first frame has none, so no update_at_reset.")
-        if observation_key is None and sensor is None:
-            raise ValueError("Without a sensor, say where the reading is: observation_key=...")
-        check_module("noise", noise)
-        if sensor is not None:
-            check_module("sensor", sensor)
-        space = role(initial, Initial).space
-        if process_noise is not None:
-            transition = NoisyTransition(transition, as_process_noise(process_noise, initial), space=space)
-        reading = sensor.out_keys[0] if sensor is not None and observation_key is None else observation_key
+        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, **options)
+        transition = parts.moving()
         analysis = IteratedAnalysis(
             transition,
             observation,
             iterations=iterations,
             inflation=inflation,
             rotate=rotate,
-            space=space,
-            reading_space=reading_space,
-            observation_key=reading,
-            noise_variance_key=noise.out_keys[0],
+            space=parts.space,
+            **parts.reading(),
         )
-        modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
-        modules.update(noise=noise, transition=transition, analysis=analysis)
-        super().__init__(modules, initial=with_smoothed(initial), **kwargs)
+        modules = parts.in_order(transition=transition, analysis=analysis)
+        super().__init__(modules, initial=with_smoothed(initial), **parts.options)

@@ -10,9 +10,9 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.baselines.lstm_cell import LSTMTransition, LSTMUpdate, with_memory
-from torch_denkf.filters._gaussian import refuse_other_beliefs
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
+from torch_denkf.filters.parts import check_moments
 from torch_denkf.modules.kalman import MomentPrior
 from torch_denkf.submodel import SubModel
 
@@ -109,7 +109,7 @@ class LSTMFilter(Filter):
         )
         if initial is None:
             initial = MomentPrior(update.loc, update.scale.square().diag())
-        refuse_other_beliefs(type(self).__name__, initial, [("belief", "mean"), ("belief", "cov")])
+        check_moments(type(self).__name__, initial)
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
         modules.update(transition=LSTMTransition(), lstm=update)
         if motion is not None:

@@ -22,6 +22,7 @@ from torch_denkf.compilation import (
 from torch_denkf.deployment.files import write_bytes
 from torch_denkf.deployment.onnx_model import need_onnx, onnx_model
 from torch_denkf.deployment.package import SIGNATURE, run_onnx
+from torch_denkf.diagnosis import missing_entry
 from torch_denkf.filters import Filter
 from torch_denkf.submodel import Entries
 
@@ -203,9 +204,7 @@ def _inputs(filter: Filter, entries: Entries, example: TensorDictBase) -> list[N
     keys = [*structure.needed, *structure.controls, *structure.carry]
     missing = [key for key in keys if key not in entries]
     if missing:
-        raise KeyError(
-            f"the step reads {missing}, which the example lacks; it holds {sorted(map(str, example.keys(True, True)))}"
-        )
+        raise missing_entry("the step", missing, example.keys(True, True), "This is what the example lacks.")
     return [*keys, *[key for key in entries if key not in keys and (key in structure.optional or key[0] == "noise")]]
 
 

@@ -11,7 +11,9 @@ from torch_denkf.diagnosis.ceiling import CeilingReached
 from torch_denkf.diagnosis.check import check_analysis
 from torch_denkf.diagnosis.collapse import NarrowEnsemble
 from torch_denkf.diagnosis.composition import check_composition as check_composition
+from torch_denkf.diagnosis.errors import entry_of as entry_of
 from torch_denkf.diagnosis.errors import explained as explained
+from torch_denkf.diagnosis.errors import missing_entry as missing_entry
 from torch_denkf.diagnosis.masks import UnreadMasks
 from torch_denkf.diagnosis.policy import PolicyStart
 from torch_denkf.diagnosis.shapes import ReadingRanks

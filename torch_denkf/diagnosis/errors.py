@@ -1,14 +1,16 @@
-"""Explains errors of sub-models: what was read, and in which precision."""
+"""Explains errors: what was read, in which precision, and what is missing."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torch_denkf.submodel import EXPLAINED, Entries, SubModel
 
-__all__ = ["explained"]
+__all__ = ["entry_of", "explained", "missing_entry"]
 
 
 def explained(module: SubModel, error: Exception, entries: Entries) -> Exception:
@@ -56,3 +58,30 @@ def _explain_dtypes(module: SubModel, error: Exception, entries: Entries) -> Non
 
 def _shown(key: NestedKey, value: Tensor) -> str:
     return f"{key!r} {list(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+
+
+def missing_entry(reader: str, missing: Iterable[NestedKey], present: Iterable[NestedKey], cure: str = "") -> KeyError:
+    """Returns the error for entries that are read and missing: it names the reader, them, what is there, and the cure.
+
+    Example:
+        >>> print(missing_entry("Blur", ["pixels"], ["image", "action"], "Set in_keys=."))
+        "Blur reads 'pixels', which is missing. There is action, image. Set in_keys=."
+    """
+    there = ", ".join(sorted(map(str, present))) or "nothing"
+    cure = cure or (
+        "Give the filter it (does the environment or the data have it?), put the module that writes it in front, or "
+        f"rename the key in the constructor of {reader}."
+    )
+    return KeyError(f"{reader} reads {', '.join(map(repr, missing))}, which is missing. There is {there}. {cure}")
+
+
+def entry_of(tensordict: TensorDictBase, key: NestedKey, reader: str, cure: str = "") -> Tensor:
+    """Returns an entry of a tensordict.
+
+    Raises:
+        KeyError: that is :func:`missing_entry`, if it is missing.
+    """
+    value = tensordict.get(key, None)
+    if value is None:
+        raise missing_entry(reader, [key], tensordict.keys(True, True), cure)
+    return value

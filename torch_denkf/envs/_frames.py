@@ -11,6 +11,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import Transform
 
 from torch_denkf._arguments import Checked
+from torch_denkf._registered import diagnosis
 
 CHUNK = 2**20  # values in work at a time: 4 MB in float32
 
@@ -42,10 +43,7 @@ class FrameTransform(Checked, Transform):
     def _frame(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         frame = tensordict.get(key, None)
         if frame is None:
-            present = sorted(map(str, tensordict.keys(True, True)))
-            raise KeyError(
-                f"{type(self).__name__} reads {key!r}, which is not there; there are {present}. Set in_keys=."
-            )
+            raise diagnosis().missing_entry(type(self).__name__, [key], tensordict.keys(True, True), "Set in_keys=.")
         return frame
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

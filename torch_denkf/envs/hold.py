@@ -10,6 +10,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from torch_denkf._arguments import Checked
+from torch_denkf._registered import diagnosis
 
 __all__ = ["HoldReading"]
 
@@ -51,8 +52,7 @@ class HoldReading(Checked, Transform):
     def _entry(self, tensordict: TensorDictBase, key: NestedKey, cure: str) -> Tensor:
         value = tensordict.get(key, None)
         if value is None:
-            present = sorted(map(str, tensordict.keys(True, True)))
-            raise KeyError(f"HoldReading reads {key!r}, which is not there; there are {present}. {cure}")
+            raise diagnosis().missing_entry("HoldReading", [key], tensordict.keys(True, True), cure)
         return value
 
     def _write(self, tensordict: TensorDictBase, before: Tensor | None) -> TensorDictBase:
@@ -64,9 +64,8 @@ class HoldReading(Checked, Transform):
         return tensordict.set(self.out_keys[0], torch.where(observed, reading, before))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        before = self._entry(
-            tensordict, self.out_keys[0], "Start from env.reset(), and pass on what step_mdp() returns."
-        )
+        cure = "Start from env.reset(), and pass on what step_mdp() returns."
+        before = self._entry(tensordict, self.out_keys[0], cure)
         return self._write(next_tensordict, before)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -87,7 +86,8 @@ class HoldReading(Checked, Transform):
         Raises:
             KeyError: if they do not.
         """
-        self._entry(tensordict, self.out_keys[0], "Append HoldReading to the environment, not to a replay buffer.")
+        cure = "Append HoldReading to the environment, not to a replay buffer."
+        self._entry(tensordict, self.out_keys[0], cure)
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

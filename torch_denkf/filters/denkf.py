@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
+from functools import partial
 from typing import Unpack
 
 import torch
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.filters.base import Filter
-from torch_denkf.filters.options import FilterOptions
-from torch_denkf.functional.manifolds import Space
-from torch_denkf.imperfect import FadingBias, Visibility
-from torch_denkf.imperfect.bias import biased_parts
-from torch_denkf.imperfect.visible import heeding
+from torch_denkf.filters.parts import FilterParts, ReadingOptions, SensorError
 from torch_denkf.modules import (
     DiagonalNoise,
     EnsembleAnalysis,
@@ -25,19 +20,11 @@ from torch_denkf.modules import (
     ImageSensor,
     LearnedObservation,
     LearnedTransition,
-    NoisyTransition,
     StochasticMLP,
-    as_process_noise,
 )
-from torch_denkf.running import check_module, reading_of
-from torch_denkf.submodel import Initial, Update, role
+from torch_denkf.submodel import Update, role
 
 __all__ = ["DEnKF"]
-
-
-def _check_image_shape(shape: Sequence[int]) -> None:
-    if len(shape) != 3 or not all(isinstance(side, int) and side > 0 for side in shape):
-        raise ValueError(f"image_shape is (channels, height, width), positive; got {shape!r}")
 
 
 class DEnKF(Filter):
@@ -58,17 +45,11 @@ class DEnKF(Filter):
         process_noise: Q of the motion, beside the noise of the transition's network: standard deviations ``[S]`` (a
             number for all, 0 for none), or a module that writes Q, see :mod:`torch_denkf.modules.process_noise`. An
             ensemble without any process noise collapses. ``None``: the transition's own noise alone.
-        reading_space: in which the reading lives, such as ``Circle()`` for an angle, for the default ``analysis``;
-            ``None`` for plain numbers. The initial belief has that of the state.
-        observation_key: the reading ``[*B, O]``, for the default ``analysis`` without a sensor.
-        observed_key: its mask ``[*B, 1]`` or ``[*B, O]``, for the default ``analysis``; ``"observed"`` by default.
         sensor_error: coloured errors of the sensor, such as a ``FadingBias``: they become part of the state, behind its
             S components, of transition, process noise, observation and initial belief. All these are given for the
             state alone.
-        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.imperfect.Visibility`; the
-            update heeds it, see :class:`~torch_denkf.imperfect.Visible`.
-        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
-            ``check_finite`` and ``prefix`` of :class:`Filter`.
+        **options: ``reading_space``, ``observation_key``, ``observed_key``, for the default ``analysis``,
+            ``visibility`` and what every filter takes, see :class:`~torch_denkf.filters.parts.ReadingOptions`.
 
     Raises:
         ValueError: if it is not clear where the reading is.
@@ -95,47 +76,22 @@ class DEnKF(Filter):
         *,
         initial: TensorDictModuleBase,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
-        reading_space: Space | None = None,
-        observation_key: NestedKey | None = None,
-        observed_key: NestedKey | None = None,
-        sensor_error: FadingBias | None = None,
-        visibility: Visibility | None = None,
-        **kwargs: Unpack[FilterOptions],
+        sensor_error: SensorError | None = None,
+        **options: Unpack[ReadingOptions],
     ):
-        check_module("transition", transition)
-        check_module("observation", observation)
-        check_module("noise", noise)
-        check_module("initial", initial)
-        if sensor_error is not None:
-            of_reading = reading_space if analysis is None else role(analysis, Update).reading_space
-            biased = biased_parts(sensor_error, transition, observation, process_noise, initial, of_reading)
-            transition, observation, process_noise, initial = biased
-        if process_noise is not None:
-            q = as_process_noise(process_noise, initial)
-            transition = NoisyTransition(transition, q, space=role(initial, Initial).space)
-        told = reading_space is not None or observation_key is not None or observed_key is not None
-        if analysis is not None and told:
-            raise ValueError(
-                "reading_space, observation_key and observed_key are for the default analysis; give them to yours "
-                "instead."
-            )
+        if analysis is not None:
+            if any(options.get(name) is not None for name in ("reading_space", "observation_key", "observed_key")):
+                raise ValueError(
+                    "reading_space, observation_key and observed_key are for the default analysis; give them to yours "
+                    "instead."
+                )
+            options["reading_space"] = role(analysis, Update).reading_space
+        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, sensor_error, **options)
         if analysis is None:
-            if observation_key is None and sensor is None:
-                raise ValueError("Without a sensor, say where the reading is: observation_key=..., or an analysis.")
-            reading = reading_of(sensor) if sensor is not None and observation_key is None else observation_key
-            mask = "observed" if observed_key is None else observed_key
-            keys = {"observation_key": reading, "noise_variance_key": noise.out_keys[0], "observed_key": mask}
-            analysis = EnsembleAnalysis(
-                "perturbed" if sensor is None else "sensor",
-                space=role(initial, Initial).space,
-                reading_space=reading_space,
-                **keys,
-            )
-        modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
-        if visibility is not None:
-            modules["visibility"] = visibility
-        modules.update(noise=noise, transition=transition, observation=observation)
-        super().__init__(modules | {"analysis": heeding(visibility, analysis)}, initial=initial, **kwargs)
+            scheme = partial(EnsembleAnalysis, "perturbed" if sensor is None else "sensor")
+            analysis = scheme(space=parts.space, **parts.reading(", or an analysis"))
+        modules = parts.in_order(transition=parts.moving(), observation=parts.observation, analysis=analysis)
+        super().__init__(modules, initial=parts.initial, **parts.options)
 
     @classmethod
     def paper(
@@ -165,7 +121,6 @@ class DEnKF(Filter):
         """
         check_count("state_dim", state_dim)
         check_count("observation_dim", observation_dim)
-        _check_image_shape(image_shape)
         check_number("r", r, above=0)
         return cls(
             transition=LearnedTransition(StochasticMLP(state_dim, state_dim, (32, 32, 64, 64), rate=rate)),

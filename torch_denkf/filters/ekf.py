@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Unpack
 
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
-from torch_denkf.imperfect.bias import FadingBias, biased_parts
+from torch_denkf.filters.base import Filter
+from torch_denkf.filters.parts import FilterParts, ReadingOptions, SensorError, check_moments
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
-from torch_denkf.modules.process_noise import as_process_noise
-from torch_denkf.submodel import Initial, role
 
 __all__ = ["EKF"]
 
 
-class EKF(GaussianFilter):
+class EKF(Filter):
     """Extended Kalman filter whose transition, sensor, observation and noise models may all be learned (dEKF).
 
     It takes the modules of :class:`~torch_denkf.filters.DEnKF` and a process noise: what an ensemble filter's
@@ -39,8 +36,13 @@ class EKF(GaussianFilter):
             S components, of transition, process noise, observation and initial belief. All these are given for the
             state alone.
         stop_jacobian_gradient: the transition's Jacobian is a constant to the gradient.
-        **options: ``inflation``, ``reading_space``, ``observation_key``, ``observed_key``, ``visibility`` and what
-            every filter takes, see :class:`GaussianOptions`.
+        inflation: factor on the belief's standard deviations, where anything is observed. What is never observed grows
+            by it without bound.
+        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``visibility`` and what every filter takes,
+            see :class:`~torch_denkf.filters.parts.ReadingOptions`.
+
+    Raises:
+        ValueError: if it is not clear where the reading is, or ``initial`` writes no mean and covariance.
 
     Reference:
         Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.
@@ -73,14 +75,16 @@ class EKF(GaussianFilter):
         *,
         process_noise: TensorDictModuleBase | Sequence[float] | float,
         initial: TensorDictModuleBase,
-        sensor_error: FadingBias | None = None,
+        sensor_error: SensorError | None = None,
         stop_jacobian_gradient: bool = False,
-        **options: Unpack[GaussianOptions],
+        inflation: float = 1.0,
+        **options: Unpack[ReadingOptions],
     ):
-        q = as_process_noise(process_noise, initial)
-        if sensor_error is not None:
-            parts = biased_parts(sensor_error, transition, observation, q, initial, options.get("reading_space"))
-            transition, observation, q, initial = parts
-        space = role(initial, Initial).space
-        forecast = EKFTransition(transition, q, stop_jacobian_gradient=stop_jacobian_gradient, space=space)
-        super().__init__(sensor, noise, forecast, partial(EKFAnalysis, observation), initial=initial, **options)
+        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, sensor_error, **options)
+        check_moments(type(self).__name__, initial)
+        forecast = EKFTransition(
+            parts.transition, parts.process_noise, stop_jacobian_gradient=stop_jacobian_gradient, space=parts.space
+        )
+        update = EKFAnalysis(parts.observation, inflation=inflation, space=parts.space, **parts.reading())
+        modules = parts.in_order(transition=forecast, analysis=update)
+        super().__init__(modules, initial=parts.initial, **parts.options)

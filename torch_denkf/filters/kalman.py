@@ -8,13 +8,12 @@ from typing import Any, Unpack
 
 import torch
 from tensordict import NestedKey
-from torch import Tensor, nn
 
 from torch_denkf._checks import check_covariance, check_one_dtype, check_shape, check_square, check_values
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
+from torch_denkf.filters.parts import SensorError, check_kind
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules.tensors import as_floating
 
@@ -72,7 +71,7 @@ class KalmanFilter(Filter):
         cov: torch.Tensor,
         control: torch.Tensor | None = None,
         reading_space: Space | None = None,
-        sensor_error: FadingBias | None = None,
+        sensor_error: SensorError | None = None,
         observation_key: NestedKey = "observation",
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
@@ -97,9 +96,9 @@ class KalmanFilter(Filter):
             b = as_floating(control, "control")
             check_shape("control", b, (size, b.shape[-1] if b.ndim else 0), "[S, A]")
             check_values("control", b)
+        check_kind("sensor_error", sensor_error)
         if sensor_error is not None:
-            f, h, q, m, p = _with_biases(sensor_error, f, h, q, m, p)
-            control = None if control is None else nn.functional.pad(as_floating(control), (0, 0, 0, len(sensor_error)))
+            f, h, q, m, p, control = sensor_error.augmented_matrices(f, h, q, m, p, control)
         action: dict[str, Any] = {}
         if control is not None:
             action = {"control": control, "action_key": kwargs.get("control_keys", ("action",))[0]}
@@ -114,21 +113,6 @@ class KalmanFilter(Filter):
             ),
         )
         super().__init__(modules, initial=MomentPrior(m, p), **kwargs)
-
-
-@torch.no_grad()
-def _with_biases(bias: FadingBias, f: Tensor, h: Tensor, q: Tensor, m: Tensor, p: Tensor) -> tuple[Tensor, ...]:
-    """F, H, Q, mean and covariance of the state with the biases behind it."""
-    if bias.factor or len(bias) % len(h):
-        raise ValueError(
-            f"A KalmanFilter takes as many biases for each of the {len(h)} components of the reading, and no factors; "
-            f"sensor_error has {len(bias)}{' factors' if bias.factor else ''}. Take an EKF."
-        )
-    decay, variance, std = (value.to(f.dtype) for value in (bias.decay, bias.variance, bias.std))
-    own = torch.eye(len(h), dtype=f.dtype, device=f.device).repeat(1, len(bias) // len(h))
-    q = torch.block_diag(q.diag() if q.ndim == 1 else q, variance.diag())
-    f, p = torch.block_diag(f, decay.diag()), torch.block_diag(p, std.square().diag())
-    return f, torch.cat([h, own], -1), q, torch.cat([m, torch.zeros_like(decay)]), p
 
 
 def _covariance(name: str, given: dict[str, torch.Tensor], size: int, shape: str) -> torch.Tensor:

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Literal, Unpack
 
-from tensordict import NestedKey, unravel_key
+from tensordict import unravel_key
 from tensordict.nn import TensorDictModuleBase
 
+from torch_denkf._checks import check_choice
 from torch_denkf.filters.base import Filter
-from torch_denkf.filters.options import FilterOptions
-from torch_denkf.functional.manifolds import Space
-from torch_denkf.imperfect import Visibility
-from torch_denkf.imperfect.visible import heeding
-from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel, as_process_noise
+from torch_denkf.filters.parts import FilterParts, ReadingOptions
+from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
-from torch_denkf.running import check_module, reading_of
-from torch_denkf.submodel import Initial, role
 
 __all__ = ["DPF", "PFM", "MixtureParticleFilter", "ParticleFilter"]
 
@@ -51,14 +46,9 @@ class ParticleFilter(Filter):
         initial: the initial belief, which also fixes the number of particles; weights are added where it has none.
         process_noise: Q of the motion, beside the transition's own noise: standard deviations ``[S]`` (a number for
             all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
-        reading_space: in which the reading lives, such as ``Circle()`` for an angle, for the default likelihood;
-            ``None`` for plain numbers. The initial belief has that of the state.
-        observation_key: the reading ``[*B, O]``, for the default likelihood without a sensor.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` that resampling and the default likelihood heed.
-        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.imperfect.Visibility`; the
-            update heeds it, see :class:`~torch_denkf.imperfect.Visible`. For a Gaussian likelihood.
-        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
-            ``check_finite`` and ``prefix`` of :class:`Filter`.
+        **options: ``reading_space`` and ``observation_key``, for the default likelihood, ``observed_key``, which
+            resampling heeds, too, ``visibility``, for a Gaussian likelihood, and what every filter takes, see
+            :class:`~torch_denkf.filters.parts.ReadingOptions`.
 
     Raises:
         ValueError: on an unknown ``resampling``, or if it is not clear where the reading is.
@@ -98,33 +88,17 @@ class ParticleFilter(Filter):
         ess_threshold: float | None = None,
         jitter: float = 0.0,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
-        reading_space: Space | None = None,
-        observation_key: NestedKey | None = None,
-        observed_key: NestedKey = "observed",
-        visibility: Visibility | None = None,
-        **kwargs: Unpack[FilterOptions],
+        **options: Unpack[ReadingOptions],
     ):
-        check_module("transition", transition)
-        check_module("observation", observation)
-        check_module("initial", initial)
-        if noise is not None:
-            check_module("noise", noise)
-        if resampling not in ("systematic", "soft", "transport", None):
-            raise ValueError(f'resampling is "systematic", "soft", "transport" or None; got {resampling!r}.')
-        if process_noise is not None:
-            if isinstance(transition, ResampledTransition):
-                raise ValueError("A ResampledTransition holds its motion: put the process noise into that.")
-            q = as_process_noise(process_noise, initial)
-            transition = NoisyTransition(transition, q, space=role(initial, Initial).space)
+        check_choice("resampling", resampling, ("systematic", "soft", "transport", None))
+        if process_noise is not None and isinstance(transition, ResampledTransition):
+            raise ValueError("A ResampledTransition holds its motion: put the process noise into that.")
+        parts = FilterParts(
+            transition, sensor, observation, noise, initial, process_noise, optional=["noise"], **options
+        )
         if likelihood is None:
-            if observation_key is None and sensor is None:
-                raise ValueError("Without a sensor, say where the reading is: observation_key=..., or a likelihood.")
-            reading = reading_of(sensor) if sensor is not None and observation_key is None else observation_key
-            keys = {} if noise is None else {"noise_variance_key": noise.out_keys[0]}
-            likelihood = GaussianLikelihood(
-                reading_space=reading_space, observation_key=reading, observed_key=observed_key, **keys
-            )
-        elif reading_space is not None or observation_key is not None:
+            likelihood = GaussianLikelihood(**parts.reading(", or a likelihood"))
+        elif parts.reading_space is not None or parts.observation_key is not None:
             raise ValueError(
                 "reading_space and observation_key are for the default likelihood; give them to yours instead, "
                 "the key as observation_key= of a GaussianLikelihood, or as encoding_key= or observation_key= of a "
@@ -132,33 +106,23 @@ class ParticleFilter(Filter):
             )
         if analysis is None:
             of_reading = likelihood if isinstance(likelihood, GaussianLikelihood) else None
-            analysis = ParticleAnalysis(of_reading, space=role(initial, Initial).space)
-        if not isinstance(transition, ResampledTransition):
-            transition = ResampledTransition(
-                transition,
+            analysis = ParticleAnalysis(of_reading, space=parts.space)
+        moving = parts.moving()
+        if not isinstance(moving, ResampledTransition):
+            moving = ResampledTransition(
+                moving,
                 resampling,
                 alpha=alpha,
                 epsilon=epsilon,
                 ess_threshold=ess_threshold,
                 jitter=jitter,
-                observed_key=observed_key,
+                observed_key=parts.observed_key,
             )
-        if unravel_key(transition.in_keys[1]) not in map(unravel_key, initial.out_keys):
-            initial = with_weights(initial, ensemble_key=transition.in_keys[0], log_weight_key=transition.in_keys[1])
-        modules = OrderedDict(
-            sensor=sensor,
-            visibility=visibility,
-            noise=noise,
-            transition=transition,
-            observation=observation,
-            likelihood=likelihood,
-            analysis=heeding(visibility, analysis),
-        )
-        super().__init__(
-            OrderedDict((name, module) for name, module in modules.items() if module is not None),
-            initial=initial,
-            **kwargs,
-        )
+        ensemble, log_weight = map(unravel_key, moving.in_keys[:2])
+        if log_weight not in map(unravel_key, initial.out_keys):
+            initial = with_weights(initial, ensemble_key=ensemble, log_weight_key=log_weight)
+        modules = parts.in_order(transition=moving, observation=observation, likelihood=likelihood, analysis=analysis)
+        super().__init__(modules, initial=initial, **parts.options)
 
 
 class DPF(ParticleFilter):

@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
+from torch_denkf._registered import diagnosis
 from torch_denkf.filters.structure import Structure, previous_key, takes_reading
 from torch_denkf.running import in_sequences, writes
 from torch_denkf.submodel import Entries, Sensor, Update, in_role, role
@@ -57,11 +58,12 @@ def check_inputs(
         readers = [
             type(m).__name__ for _, m in structure.modules if not set(missing).isdisjoint(map(unravel_key, m.in_keys))
         ]
-        present = ", ".join(sorted(map(str, tensordict.keys(True, True)))) or "nothing"
-        raise KeyError(
-            f"{', '.join(readers) or name} reads {', '.join(map(repr, missing))}, which the tensordict lacks. It holds "
-            f"{present}. Rename the key in the constructor, or put the module that writes it in front. A reading that "
-            "is missing on purpose: step(..., without=[key]), predict(...), or a mask."
+        raise diagnosis().missing_entry(
+            ", ".join(readers) or name,
+            missing,
+            tensordict.keys(True, True),
+            "Rename the key in the constructor, or put the module that writes it in front. A reading that is missing "
+            "on purpose: step(..., without=[key]), predict(...), or a mask.",
         )
 
 

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
-from typing import Unpack
+from typing import Any, Unpack
 
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
-from torch_denkf.imperfect.bias import FadingBias, biased_parts
-from torch_denkf.modules.process_noise import as_process_noise
+from torch_denkf.filters.base import Filter
+from torch_denkf.filters.parts import FilterParts, ReadingOptions, SensorError, check_moments
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
-from torch_denkf.submodel import Initial, role
 
 __all__ = ["UKF"]
 
 
-class UKF(GaussianFilter):
+class UKF(Filter):
     """Unscented Kalman filter whose transition, sensor, observation and noise models may all be learned (dUKF).
 
     It takes the modules of :class:`~torch_denkf.filters.DEnKF` and a process noise, and has the belief of
@@ -40,8 +37,13 @@ class UKF(GaussianFilter):
         alpha: spread of the sigma points.
         beta: extra weight of the central point in the covariance.
         kappa: their secondary spread. Covariances stay positive where no weight is negative, as by default.
-        **options: ``inflation``, ``reading_space``, ``observation_key``, ``observed_key``, ``visibility`` and what
-            every filter takes, see :class:`GaussianOptions`.
+        inflation: factor on the belief's standard deviations, where anything is observed. What is never observed grows
+            by it without bound.
+        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``visibility`` and what every filter takes,
+            see :class:`~torch_denkf.filters.parts.ReadingOptions`.
+
+    Raises:
+        ValueError: if it is not clear where the reading is, or ``initial`` writes no mean and covariance.
 
     Reference:
         Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.
@@ -71,17 +73,17 @@ class UKF(GaussianFilter):
         *,
         process_noise: TensorDictModuleBase | Sequence[float] | float,
         initial: TensorDictModuleBase,
-        sensor_error: FadingBias | None = None,
+        sensor_error: SensorError | None = None,
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.5,
-        **options: Unpack[GaussianOptions],
+        inflation: float = 1.0,
+        **options: Unpack[ReadingOptions],
     ):
-        q = as_process_noise(process_noise, initial)
-        if sensor_error is not None:
-            parts = biased_parts(sensor_error, transition, observation, q, initial, options.get("reading_space"))
-            transition, observation, q, initial = parts
-        space = role(initial, Initial).space
-        forecast = UKFTransition(transition, q, alpha=alpha, beta=beta, kappa=kappa, space=space)
-        update = partial(UKFAnalysis, observation, alpha=alpha, beta=beta, kappa=kappa)
-        super().__init__(sensor, noise, forecast, update, initial=initial, **options)
+        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, sensor_error, **options)
+        check_moments(type(self).__name__, initial)
+        both: dict[str, Any] = {"alpha": alpha, "beta": beta, "kappa": kappa, "space": parts.space}
+        forecast = UKFTransition(parts.transition, parts.process_noise, **both)
+        update = UKFAnalysis(parts.observation, inflation=inflation, **both, **parts.reading())
+        modules = parts.in_order(transition=forecast, analysis=update)
+        super().__init__(modules, initial=parts.initial, **parts.options)

@@ -14,11 +14,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf._checks import check_count
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
+from torch_denkf.filters.parts import check_kind
 from torch_denkf.fusion._updates import Updates
 from torch_denkf.fusion.joint_moments import JOINT_PAST, JointForecast, PresentOfJoint, joint_space
 from torch_denkf.fusion.parts import OfOwnErrors
 from torch_denkf.fusion.sensor import FusedSensor, wire
-from torch_denkf.imperfect.bias import FadingBias, biased_parts
 from torch_denkf.modules import (
     EKFAnalysis,
     EKFTransition,
@@ -204,8 +204,7 @@ def _with_errors(transition, process_noise, initial, sensors):
     """Transition, process noise, initial belief and sensors of the state with the sensors' lasting errors behind it."""
     given = [sensor.sensor_error for sensor in sensors.values() if sensor.sensor_error is not None]
     for error in given:
-        if not isinstance(error, FadingBias):
-            raise TypeError(f"sensor_error is a FadingBias, or None; got {type(error).__name__}")
+        check_kind("sensor_error", error)
     total = sum(map(len, given))
     if not total:
         return transition, process_noise, initial, sensors
@@ -220,9 +219,9 @@ def _with_errors(transition, process_noise, initial, sensors):
     for name, sensor in sensors.items():
         observation, end = sensor.observation, begin
         if sensor.sensor_error is not None:
-            of_reading = sensor.reading_space
-            parts = biased_parts(sensor.sensor_error, transition, observation, process_noise, initial, of_reading)
-            transition, observation, process_noise, initial = parts
+            transition, observation, process_noise, initial = sensor.sensor_error.augmented(
+                transition, observation, process_noise, initial, sensor.reading_space
+            )
             end += len(sensor.sensor_error)
         made[name] = replace(sensor, observation=OfOwnErrors(observation, range(begin, end), total))
         begin = end

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, cast
+from typing import cast
 
 import torch
 from tensordict import unravel_key
@@ -33,11 +33,11 @@ from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.modules.around import AroundInitial, Wrapper
 from torch_denkf.modules.process_noise import as_process_noise
-from torch_denkf.modules.tensors import as_standard_deviations
+from torch_denkf.modules.tensors import as_floating, as_standard_deviations
 from torch_denkf.running import check_module
 from torch_denkf.submodel import Initial, Transition, role
 
-__all__ = ["BiasedBelief", "BiasedNoise", "BiasedObservation", "BiasedTransition", "FadingBias", "biased_parts"]
+__all__ = ["BiasedBelief", "BiasedNoise", "BiasedObservation", "BiasedTransition", "FadingBias"]
 
 
 class FadingBias(nn.Module):
@@ -147,6 +147,78 @@ class FadingBias(nn.Module):
     def variance(self) -> Tensor:
         """Variance of what is new in a step, ``[K]``: with it the biases stay as large as they are."""
         return (2 * self.log_std).exp() * -torch.expm1(-2 * (-self.log_time).exp())
+
+    def augmented(
+        self,
+        transition: TensorDictModuleBase,
+        observation: TensorDictModuleBase,
+        process_noise: TensorDictModuleBase | Sequence[float] | float | None,
+        initial: TensorDictModuleBase,
+        reading_space: Space | None = None,
+    ) -> tuple[BiasedTransition, BiasedObservation, BiasedNoise, BiasedBelief]:
+        """Gives each part of a filter the same biases.
+
+        Args:
+            transition: moves ensembles of the state.
+            observation: observes them.
+            process_noise: of the state; ``None`` for none, where the transition has its own.
+            initial: the belief of the state.
+            reading_space: in which the sensor's reading lives; ``None`` for plain numbers.
+
+        Returns:
+            Transition, observation, process noise and initial belief of the state with the biases behind it.
+
+        Raises:
+            ValueError: if the state or the reading lives in a space of other than numbers and angles.
+        """
+        space = role(initial, Initial).space
+        if space is not None:
+            raise ValueError(
+                f"sensor_error is for states of plain numbers, not for {space}: put the biases into the state, "
+                "Product(..., Euclidean(K))."
+            )
+        if not is_flat(reading_space):
+            raise ValueError(
+                f"sensor_error is added to readings of numbers and angles, not to points of {reading_space}."
+            )
+        nothing = torch.zeros_like(self.std[0]).detach()
+        of_state = as_process_noise(nothing if process_noise is None else process_noise, initial)
+        return (
+            BiasedTransition(transition, self),
+            BiasedObservation(observation, self),
+            BiasedNoise(of_state, self),
+            BiasedBelief(initial, self),
+        )
+
+    @torch.no_grad()
+    def augmented_matrices(
+        self, f: Tensor, h: Tensor, q: Tensor, mean: Tensor, cov: Tensor, control: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:
+        """Returns F, H, Q, mean, covariance and B of a linear system with the biases behind its state, as they are now.
+
+        Args:
+            f: ``[S, S]``.
+            h: ``[O, S]``.
+            q: ``[S, S]``, or variances ``[S]``.
+            mean: of the initial belief, ``[S]``.
+            cov: of the initial belief, ``[S, S]``.
+            control: B, ``[S, A]``; ``None`` for none.
+
+        Raises:
+            ValueError: if there are not as many biases for each component of the reading, or they are factors.
+        """
+        count = len(self)
+        if self.factor or count % len(h):
+            raise ValueError(
+                f"A KalmanFilter takes as many biases for each of the {len(h)} components of the reading, and no "
+                f"factors; sensor_error has {count}{' factors' if self.factor else ''}. Take an EKF."
+            )
+        decay, variance, std = (value.to(f.dtype) for value in (self.decay, self.variance, self.std))
+        own = torch.eye(len(h), dtype=f.dtype, device=f.device).repeat(1, count // len(h))
+        q = torch.block_diag(q.diag() if q.ndim == 1 else q, variance.diag())
+        f, cov = torch.block_diag(f, decay.diag()), torch.block_diag(cov, std.square().diag())
+        control = None if control is None else nn.functional.pad(as_floating(control), (0, 0, 0, count))
+        return f, torch.cat([h, own], -1), q, torch.cat([mean, torch.zeros_like(decay)]), cov, control
 
 
 class BiasedTransition(Wrapper, Transition):
@@ -330,53 +402,6 @@ class BiasedBelief(AroundInitial):
             cov = torch.cat(rows, -2)
             now = {"mean": nn.functional.pad(mean, (0, count)), "cov": cov, "var": cov.diagonal(dim1=-2, dim2=-1)}
         return {**written, **{names[name]: value for name, value in now.items() if name in names}}
-
-
-class BiasedParts(NamedTuple):
-    """Holds the parts of a filter whose state holds its sensor's biases, see :func:`biased_parts`."""
-
-    transition: TensorDictModuleBase
-    observation: TensorDictModuleBase
-    process_noise: TensorDictModuleBase
-    initial: TensorDictModuleBase
-
-
-def biased_parts(
-    bias: FadingBias,
-    transition: TensorDictModuleBase,
-    observation: TensorDictModuleBase,
-    process_noise: TensorDictModuleBase | Sequence[float] | float | None,
-    initial: TensorDictModuleBase,
-    reading_space: Space | None = None,
-) -> BiasedParts:
-    """Gives each part of a filter the same biases.
-
-    Args:
-        bias: of the sensor.
-        transition: moves ensembles of the state.
-        observation: observes them.
-        process_noise: of the state; ``None`` for none, where the transition has its own.
-        initial: the belief of the state.
-        reading_space: in which the sensor's reading lives; ``None`` for plain numbers.
-    """
-    if not isinstance(bias, FadingBias):
-        raise TypeError(f"sensor_error is a FadingBias, or None; got {type(bias).__name__}")
-    if role(initial, Initial).space is not None:
-        raise ValueError(
-            f"sensor_error is for states of plain numbers, not for {role(initial, Initial).space}: put the biases into "
-            "the state, Product(..., Euclidean(K))."
-        )
-    if not is_flat(reading_space):
-        raise ValueError(f"sensor_error is added to readings of numbers and angles, not to points of {reading_space}.")
-    of_state = as_process_noise(
-        torch.zeros_like(bias.std[0]).detach() if process_noise is None else process_noise, initial
-    )
-    return BiasedParts(
-        BiasedTransition(transition, bias),
-        BiasedObservation(observation, bias),
-        BiasedNoise(of_state, bias),
-        BiasedBelief(initial, bias),
-    )
 
 
 def _autocovariance(values: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,7 @@ from torchrl.envs.transforms import Transform
 
 from torch_denkf._arguments import Checked, check_key
 from torch_denkf._checks import check_mask, check_number, flag_value
+from torch_denkf.diagnosis import entry_of
 from torch_denkf.functional.manifolds import Euclidean, Space, places_of
 from torch_denkf.submodel import Entries
 
@@ -168,7 +169,7 @@ class RejectReadings(Checked, Transform):
             tensordict: with the reading.
             written: gets the reading, and its noise, with neutral numbers in the place of bad ones.
         """
-        size, value = tensordict.ndim, self._entry(tensordict, key)
+        size, value = tensordict.ndim, entry_of(tensordict, key, "RejectReadings", "Rename it in the constructor.")
         good, neutral = self._within(value), value.new_zeros(())
         known = good.unsqueeze(-1).flatten(size).all(-1, keepdim=True)
         if key in self.spaces or key in self.by_component:  # samples of one reading count together
@@ -176,7 +177,8 @@ class RejectReadings(Checked, Transform):
         noise = None
         if key in self.noises:
             name = self.noises[key]
-            noise, written[name] = self._judged_noise(self._entry(tensordict, name), size)
+            given = entry_of(tensordict, name, "RejectReadings", "Rename it in the constructor.")
+            noise, written[name] = self._judged_noise(given, size)
         if key in self.spaces:
             points, known = _whole_parts(self.spaces[key], known, noise)
             good = points.reshape(*points.shape[:-1], *(1,) * (value.ndim - points.ndim), points.shape[-1])
@@ -202,13 +204,6 @@ class RejectReadings(Checked, Transform):
         good = good.flatten(-2).all(-1)[..., None, None]
         good = good & _is_covariance(torch.where(good, noise, eye).detach())[..., None, None]
         return good[..., 0].expand(noise.shape[:-1]), torch.where(good, noise, eye)
-
-    def _entry(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        value = tensordict.get(key, None)
-        if value is None:
-            present = sorted(map(str, tensordict.keys(True, True)))
-            raise KeyError(f"RejectReadings reads {key!r}, which is not there; there are {present}.")
-        return value
 
     def _messages(
         self,

@@ -32,10 +32,9 @@ from torch_denkf.functional.weighted import scored_innovation
 from torch_denkf.modules.around import Around
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import mean_of_members
-from torch_denkf.running import check_module
 from torch_denkf.submodel import Call, Entries, Sensor, Update
 
-__all__ = ["Visibility", "Visible", "heeding"]
+__all__ = ["Visibility", "Visible"]
 
 
 class Visibility(Sensor):
@@ -94,6 +93,10 @@ class Visibility(Sensor):
         if observed is not None:
             encoding = torch.where(observed.any(-1, keepdim=True), encoding, 0)
         return self.floor + (1 - 2 * self.floor) * self.module(encoding).sigmoid()
+
+    def heeded_by(self, analysis: TensorDictModuleBase) -> Visible:
+        """Returns :class:`Visible` around an analysis: readings count as far as this head says."""
+        return Visible(cast(Update, analysis), visible_key=self.out_keys[0])
 
 
 class Visible(Around):
@@ -226,14 +229,6 @@ class Visible(Around):
         out = self.module.on_entries({**entries, self.module.in_keys[2]: mixed}, call)
         share = responsibility(visible, torch.logsumexp(prior + likelihood, -1, keepdim=True), other)
         return {**out, (self.info_prefix, "visible"): share if seen is None else torch.where(seen, share, 0)}
-
-
-def heeding(visibility: Visibility | None, analysis: TensorDictModuleBase) -> TensorDictModuleBase:
-    """The analysis, which heeds what a head says; as it is without one."""
-    if visibility is None:
-        return analysis
-    check_module("visibility", visibility)
-    return Visible(cast(Update, analysis), visible_key=visibility.out_keys[0])
 
 
 def _like(seen: Tensor, value: Tensor) -> Tensor:

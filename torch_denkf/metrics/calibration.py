@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.metrics.state import known_tangents, mean_of_known, state_difference
+from torch_denkf.metrics.state import check_level, known_tangents, mean_of_known, state_difference
 
 __all__ = [
     "SpreadError",
@@ -119,7 +119,7 @@ def interval_coverage(
     """
     error = state_difference(mean, truth, space=space)
     _check_variance(variance, error)
-    _check_level(level)
+    check_level(level)
     quantile = torch.special.ndtri(torch.tensor(0.5 + level / 2, dtype=torch.float64)).item()
     return _share(error.abs() <= quantile * variance.sqrt(), known_tangents(truth, space))
 
@@ -183,7 +183,7 @@ def ensemble_interval(ensemble: Tensor, *, level: float = 0.9) -> tuple[Tensor, 
         >>> low.item(), high.item()
         (1.0, 17.0)
     """
-    _check_level(level)
+    check_level(level)
     size = ensemble.shape[-2]
     rank = (1 - level) / 2 * (size + 1) - 1  # from zero
     if rank < -1e-9:
@@ -305,7 +305,7 @@ def histogram_band(samples: int, bins: int, *, level: float = 0.99) -> tuple[int
         >>> histogram_band(1000, 10)
         (70, 132)
     """
-    _check_level(level)
+    check_level(level)
     if samples < 1 or bins < 1:
         raise ValueError(f"a histogram needs samples and bins; got {samples} samples and {bins} bins")
     if bins == 1:
@@ -399,11 +399,6 @@ def _check_variance(variance: Tensor, error: Tensor) -> None:
         )
     if bool((variance < 0).any()):
         raise ValueError(f"variances cannot be negative; the least is {variance.min().item():.3g}.")
-
-
-def _check_level(level: float) -> None:
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"level is the probability of the interval, in (0, 1); got {level}.")
 
 
 def _share(inside: Tensor, truth: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal, Normal
 
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.metrics.state import state_difference
+from torch_denkf.metrics.state import check_level, state_difference
 
 __all__ = ["NEES", "gaussian_nll", "nees"]
 
@@ -107,8 +107,7 @@ def nees(
         >>> result.values.tolist(), result.mean.item(), round(result.lower, 3), round(result.upper, 3)
         ([4.0, 1.0], 2.5, 0.242, 5.572)
     """
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"level is the probability of the bounds, in (0, 1); got {level}")
+    check_level(level)
     if bool(truth.isnan().any()):
         raise ValueError("the truth is NaN in places, where it is not known; leave out the rows that are not whole")
     error = state_difference(mean, truth, space=space)

@@ -129,6 +129,12 @@ def rotation_error(estimated: Tensor, truth: Tensor, *, space: Space) -> Tensor:
     return torch.stack([torch.linalg.vector_norm(error[..., turn], dim=-1) for turn in turns], -1).rad2deg()
 
 
+def check_level(level: float) -> None:
+    """Raises a ``ValueError`` unless a level is a probability of an interval, in (0, 1)."""
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"level is the probability of the interval, in (0, 1); got {level}.")
+
+
 def known_tangents(truth: Tensor, space: Space | None) -> Tensor:
     """Marks unknown errors by NaN: the truth ``[*B, S]``, of points of a space zeros and NaN, ``[*B, D]``."""
     if space is None:

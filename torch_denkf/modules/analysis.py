@@ -7,7 +7,7 @@ from typing import Any, Literal, Unpack
 
 import torch
 
-from torch_denkf._checks import check_values
+from torch_denkf._checks import check_choice, check_values
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.manifolds import Space, is_flat
@@ -83,8 +83,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         pair = isinstance(taper, tuple) and len(taper) == 2 and all(isinstance(part, torch.Tensor) for part in taper)
         if taper is not None and not pair:
             raise TypeError(f"taper is two tensors, [S, O] and [O, O], or None; got {type(taper).__name__}")
-        if scheme not in ("sensor", "perturbed", "etkf", "sakov"):
-            raise ValueError(f'scheme is "sensor", "perturbed", "etkf" or "sakov"; got {scheme!r}.')
+        check_choice("scheme", scheme, ("sensor", "perturbed", "etkf", "sakov"))
         if taper is not None and scheme == "etkf":
             raise ValueError('taper is for scheme "sensor", "perturbed" or "sakov"; "etkf" has none.')
         if rotate and scheme != "etkf":

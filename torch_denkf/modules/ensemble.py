@@ -9,7 +9,7 @@ import torch
 from tensordict import NestedKey, unravel_key
 from torch import Tensor, nn
 
-from torch_denkf._checks import check_number, check_values
+from torch_denkf._checks import check_choice, check_number, check_values
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.submodel import Call, Entries, Update
 
@@ -93,8 +93,7 @@ class EnsembleUpdate(Update):
         self.inflation, self.relaxation, self.rotate = inflation, relaxation, rotate
         self.info_prefix = info_prefix
         self.space, self.reading_space = check_space("space", space), check_space("reading_space", reading_space)
-        if localisation not in (None, "significance"):
-            raise ValueError(f'localisation is "significance" or None; got {localisation!r}.')
+        check_choice("localisation", localisation, ("significance", None))
         if localisation is not None:
             if not isinstance(threshold, Real | Tensor):
                 raise TypeError(f"threshold is a number or a tensor; got {threshold!r}")

@@ -15,7 +15,7 @@ from torch_denkf.functional.linalg import product_of_known
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules._spaces import mean_reading
 from torch_denkf.modules.gaussian import as_covariance, further_keys, updated
-from torch_denkf.modules.tensors import as_standard_deviations, register_constant
+from torch_denkf.modules.tensors import as_standard_deviations, register_constant, register_matrix
 from torch_denkf.running import run_module
 from torch_denkf.submodel import Call, Entries, Initial, Transition, Update
 
@@ -247,12 +247,9 @@ class KalmanAnalysis(Update):
         )
         self.inflation, self.info_prefix = inflation, info_prefix
         self.reading_space = check_space("reading_space", reading_space, flat=True)
-        register_constant(self, "matrix", matrix, trainable=trainable)
+        register_matrix(self, "matrix", matrix, "[O, S]", trainable=trainable)
         register_constant(self, "noise", noise)
         check_number("inflation", inflation, above=0)
-        if self.matrix.ndim != 2:
-            raise ValueError(f"matrix must be [O, S], got {list(self.matrix.shape)}")
-        check_values("matrix", self.matrix)
         if self.reading_space is not None and self.reading_space.point_dim != len(self.matrix):
             raise ValueError(f"reading_space={reading_space} is not one of the {len(self.matrix)} rows of matrix.")
         if self.noise is not None and self.noise.ndim == 2:

@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey, unravel_key
 from torch import nn
 
-from torch_denkf._checks import check_count
+from torch_denkf._checks import check_choice, check_count
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules._spaces import mean_reading
 from torch_denkf.modules.stochastic import StochasticMLP
@@ -172,8 +172,7 @@ class LearnedLikelihood(Update):
         observed_key: NestedKey = "observed",
         out_key: NestedKey = ("forecast", "log_likelihood"),
     ):
-        if bound not in ("scaled", "clipped"):
-            raise ValueError(f'bound is "scaled" or "clipped"; got {bound!r}.')
+        check_choice("bound", bound, ("scaled", "clipped"))
         if loc is not None and observation_key is not None:
             raise ValueError(
                 "with a observation_key the network sees the innovation, which has no loc; pass scale alone."

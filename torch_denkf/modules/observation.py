@@ -8,9 +8,8 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf._checks import check_values
 from torch_denkf.functional.linalg import product_of_known
-from torch_denkf.modules.tensors import check_dims, register_constant, register_location, register_scale
+from torch_denkf.modules.tensors import check_dims, register_location, register_matrix, register_scale
 from torch_denkf.modules.transition import MemberNetwork
 from torch_denkf.running import check_network
 from torch_denkf.submodel import SubModel
@@ -138,10 +137,7 @@ class LinearObservation(_Observation):
         out_key: NestedKey = ("forecast", "observation"),
     ):
         super().__init__(nn.Identity(), in_key, out_key)
-        register_constant(self, "matrix", matrix)
-        if self.matrix.ndim != 2:
-            raise ValueError(f"matrix must be [O, S], got {list(self.matrix.shape)}")
-        check_values("matrix", self.matrix)
+        register_matrix(self, "matrix", matrix, "[O, S]")
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
         """Returns ``H x`` of states ``[*, S]``; NaN where it reads a dimension that is NaN."""

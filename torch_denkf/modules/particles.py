@@ -20,7 +20,7 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf._checks import check_count, check_number
+from torch_denkf._checks import check_choice, check_count, check_number
 from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
 from torch_denkf.functional.manifolds import Space, check_space
@@ -121,8 +121,7 @@ class ResampledTransition(Transition):
         out_past_key: NestedKey = ("forecast", "past"),
     ):
         check_module("transition", transition)
-        if scheme not in ("systematic", "soft", "transport", None):
-            raise ValueError(f'scheme is "systematic", "soft", "transport" or None; got {scheme!r}.')
+        check_choice("scheme", scheme, ("systematic", "soft", "transport", None))
         check_number("alpha", alpha, least=0, most=1)
         check_number("epsilon", epsilon, above=0)
         check_count("iterations", iterations)

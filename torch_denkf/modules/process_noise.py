@@ -21,8 +21,8 @@ from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import (
     as_floating,
     mean_of_members,
-    register_constant,
     register_location,
+    register_matrix,
     register_scale,
     variance_and_floor,
 )
@@ -199,10 +199,7 @@ class MappedNoise(NoiseThrough):
 
     def __init__(self, noise: TensorDictModuleBase, matrix: torch.Tensor):
         super().__init__(noise, [])
-        register_constant(self, "matrix", matrix)
-        if self.matrix.ndim != 2:
-            raise ValueError(f"matrix must be [S, N], got {list(self.matrix.shape)}")
-        check_values("matrix", self.matrix)
+        register_matrix(self, "matrix", matrix, "[S, N]")
 
     def _matrix(self, entries):
         return self.matrix

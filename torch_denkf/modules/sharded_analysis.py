@@ -6,6 +6,7 @@ from typing import Literal, Unpack
 
 import torch.distributed as dist
 
+from torch_denkf._checks import check_choice
 from torch_denkf.functional.kernels.sharded import analyse_sharded
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.ensemble import EnsembleAnalysisKeys
@@ -63,8 +64,7 @@ class ShardedEnsembleAnalysis(EnsembleAnalysis):
         group: dist.ProcessGroup | None = None,
         **keys: Unpack[EnsembleAnalysisKeys],
     ):
-        if scheme not in ("sensor", "etkf", "sakov"):
-            raise ValueError(f'scheme is "sensor", "etkf" or "sakov" in a sharded analysis; got {scheme!r}')
+        check_choice("scheme of a sharded analysis", scheme, ("sensor", "etkf", "sakov"))
         super().__init__(scheme, inflation=inflation, relaxation=relaxation, **keys)
         self.group = group
 

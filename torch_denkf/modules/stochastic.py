@@ -23,7 +23,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from torch_denkf._checks import check_count, check_number
+from torch_denkf._checks import check_choice, check_count, check_number
 from torch_denkf.functional.kernels.dropped_relu import dropped_relu
 from torch_denkf.functional.kernels.random_bits import dropout_factor, random_bytes, random_signs, representable_rate
 
@@ -145,8 +145,7 @@ class StochasticMLP(nn.Module):
     ):
         check_number("posterior_std", posterior_std, above=0)
         super().__init__()
-        if layer not in ("dropout", "flipout", "none"):
-            raise ValueError(f'layer is "dropout", "flipout" or "none"; got {layer!r}.')
+        check_choice("layer", layer, ("dropout", "flipout", "none"))
         for name, size in (("in_features", in_features), ("out_features", out_features)):
             check_count(name, size)
         for size in num_cells:

@@ -20,6 +20,7 @@ __all__ = [
     "mean_of_members",
     "refuse_trained",
     "register_constant",
+    "register_matrix",
     "register_location",
     "register_scale",
     "variance_and_floor",
@@ -58,6 +59,21 @@ def register_constant(
         module.register_parameter(name, nn.Parameter(tensor))
     else:
         module.register_buffer(name, tensor)
+
+
+def register_matrix(
+    module: nn.Module, name: str, value: Tensor | Sequence | None, layout: str, *, trainable: bool = False
+) -> None:
+    """Keeps a matrix of finite numbers in a module, as a buffer or as a parameter.
+
+    Raises:
+        ValueError: if it is no matrix, or one of its numbers is not finite.
+    """
+    register_constant(module, name, value, trainable=trainable)
+    matrix = getattr(module, name)
+    if matrix.ndim != 2:
+        raise ValueError(f"{name} must be {layout}, got {list(matrix.shape)}")
+    check_values(name, matrix)
 
 
 def refuse_trained(name: str, value: Any, why: str) -> None:
@@ -151,14 +167,9 @@ def variance_and_floor(
     Raises:
         ValueError: if ``r`` is not positive or the floor reaches :math:`r^2`.
     """
-    std = as_floating(r, f"r of {owner}")
-    check_values(f"r of {owner}, a standard deviation,", std, above=0)
-    for name, value in (("r", std), ("floor", None if floor is None else as_floating(floor, f"floor of {owner}"))):
-        if value is not None and (value.ndim > 1 or value.numel() not in (1, size)):
-            raise ValueError(f"{name} of {owner} is one number, or one for each of {size}; got {list(value.shape)}")
-    variance = std.expand(size) ** 2
+    variance = as_vector(f"r of {owner}", r, size, above=0) ** 2
     check_values(f"r^2 of {owner}", variance, above=0, cure="Scale the observation, so that its variance is a number")
-    floor = 0.01 * variance if floor is None else as_floating(floor, f"floor of {owner}").expand(size)
+    floor = 0.01 * variance if floor is None else as_vector(f"floor of {owner}", floor, size)
     check_values(f"floor of {owner}", floor, least=0)
     check_values(f"r^2 - floor of {owner}", variance - floor, above=0, cure="The floor is a variance below r^2")
     return variance - floor, floor.clone()

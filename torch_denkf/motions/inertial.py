@@ -1,4 +1,8 @@
-"""A body whose gyro and accelerometer say how it moves."""
+"""A body whose gyro and accelerometer say how it moves.
+
+Source: Forster, Carlone, Dellaert & Scaramuzza 2017, IEEE T-RO 33 (the model); Fourmy, Flayols, Léziart, Mansard & Solà
+2021, ICRA, and Brossard, Barrau, Chauchat & Bonnabel 2022, IEEE T-RO 38 (the exact integrals).
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,12 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor
 
-from torch_denkf._checks import check_number
-from torch_denkf.functional.inertial import move_inertially
-from torch_denkf.functional.manifolds import SE23, SO3, Euclidean, Product
+from torch_denkf._checks import check_number, check_shape
+from torch_denkf.functional.manifolds import SE23, SO3, Euclidean, Product, rotate
+from torch_denkf.functional.manifolds.rotations import bend, fourth, half_versine, one_minus_sinc, series
 from torch_denkf.motions.motion import Motion, densities, integrated, walked
 
-__all__ = ["AttitudeMotion", "InertialMotion"]
+__all__ = ["AttitudeMotion", "InertialMotion", "move_inertially"]
 
 
 class InertialMotion(Motion):
@@ -29,7 +33,7 @@ class InertialMotion(Motion):
     upwards.
 
     The integration is exact where rate and specific force are constant in the body's axes, see
-    :func:`torch_denkf.functional.inertial.move_inertially`. The body is where the accelerometer sits.
+    :func:`move_inertially`. The body is where the accelerometer sits.
 
     Noises are what a data sheet calls densities. A data sheet that has degrees and micro-g: 0.005 deg/s/sqrt(Hz) is
     8.7e-5 rad/s/sqrt(Hz), and 400 ug/sqrt(Hz) is 3.9e-3 m/s^2/sqrt(Hz).
@@ -157,3 +161,52 @@ class AttitudeMotion(Motion):
     def noise_of_step(self, dt):
         """Of orientation and bias."""
         return walked(self.gyro_noise, dt) + walked(self.gyro_walk, dt)
+
+
+def move_inertially(pose: Tensor, rate: Tensor, force: Tensor, dt: float | Tensor, gravity: float = 9.81) -> Tensor:
+    r"""The pose of a body after a step in which its rate of turn and its specific force are constant in its own axes.
+
+    With rate :math:`\omega`, specific force :math:`f` and gravity :math:`g`, both axes and world as in
+    :mod:`torch_denkf.functional.manifolds`:
+
+    .. math::
+        R' &= R \exp(\omega \Delta t) \\
+        v' &= v + g \Delta t + R \, \Gamma_1(\omega \Delta t) \, f \Delta t \\
+        p' &= p + v \Delta t + g \Delta t^2 / 2 + R \, \Gamma_2(\omega \Delta t) \, f \Delta t^2
+
+    :math:`\Gamma_k` is the integral of the turn, taken k times. No step is too long: nothing is cut off. The earth does
+    not turn.
+
+    Args:
+        pose: orientation, velocity in m/s and position in m, points ``[*, 10]`` of ``SE23``.
+        rate: in rad/s, the body's axes, ``[*, 3]``.
+        force: specific force in m/s^2, the body's axes, ``[*, 3]``: at rest it is ``gravity`` upwards.
+        dt: seconds, a number or ``[*, 1]``.
+        gravity: in m/s^2, along the world's -z.
+
+    Returns:
+        The pose ``[*, 10]`` at the step's end.
+
+    Raises:
+        ValueError: if a shape is wrong.
+
+    Example:
+        >>> still, up = torch.zeros(3), torch.tensor([0.0, 0.0, 9.81])
+        >>> move_inertially(SE23().neutral(), still, up, 1.0)[4:]
+        tensor([0., 0., 0., 0., 0., 0.])
+        >>> move_inertially(SE23().neutral(), still, still, 1.0)[4:]  # it falls
+        tensor([ 0.0000,  0.0000, -9.8100,  0.0000,  0.0000, -4.9050])
+    """
+    SE23().check(point=pose)
+    for name, value in (("rate", rate), ("force", force)):
+        check_shape(name, value, [*value.shape[:-1], 3], "[*, 3]")
+    orientation, velocity, position = pose[..., :4], pose[..., 4:7], pose[..., 7:]
+    angles = rate * dt
+    square = angles.square().sum(-1, keepdim=True)
+    third = series(square, one_minus_sinc)
+    once = bend(angles, force * dt, series(square, half_versine), third)
+    twice = bend(angles, 0.5 * force * dt, 2 * third, 2 * series(square, fourth))
+    fall = pose.new_tensor([0.0, 0.0, -gravity]) * dt
+    turned = SO3().compose(orientation, SO3().exp(angles))
+    moved = position + (velocity + 0.5 * fall + rotate(orientation, twice)) * dt
+    return torch.cat([turned, velocity + fall + rotate(orientation, once), moved], -1)

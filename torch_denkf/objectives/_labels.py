@@ -16,6 +16,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from torch_denkf._checks import check_mask
+from torch_denkf._registered import diagnosis
 from torch_denkf.functional.manifolds import Space, is_flat, whole_parts
 from torch_denkf.submodel import Initial, role
 
@@ -160,11 +161,8 @@ class Truth:
         source = self.data if given else self.out
         value = source.get(key, None)
         if value is None:
-            present = ", ".join(sorted(map(str, source.keys(True, True))))
-            raise KeyError(
-                f"{type(self.loss).__name__} reads {key!r}, which is missing; there are {present}. {cure}Rename it "
-                "with loss.set_keys(...)."
-            )
+            cure = f"{cure}Rename it with loss.set_keys(...)."
+            raise diagnosis().missing_entry(type(self.loss).__name__, [key], source.keys(True, True), cure)
         return value
 
     @cached_property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import Literal, TypedDict
+from typing import Literal, TypedDict, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from torch_denkf._arguments import Checked, check_key
-from torch_denkf._checks import check_number
+from torch_denkf._checks import check_choice, check_number
 from torch_denkf.filters import Filter
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.tensors import as_floating, check_dims
@@ -171,15 +171,8 @@ class FilterLoss(Checked, LossModule):
         filter: the filter; its parameters are the loss's.
         terms: what is scored, see :class:`Term`.
         score: one of the class's ``SCORES``, where it has some.
-        dims: state dimensions that count; all that have labels by default.
-        state_scale: one for each of ``dims``, else of the labels' dimensions; errors of the state are divided by it. A
-            dimension with infinite scale does not count: means are taken over the others.
-        observation_scale: ``[O]``, what errors of observations are divided by.
-        space: whose points the states are; by default that of the filter's initial belief. Errors of angles are
-            wrapped to [-pi, pi). ``dims`` and ``state_scale`` are then those of tangents, see :class:`StateOptions`.
-        reading_space: in which observations live, one of numbers and angles; ``None`` for plain numbers.
-        detach_every: truncated back-propagation: steps after which the belief is detached.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B]``, zero where an element does not count).
+        **options: ``dims``, scales, ``space``, ``reading_space``, ``detach_every`` and ``reduction``, see
+            :class:`SequenceOptions`.
 
     Raises:
         TypeError: for what is no filter, no term or no space.
@@ -213,41 +206,39 @@ class FilterLoss(Checked, LossModule):
         terms: Sequence[Term],
         *,
         score: str = "crps",
-        dims: Sequence[int] | None = None,
-        state_scale: Scale = None,
-        observation_scale: Scale = None,
-        space: Space | None = None,
-        reading_space: Space | None = None,
-        detach_every: int | None = None,
-        reduction: Literal["mean", "sum", "none"] = "mean",
+        **options: Unpack[SequenceOptions],
     ):
-        if self.SCORES and score not in self.SCORES:
-            *others, last = (f'"{name}"' for name in self.SCORES)
-            raise ValueError(f"score is {', '.join(others)} or {last}; got {score!r}.")
+        if self.SCORES:
+            check_choice("score", score, self.SCORES)
         if not isinstance(filter, Filter):
             raise TypeError(f"filter must be a torch_denkf Filter; got {filter!r}"[:200])
-        if reduction not in ("mean", "sum", "none"):
-            raise ValueError(f'reduction is "mean", "sum" or "none"; got {reduction!r}.')
+        dims, reduction = options.get("dims"), options.get("reduction", "mean")
+        check_choice("reduction", reduction, ("mean", "sum", "none"))
         if dims is not None:
             check_dims("dims", dims, once=True)
             if not len(dims):
                 raise ValueError("dims names the dimensions of the state that count; got none. Pass None for all.")
-        space = filter.structure.space if space is None else space
-        space = check_space("space", space)
+        space = check_space("space", filter.structure.space if options.get("space") is None else options["space"])
         if space is not None and dims is not None and max(dims) >= space.tangent_dim:
             raise ValueError(
                 f"dims={list(dims)} names component {max(dims)} of tangents of {space.tangent_dim}, from 0."
             )
         super().__init__()
-        self.space, self.reading_space = space, check_space("reading_space", reading_space, flat=True)
+        self.space, self.reading_space = space, check_space("reading_space", options.get("reading_space"), flat=True)
         self.dims = None if dims is None else [int(dim) for dim in dims]
-        self.filter, self.score, self.reduction, self.detach_every = filter, score, reduction, detach_every
-        self.register_buffer("state_scale", _checked_scale("state_scale", state_scale))
-        self.register_buffer("observation_scale", _checked_scale("observation_scale", observation_scale))
-        if self.dims is not None and self.state_scale is not None and self.state_scale.numel() != len(self.dims):
-            raise ValueError(f"state_scale has one entry for each of dims={self.dims}; got {self.state_scale.numel()}.")
+        self.filter, self.score, self.reduction = filter, score, reduction
+        self.detach_every = options.get("detach_every")
+        self.register_buffer("state_scale", _checked_scale("state_scale", options.get("state_scale")))
+        self.register_buffer("observation_scale", _checked_scale("observation_scale", options.get("observation_scale")))
+        if self.state_scale is not None:
+            self._check_entries("state_scale", self.state_scale)
         self.terms = nn.ModuleList(_checked_terms(terms))
         self._choose_terms()
+
+    def _check_entries(self, name: str, value: Tensor) -> None:
+        """Raises a ``ValueError`` unless a value has one entry for each of ``dims``, where these are given."""
+        if self.dims is not None and value.numel() != len(self.dims):
+            raise ValueError(f"{name} has one entry for each of dims={self.dims}; got {value.numel()}.")
 
     @property
     def in_keys(self) -> list[NestedKey]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
 
 from torch_denkf._arguments import check_key
-from torch_denkf._checks import check_count
+from torch_denkf._checks import check_count, check_values
 from torch_denkf._registered import diagnosis
 from torch_denkf.filters import Filter
 from torch_denkf.filters.structure import previous_key
@@ -245,8 +245,7 @@ class TransitionLoss(FilterLoss):
         super().__init__(filter, [Step()], score=score, reduction=reduction, **options)
         self.belief, self.members = belief, found
         self.register_buffer("spread", as_floating(spread, "spread"))
-        if not ((self.spread >= 0) & self.spread.isfinite()).all():
-            raise ValueError(f"spread is a standard deviation, finite and not negative; got {spread}.")
+        check_values("spread", self.spread, least=0, cure="It is a standard deviation, not negative")
 
     def _trained(self):
         return [self.filter.transition_module]

@@ -9,6 +9,7 @@ from typing import Literal, Unpack
 from tensordict import NestedKey
 from torch import Tensor
 
+from torch_denkf._checks import check_values
 from torch_denkf.filters import Filter
 from torch_denkf.modules.tensors import as_floating
 from torch_denkf.objectives import _terms
@@ -119,8 +120,7 @@ class DEnKFLoss(FilterLoss):
         own: list[Term] = [_terms.Members("state", "belief", state)]
         own += [_terms.Members("transition", "forecast", transition)]
         own += [_terms.Sensor(sensor), _terms.Observation(observation), _terms.Likelihood(nll), _terms.Divergence(kl)]
-        own += [_terms.Visible(visible)]
-        own += [_terms.Members("smoothed", "smoothed", smoothed)]
+        own += [_terms.Visible(visible), _terms.Members("smoothed", "smoothed", smoothed)]
         super().__init__(filter, [*own, *terms], score=score, **options)
         made = smoother if smoother is None or isinstance(smoother, Smoother) else smoother(filter)
         if smoother is not None and (made is smoother or not isinstance(made, Smoother)):
@@ -329,9 +329,9 @@ class MixtureLoss(FilterLoss):
         terms: Sequence[Term] = (),
         **options: Unpack[SequenceOptions],
     ):
-        own: list[Term] = [_terms.Particles("state", "belief", state)]
-        own += [_terms.Particles("transition", "forecast", transition)]
-        own += [
+        own = [
+            _terms.Particles("state", "belief", state),
+            _terms.Particles("transition", "forecast", transition),
             _terms.Mean("mean", "belief", mean),
             _terms.Sensor(sensor),
             _terms.Likelihood(nll),
@@ -339,7 +339,7 @@ class MixtureLoss(FilterLoss):
         ]
         super().__init__(filter, [*own, *terms], score=score, **options)
         self.register_buffer("component_std", as_floating(component_std, "component_std"))
-        if not ((self.component_std > 0) & self.component_std.isfinite()).all():
-            raise ValueError(f"component_std is the width of each component, positive and finite; got {component_std}.")
-        if self.dims is not None and self.component_std.numel() not in (1, len(self.dims)):
-            raise ValueError(f"component_std has one entry for each of dims={self.dims}; got {component_std}.")
+        width = "component_std is the width of each component"
+        check_values("component_std", self.component_std, above=0, cure=width)
+        if self.component_std.numel() > 1:
+            self._check_entries("component_std", self.component_std)

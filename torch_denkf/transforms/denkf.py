@@ -13,7 +13,7 @@ from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf._arguments import Checked
-from torch_denkf._registered import deployment
+from torch_denkf._registered import deployment, diagnosis
 from torch_denkf.beliefs import is_summary
 from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record, check_belief
@@ -218,12 +218,12 @@ class DEnKFTransform(Checked, Transform):
         for key in keys:
             value = source.get(key, None)
             if value is None:
-                raise KeyError(
-                    f"The filter reads {key!r}, which {owner} does not hold; it holds "
-                    f"{sorted(map(str, source.keys(True, True)))}. Rename the key in the filter's sub-model, or put a "
-                    "transform that writes it before DEnKFTransform. It must also declare it, in its "
-                    "transform_observation_spec; a function in the place of a transform declares nothing."
+                cure = (
+                    f"Looked for in {owner}. Rename the key in the filter's sub-model, or put a transform that writes "
+                    "it before DEnKFTransform. It must also declare it, in its transform_observation_spec; a function "
+                    "in the place of a transform declares nothing."
                 )
+                raise diagnosis().missing_entry("The filter", [key], source.keys(True, True), cure)
             if isinstance(target, dict):
                 target[key] = value
             else:

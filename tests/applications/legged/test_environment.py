@@ -9,8 +9,8 @@ from torch_denkf.applications.legged.environment import LeggedEnv
 from torch_denkf.applications.legged.humanoid import humanoid_env
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.applications.legged.motion import LeggedSpace
-from torch_denkf.functional.inertial import move_inertially
 from torch_denkf.functional.manifolds import SE3, SO3, rotate
+from torch_denkf.motions.inertial import move_inertially
 
 PERFECT = LeggedErrors(*[0.0] * 9)
 

@@ -14,6 +14,7 @@ from torch_denkf._checks import check_number
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
 from torch_denkf.applications.car.vision.motion import grey_picture, image_motion
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
+from torch_denkf.diagnosis import entry_of
 from torch_denkf.modules.tensors import as_floating
 
 __all__ = ["OpticalFlow"]
@@ -64,10 +65,7 @@ class OpticalFlow(Checked, Transform):
         self.height, self.observed_key = height, observed_key
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        pixels = next_tensordict.get(self.in_keys[0], None)
-        if pixels is None:
-            present = sorted(map(str, next_tensordict.keys(True, True)))
-            raise KeyError(f"OpticalFlow reads {self.in_keys[0]!r}, which is not there; there are {present}.")
+        pixels = entry_of(next_tensordict, self.in_keys[0], "OpticalFlow", "Set in_key=.")
         batch = next_tensordict.batch_size
         if pixels.ndim != len(batch) + 3 or pixels.shape[-3] not in (2, 6):
             raise ValueError(
