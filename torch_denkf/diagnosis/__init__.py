@@ -14,6 +14,13 @@ from torch_denkf.diagnosis.composition import check_composition as check_composi
 from torch_denkf.diagnosis.errors import entry_of as entry_of
 from torch_denkf.diagnosis.errors import explained as explained
 from torch_denkf.diagnosis.errors import missing_entry as missing_entry
+from torch_denkf.diagnosis.inputs import check_actions as check_actions
+from torch_denkf.diagnosis.inputs import check_inputs as check_inputs
+from torch_denkf.diagnosis.inputs import check_joined_readings as check_joined_readings
+from torch_denkf.diagnosis.inputs import check_named_readings as check_named_readings
+from torch_denkf.diagnosis.inputs import check_noise as check_noise
+from torch_denkf.diagnosis.inputs import check_precision as check_precision
+from torch_denkf.diagnosis.inputs import readings_to_leave_out as readings_to_leave_out
 from torch_denkf.diagnosis.masks import UnreadMasks
 from torch_denkf.diagnosis.policy import PolicyStart
 from torch_denkf.diagnosis.shapes import ReadingRanks

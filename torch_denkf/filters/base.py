@@ -34,15 +34,6 @@ from torch_denkf.filters.finish import Record, check_belief, own
 from torch_denkf.filters.gather import gather_rows, of_one_robot
 from torch_denkf.filters.noise import Drawn, draw_noise, recorded_draws
 from torch_denkf.filters.options import FilterOptions
-from torch_denkf.filters.refusals import (
-    check_inputs,
-    refuse_missing_actions,
-    refuse_nameless_readings,
-    refuse_single_readings,
-    refuse_two_precisions,
-    refuse_unknown_noise,
-    refuse_unknown_readings,
-)
 from torch_denkf.filters.scan import Steps, where_rows
 from torch_denkf.filters.structure import KNOWN, Structure, previous_key
 from torch_denkf.modules.variance_ceiling import VarianceCeiling
@@ -157,7 +148,7 @@ class Filter(Checked, TensorDictSequential):
         self.compiled: Any = None
         #: Called with the filter and a :class:`Record` of each run, before anything is written.
         self.observers: list[Observer] = diagnosis().default_observers()
-        refuse_two_precisions(self)
+        diagnosis().check_precision(self)
         self._sort()
 
     def _sort(self) -> None:
@@ -174,7 +165,7 @@ class Filter(Checked, TensorDictSequential):
         self._sizes: Drawn = {}
         placed = (*structure.modules, ("initial", self.initial))
         self._random = [found for place, module in placed for found in random_parts(module, place)]
-        written = structure.out_keys
+        self._places, written = {place for place, _ in self._random}, structure.out_keys
         self._own_keys = {*written, *map(unravel_key, self.initial.out_keys)}
         self.in_keys = [self.outer(key) for key in structure.in_keys(self.init_key)]
         self.out_keys = [self.outer(key) for key in written]
@@ -385,11 +376,14 @@ class Filter(Checked, TensorDictSequential):
         structure, size = self.structure, tensordict.batch_size
         entries = self.entries_of(tensordict)
         given = list(entries.values())
-        refuse_missing_actions(structure, entries, all(previous_key(key) in entries for key in structure.carry))
+        resumed = all(previous_key(key) in entries for key in structure.carry)
+        if resumed and not all(previous_key(key) in entries for key in structure.required_controls):
+            diagnosis().check_actions(structure, entries)
         for key in (*structure.carry, *structure.controls):
             if previous_key(key) in entries:
                 entries[key] = entries[previous_key(key)]
-        check_inputs(structure, type(self).__name__, entries, tensordict)
+        if not entries.keys() >= structure.must:
+            diagnosis().check_inputs(structure, type(self).__name__, entries, tensordict)
         # A mark may be that of a slice of data, which goes on from the belief before it.
         known = entries.get(KNOWN)
         reset = starts_of(tensordict, self.init_key, step=True) if known is None else ~known.reshape(*size, 1)
@@ -431,11 +425,11 @@ class Filter(Checked, TensorDictSequential):
             tensordict = self.of_one_robot(tensordict)
         entries, size = self.entries_of(tensordict, one_step=True), tensordict.batch_size
         if without:
-            without = refuse_unknown_readings(self.structure, without)
-            refuse_single_readings(self.structure, without)
+            without = diagnosis().readings_to_leave_out(self.structure, without)
+            diagnosis().check_joined_readings(self.structure, without)
             entries = {key: value for key, value in entries.items() if key not in without}
         if not entries.keys() >= self.structure.must:
-            check_inputs(self.structure, type(self).__name__, entries, tensordict, without)
+            diagnosis().check_inputs(self.structure, type(self).__name__, entries, tensordict, without)
         if without:
             written = self.steps.step(entries, Call(size), partial=True)
         else:
@@ -448,7 +442,7 @@ class Filter(Checked, TensorDictSequential):
         Raises:
             KeyError: if an analysis does not say which entries are its readings.
         """
-        refuse_nameless_readings(self.structure)
+        diagnosis().check_named_readings(self.structure)
         tensordict = self.of_one_robot(tensordict)
         hidden = tensordict.copy()
         for key in {part.mask_key for part in in_role(self.module, Transition)} - {None}:
@@ -502,7 +496,7 @@ class Filter(Checked, TensorDictSequential):
         tensordict, structure, steps = self.of_one_robot(tensordict), self.structure, self.steps
         entries, call = self.entries_of(tensordict), Call(tensordict.batch_size)
         given, written = list(entries.values()), {}
-        without = refuse_unknown_readings(structure, without)
+        without = diagnosis().readings_to_leave_out(structure, without)
         entries = {key: value for key, value in entries.items() if key not in without}
         if self.update_at_reset or not set(structure.frame_keys).isdisjoint(chain(*reads(self.initial))):
             written = steps.run(structure.frames, entries, call, bool(without))
@@ -585,7 +579,8 @@ class Filter(Checked, TensorDictSequential):
         structure, steps, size = self.structure, self.steps, rows.batch_size
         entries, call = self.entries_of(rows), Call(size, time=True)
         given = list(entries.values())
-        check_inputs(structure, type(self).__name__, entries, rows, carry=False)
+        if structure.must - entries.keys() - {*structure.carry}:
+            diagnosis().check_inputs(structure, type(self).__name__, entries, rows, carry=False)
         with set_recurrent_mode(True):  # for modules that are not this package's
             frames = steps.run(structure.frames, entries, call)
         gathered = gather_rows(structure, entries, marks, size, self.initial_belief)
@@ -640,7 +635,8 @@ class Filter(Checked, TensorDictSequential):
         given = tensordict.get(self._noise_key, None)
         if given is not None:
             noise = flat_noise(given)
-            refuse_unknown_noise({place for place, _ in self._random}, type(self).__name__, noise)
+            if any(len(key) < 2 or key[1] not in self._places for key in noise):
+                diagnosis().check_noise(self._places, type(self).__name__, noise)
             entries.update(noise)
         return entries
 

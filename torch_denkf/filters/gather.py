@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torch_denkf.filters.refusals import refuse_missing_actions
+from torch_denkf._registered import diagnosis
 from torch_denkf.filters.structure import KNOWN, RESUMES, Structure, previous_key
 from torch_denkf.submodel import Call, Entries
 
@@ -93,7 +93,8 @@ def gather_rows(
     device = starts[carry[0]].device
     begins = torch.ones(*one, 1, dtype=torch.bool, device=device) if marks is None else _or_first(marks, size, device)
     if resumed:  # a policy's data: what is known before an element is where its step begins
-        refuse_missing_actions(structure, entries, resumed=True)
+        if not all(previous_key(key) in entries for key in structure.required_controls):
+            diagnosis().check_actions(structure, entries)
         first = _or_first(marks, size, device)
         known = entries.get(KNOWN, torch.ones_like(first))
         begins, inputs[RESUMES] = ~known, first & known

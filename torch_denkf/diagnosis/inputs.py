@@ -7,19 +7,19 @@ from collections.abc import Collection, Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
-from torch_denkf._registered import diagnosis
+from torch_denkf.diagnosis.errors import missing_entry
 from torch_denkf.filters.structure import Structure, previous_key, takes_reading
 from torch_denkf.running import in_sequences, writes
 from torch_denkf.submodel import Entries, Sensor, Update, in_role, role
 
 __all__ = [
     "check_inputs",
-    "refuse_missing_actions",
-    "refuse_nameless_readings",
-    "refuse_single_readings",
-    "refuse_two_precisions",
-    "refuse_unknown_noise",
-    "refuse_unknown_readings",
+    "check_actions",
+    "check_named_readings",
+    "check_joined_readings",
+    "check_precision",
+    "check_noise",
+    "readings_to_leave_out",
 ]
 
 
@@ -58,7 +58,7 @@ def check_inputs(
         readers = [
             type(m).__name__ for _, m in structure.modules if not set(missing).isdisjoint(map(unravel_key, m.in_keys))
         ]
-        raise diagnosis().missing_entry(
+        raise missing_entry(
             ", ".join(readers) or name,
             missing,
             tensordict.keys(True, True),
@@ -67,10 +67,10 @@ def check_inputs(
         )
 
 
-def refuse_missing_actions(structure: Structure, entries: Entries, resumed: bool) -> None:
+def check_actions(structure: Structure, entries: Entries) -> None:
     """Raises a ``KeyError`` where a step resumes from a policy's belief, and the action before it is not there."""
     missing = [key for key in structure.required_controls if previous_key(key) not in entries]
-    if resumed and missing:
+    if missing:
         raise KeyError(
             f"The belief is that of a policy, one step before, and {missing} drives the step. The action before it is "
             f"missing: {[previous_key(key) for key in missing]}. Put filter.make_tensordict_primer(), which brings it, "
@@ -78,15 +78,15 @@ def refuse_missing_actions(structure: Structure, entries: Entries, resumed: bool
         )
 
 
-def refuse_unknown_noise(places: Collection[str], name: str, noise: Entries) -> None:
+def check_noise(places: Collection[str], name: str, noise: Entries) -> None:
     """Raises a ``KeyError`` where noise is given for a place that draws none: it would be ignored."""
     unknown = [key for key in noise if len(key) < 2 or key[1] not in places]
     if unknown:
         raise KeyError(f"{unknown} is noise of no module of {name}; noise is drawn at {sorted(places)}.")
 
 
-def refuse_unknown_readings(structure: Structure, without: Sequence[NestedKey]) -> list[NestedKey]:
-    """The readings to leave out, unravelled.
+def readings_to_leave_out(structure: Structure, without: Sequence[NestedKey]) -> list[NestedKey]:
+    """Returns the keys of readings to leave out, unravelled.
 
     Raises:
         KeyError: if no module reads one of them.
@@ -101,7 +101,7 @@ def refuse_unknown_readings(structure: Structure, without: Sequence[NestedKey]) 
     return keys
 
 
-def refuse_nameless_readings(structure: Structure) -> None:
+def check_named_readings(structure: Structure) -> None:
     """Raises a ``KeyError`` where an analysis takes in a reading and does not say so: ``predict`` could not hide it."""
     frames = {*structure.needed, *structure.frame_keys}
     for place, module in structure.update:
@@ -116,7 +116,7 @@ def refuse_nameless_readings(structure: Structure) -> None:
                 )
 
 
-def refuse_single_readings(structure: Structure, without: Sequence[NestedKey]) -> None:
+def check_joined_readings(structure: Structure, without: Sequence[NestedKey]) -> None:
     """Raises a ``ValueError`` where some readings are to be left out, not all, of those that a module joins."""
     joined = any(part.joins_readings for _, module in structure.modules for part in in_role(module, Sensor))
     if joined and without and set(without) != set(structure.readings):
@@ -126,7 +126,7 @@ def refuse_single_readings(structure: Structure, without: Sequence[NestedKey]) -
         )
 
 
-def refuse_two_precisions(filter: torch.nn.Module) -> None:
+def check_precision(filter: torch.nn.Module) -> None:
     """Raises a ``TypeError`` where parameters or constants are of float32 and float64."""
     named = [*filter.named_parameters(), *filter.named_buffers()]
     doubles = [name for name, value in named if value.dtype == torch.float64]
