@@ -1,6 +1,6 @@
 """Oracles: the unscented filter written out in loops, a mean in closed form, a vehicle whose pose is known exactly.
 
-What both Gaussian filters share (masks, noise, inflation, refusals) is in ``test_ekf``.
+What both Gaussian filters share (masks, noise, inflation, errors) is in ``test_ekf``.
 """
 
 import numpy as np
