@@ -37,6 +37,7 @@ class UnreadMasks(Once):
     def __init__(self) -> None:
         super().__init__()
         self._seen: set[tuple] = set()
+        self._environments: set[int] = set()
         self._known: tuple[Structure | None, list[Any], list[tuple[NestedKey, NestedKey]]] = (None, [], [])
 
     def __call__(self, filter: Filter, record: Record) -> None:
@@ -55,7 +56,8 @@ class UnreadMasks(Once):
             mask = tensordict.get(own, None)
             if mask is not None:
                 self._held(structure, tensordict, key, own, mask, name)
-        if record.env is not None:
+        if record.env is not None and id(record.env) not in self._environments:
+            self._environments.add(id(record.env))
             self._of_transforms(structure, record.env, name)
 
     def _unread(self, structure: Structure, tensordict: TensorDictBase, unmasked: list) -> None:

@@ -32,6 +32,7 @@ class VarianceCeiling(SubModel):
         ValueError: if ``ceiling`` is not positive.
 
     Example:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torch_denkf.beliefs import kinds_of
         >>> keys = [("belief", name) for name in ("mean", "cov", "var")]
