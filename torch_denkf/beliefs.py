@@ -80,6 +80,9 @@ class Belief:
         self.prefix, self.space = prefix, space
         self.carry: list[NestedKey] = [(*prefix, name) for name in self.carried]
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.prefix}, {self.space})"
+
     def key(self, name: str) -> NestedKey:
         """Returns the key of an entry."""
         return (*self.prefix, name)

@@ -29,11 +29,11 @@ class ScaledInnovation(Around):
         self.share = share
 
     def on_entries(self, entries, call):
-        return self.run_inside({**entries, self.reading_keys[0]: self.scaled(entries)}, call)
+        return self.run_inside({**entries, self.reading_keys[0]: self.scaled(entries, call)}, call)
 
-    def scaled(self, entries):
-        expected = entries[self.predicted_key].mean(-2)
-        return expected + self.share * (entries[self.reading_keys[0]] - expected)
+    def scaled(self, entries, call):
+        innovation = self.run_inside(entries, call)[self.info_prefix, "innovation"]
+        return entries[self.reading_keys[0]] - (1 - self.share) * innovation
 
 
 def frame():
@@ -110,7 +110,7 @@ def test_a_lag_goes_inside_of_what_goes_around(name):
     assert isinstance(around, ScaledInnovation)
     assert set(around.in_keys) == set(UPDATES[name]().in_keys)
     td = frame()
-    changed = td.copy().set(("sensor", "ensemble"), around.scaled(dict(td.items(True, True))))
+    changed = td.copy().set(("sensor", "ensemble"), around.scaled(dict(td.items(True, True)), Call(td.batch_size)))
     expected = UPDATES[name]()(changed).set(("sensor", "ensemble"), td["sensor", "ensemble"])
     assert_equal(around(td), expected)
     with pytest.raises(TypeError, match="ScaledInnovation does not say what a reading means for earlier states"):

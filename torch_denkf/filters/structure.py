@@ -162,6 +162,7 @@ class Structure(NamedTuple):
         space = role(initial, Initial).space
         kinds = kinds_of(belief, space, carry)
         forecast_of = _forecasts(carry, writes(steps[0][1]), forecast_keys)
+        _check_forecasts(forecast_of, kinds)
         return cls(
             initial=initial,
             frames=tuple(frames),
@@ -264,6 +265,17 @@ def _forecasts(
             )
         found[carry[0]] = written[0]
     return found
+
+
+def _check_forecasts(forecast_of: Mapping[NestedKey, NestedKey], kinds: Sequence[Belief]) -> None:
+    """Raises where the transition forecasts some entries of a belief and it is not clear what forecasts the others."""
+    for kind in kinds:
+        lacking = [key for key in kind.carry if key not in forecast_of]
+        if lacking and len(lacking) < len(kind.carry):
+            raise ValueError(
+                f"The transition writes no forecast of {lacking} under the same last name: say which entry it is, "
+                f"forecast_keys={{{lacking[0]!r}: ...}}."
+            )
 
 
 def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequence[NestedKey]) -> list[NestedKey]:

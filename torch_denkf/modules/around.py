@@ -112,9 +112,11 @@ class Around(Wrapper, Update):
         ...
         ...     def on_entries(self, entries, call):
         ...         key = self.reading_keys[0]
-        ...         expected = entries[self.predicted_key].mean(-2)  # of a reading [*B, O]
-        ...         reading = expected + self.share * (entries[key] - expected)
-        ...         return self.run_inside({**entries, key: reading}, call)
+        ...         innovation = self.run_inside(entries, call)[self.info_prefix, "innovation"]
+        ...         less = (1 - self.share) * innovation
+        ...         if entries[key].ndim > innovation.ndim:  # samples [*B, E, O]
+        ...             less = less.unsqueeze(-2)
+        ...         return self.run_inside({**entries, key: entries[key] - less}, call)
         >>> members = torch.tensor([[-1.0], [1.0]])
         >>> td = TensorDict({
         ...     "forecast": {"ensemble": members, "observation": members},

@@ -29,7 +29,7 @@ class VarianceCeiling(SubModel):
         reached: whether variances were clamped, as far as that was looked at; for warnings.
 
     Raises:
-        ValueError: if ``ceiling`` is not positive.
+        ValueError: if ``ceiling`` is not positive, or a kind of belief does not say how it is limited.
 
     Example:
         >>> import torch
@@ -44,6 +44,12 @@ class VarianceCeiling(SubModel):
     def __init__(self, kinds: Sequence[Belief], keys: Sequence[NestedKey], ceiling: float):
         check_number("variance_ceiling", ceiling, above=0, cure="None is for no ceiling")
         super().__init__(nn.Identity(), [], list(keys), optional_keys=keys)
+        for kind in kinds:
+            if kind.carried and {*kind.carried}.isdisjoint(("mean", "cov")) and type(kind).limited is Belief.limited:
+                raise ValueError(
+                    f"{type(kind).__name__} carries {list(kind.carried)}, which a ceiling of the variances does not "
+                    "reach: write its limited(), or give the filter variance_ceiling=None."
+                )
         self.ceiling = ceiling
         self.kinds = [(kind.key("var"), kind) for kind in kinds if {kind.key("mean"), kind.key("var")} <= {*keys}]
         self.reached = False
