@@ -25,7 +25,6 @@ from torch_denkf.diagnosis.masks import UnreadMasks
 from torch_denkf.diagnosis.policy import PolicyStart
 from torch_denkf.diagnosis.shapes import ReadingRanks
 from torch_denkf.diagnosis.slices import UnmarkedSlices
-from torch_denkf.diagnosis.slices import check_slices as check_slices
 
 __all__ = [
     "check_analysis",

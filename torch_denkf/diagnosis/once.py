@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import warnings
 
+from torch_denkf.filters.finish import RUNS
+
 __all__ = ["Once"]
 
 
@@ -21,7 +23,7 @@ class Once:
     """
 
     #: The ways to run that it looks at.
-    ways: tuple[str, ...] = ("step", "sequence", "policy", "environment")
+    ways: tuple[str, ...] = RUNS
 
     def __init__(self) -> None:
         self.said: set[str] = set()

@@ -27,9 +27,9 @@ _CURE = (
 
 
 class UnmarkedSlices(Once):
-    """Raises where a filter reads slices of several episodes end to end, and nothing marks where they begin."""
+    """Raises where the batch of a loss holds slices of episodes end to end, and nothing marks where they begin."""
 
-    ways = ("sequence",)
+    ways = ("data",)
 
     def __call__(self, filter: Filter, record: Record) -> None:
         """Looks at a flat batch, see :func:`check_slices`."""

@@ -30,7 +30,7 @@ from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_count
 from torch_denkf._registered import compiler, diagnosis, primers
 from torch_denkf._slices import as_rows, starts_of
-from torch_denkf.filters.finish import Record, check_belief, own
+from torch_denkf.filters.finish import RUNS, Record, check_belief, own
 from torch_denkf.filters.gather import gather_rows, of_one_robot
 from torch_denkf.filters.noise import Drawn, draw_noise, recorded_draws
 from torch_denkf.filters.options import FilterOptions
@@ -475,10 +475,14 @@ class Filter(Checked, TensorDictSequential):
         if self.check_finite and record.way != "sequence" if check is None else check:
             check_belief(self.structure, record.entries, record.written)
         record = record._replace(written=own(record.written, record.entries.values() if given is None else given))
-        for observe in self.observers:
-            if record.way in getattr(observe, "ways", (record.way,)):
-                observe(self, record)
+        self.observe(record)
         return record.written
+
+    def observe(self, record: Record) -> None:
+        """Tells the observers; those that name no ``ways`` are told of steps and sequences, and not of data alone."""
+        for observe in self.observers:
+            if record.way in getattr(observe, "ways", RUNS):
+                observe(self, record)
 
     def initialise(
         self, tensordict: TensorDictBase | Mapping[str, Any], *, without: Sequence[NestedKey] = ()

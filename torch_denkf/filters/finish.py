@@ -17,14 +17,19 @@ from torch_denkf.submodel import Entries
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
-__all__ = ["Record", "check_belief", "own"]
+__all__ = ["RUNS", "Record", "check_belief", "own"]
+
+
+#: The ways to run a filter.
+RUNS = ("step", "sequence", "policy", "environment")
 
 
 class Record(NamedTuple):
     """One run of a filter, as its observers see it before anything is written.
 
     Attributes:
-        way: ``"step"``, ``"sequence"``, ``"policy"`` or ``"environment"``.
+        way: ``"step"``, ``"sequence"``, ``"policy"`` or ``"environment"``; ``"data"`` for a batch that a loss or a
+            replay buffer is about to filter: nothing is written then.
         tensordict: what the filter read from, as it was given.
         batch_size: of the entries; differs from the tensordict's where slices lie end to end.
         entries: what the modules read.
@@ -32,7 +37,7 @@ class Record(NamedTuple):
         env: the environment, where there is one.
     """
 
-    way: Literal["step", "sequence", "policy", "environment"]
+    way: Literal["step", "sequence", "policy", "environment", "data"]
     tensordict: TensorDictBase
     batch_size: torch.Size
     entries: Entries

@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule
 from torch_denkf._arguments import Checked, check_key
 from torch_denkf._checks import check_choice, check_number
 from torch_denkf.filters import Filter
+from torch_denkf.filters.finish import Record
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.tensors import as_floating, check_dims
 from torch_denkf.objectives._labels import Keys, Truth
@@ -300,6 +301,7 @@ class FilterLoss(Checked, LossModule):
 
     def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The batch with what the filter, or its part, writes."""
+        self.filter.observe(Record("data", tensordict, tensordict.batch_size, {}, {}))
         return self.filter.inside(self._filters().sequence(tensordict.copy(), detach_every=self.detach_every))
 
     def _filters(self):

@@ -15,8 +15,8 @@ from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
 
 from torch_denkf._arguments import check_key
 from torch_denkf._checks import check_count, check_values
-from torch_denkf._registered import diagnosis
 from torch_denkf.filters import Filter
+from torch_denkf.filters.finish import Record
 from torch_denkf.filters.structure import previous_key
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules.tensors import as_floating
@@ -262,7 +262,7 @@ class TransitionLoss(FilterLoss):
     def _run(self, tensordict):
         if not tensordict.ndim:
             raise ValueError("A step needs two times, the last batch dimension; this tensordict has batch_size [].")
-        diagnosis().check_slices(tensordict, self.filter.init_key)
+        self.filter.observe(Record("data", tensordict, tensordict.batch_size, {}, {}))
         truth = Truth(self, tensordict, tensordict).whole_state().values
         # Whatever else reads the true state finds no NaN either.
         known = tensordict.copy().set(self.tensor_keys.state, truth)

@@ -312,6 +312,7 @@ class DEnKFTransform(Checked, Transform):
         Raises:
             ValueError: if a flat batch seems to hold several sequences that are not marked.
         """
+        self.filter.observe(Record("data", tensordict, tensordict.batch_size, {}, {}))
         with self._grad_mode(), set_recurrent_mode(True):
             return self.filter(tensordict)
 
