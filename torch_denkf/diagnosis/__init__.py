@@ -24,7 +24,6 @@ from torch_denkf.diagnosis.inputs import readings_to_leave_out as readings_to_le
 from torch_denkf.diagnosis.masks import UnreadMasks
 from torch_denkf.diagnosis.policy import PolicyStart
 from torch_denkf.diagnosis.shapes import ReadingRanks
-from torch_denkf.diagnosis.slices import UnmarkedSlices
 from torch_denkf.diagnosis.slices import check_slices as check_slices
 
 __all__ = [
@@ -34,4 +33,4 @@ __all__ = [
 
 def default_observers() -> list[Any]:
     """Returns the observers that a new filter has."""
-    return [UnmarkedSlices(), ReadingRanks(), UnreadMasks(), CeilingReached(), NarrowEnsemble(), PolicyStart()]
+    return [ReadingRanks(), UnreadMasks(), CeilingReached(), NarrowEnsemble(), PolicyStart()]

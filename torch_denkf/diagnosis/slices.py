@@ -9,11 +9,8 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from torch_denkf._slices import starts_of
-from torch_denkf.diagnosis.once import Once
-from torch_denkf.filters.base import Filter
-from torch_denkf.filters.finish import Record
 
-__all__ = ["UnmarkedSlices", "check_slices"]
+__all__ = ["check_slices"]
 
 #: Last names of entries that number an episode, and of those that count its steps.
 _EPISODES = ("episode", "episode_index", "traj_ids")
@@ -24,16 +21,6 @@ _CURE = (
     "ReplayBuffer leaves them out. Use TensorDictReplayBuffer; or reshape slices of one length, batch.reshape(-1, T); "
     "or, if this is one sequence after all, pass batch[None]."
 )
-
-
-class UnmarkedSlices(Once):
-    """Raises where a filter reads slices of several episodes end to end, and nothing marks where they begin."""
-
-    ways = ("sequence",)
-
-    def __call__(self, filter: Filter, record: Record) -> None:
-        """Looks at a flat batch, see :func:`check_slices`."""
-        check_slices(record.tensordict, filter.init_key)
 
 
 def check_slices(tensordict: TensorDictBase, init_key: NestedKey) -> None:

@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule
 
 from torch_denkf._arguments import Checked, check_key
 from torch_denkf._checks import check_choice, check_number
+from torch_denkf._registered import diagnosis
 from torch_denkf.filters import Filter
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.tensors import as_floating, check_dims
@@ -300,6 +301,7 @@ class FilterLoss(Checked, LossModule):
 
     def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The batch with what the filter, or its part, writes."""
+        diagnosis().check_slices(tensordict, self.filter.init_key)
         return self.filter.inside(self._filters().sequence(tensordict.copy(), detach_every=self.detach_every))
 
     def _filters(self):

@@ -312,6 +312,7 @@ class DEnKFTransform(Checked, Transform):
         Raises:
             ValueError: if a flat batch seems to hold several sequences that are not marked.
         """
+        diagnosis().check_slices(tensordict, self.filter.init_key)
         with self._grad_mode(), set_recurrent_mode(True):
             return self.filter(tensordict)
 
