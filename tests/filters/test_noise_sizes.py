@@ -181,3 +181,25 @@ def test_a_batch_normalisation_does_not_notice_the_trial_step():
     filter.sequence(frames)
     assert sensor.module.norm.num_batches_tracked == 1
     assert all(part.training for part in filter.modules())
+
+
+def test_the_trial_step_calls_no_hooks():
+    filter, calls = linear_denkf("perturbed", noisy=True), []
+    filter["analysis"].register_forward_hook(lambda *_: calls.append("hook"))
+    filter["transition"].register_forward_pre_hook(lambda *_: calls.append("pre-hook"))
+    filter.draw_noise(readings(3, 5))
+    assert not calls
+
+
+def test_what_a_module_asked_for_before_is_drawn_where_its_reading_has_not_come():
+    filter = linear_denkf("perturbed", noisy=True)
+    filter.draw_noise(readings(3, 5))
+    drawn = filter.draw_noise(TensorDict({}, [3, 5]))["noise"]
+    assert drawn["analysis"].shape == (3, 5, 6, 2)
+
+
+def test_a_draw_of_which_a_part_is_missing_is_drawn_whole():
+    filter, frames = toy_denkf(layer="flipout"), toy_frames((3, 5))
+    drawn = filter.draw_noise(frames.copy())["noise", "transition"].exclude("perturbation")
+    frames["noise", "transition"] = drawn
+    assert {*filter.draw_noise(frames)["noise", "transition"].keys()} == {"signs", "perturbation"}

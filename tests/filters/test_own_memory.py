@@ -123,7 +123,13 @@ TAKES = {
     ),
     "BackpropKF": (
         lambda a, b, c, d, e: BackpropKF(
-            a, None, c, ConstantNoise([0.5, 0.5], in_key="observation"), process_noise_cov=b, initial=MomentPrior(d, e)
+            a,
+            None,
+            c,
+            ConstantNoise([0.5, 0.5], in_key="observation"),
+            process_noise_cov=b,
+            initial=MomentPrior(d, e),
+            observation_key="observation",
         ),
         [MATRIX, MATRIX, MATRIX, VECTOR, MATRIX],
     ),
