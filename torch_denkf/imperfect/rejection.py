@@ -117,7 +117,9 @@ class RejectReadings(Checked, Transform):
         numbers, marks = {*masks, *noises.values()}, {*masks.values()}
         twice = (numbers & marks) | ((numbers | marks) & {unravel_key(count_key)})
         if twice:
-            raise ValueError(f"readings and noises, masks, and the count need different keys; got {twice.pop()!r} twice")
+            raise ValueError(
+                f"readings and noises, masks and the count need keys of their own; got {twice.pop()!r} twice"
+            )
         written = dict.fromkeys([*masks, *noises.values(), *masks.values()])
         super().__init__(in_keys=list(written), out_keys=list(dict.fromkeys([*written, unravel_key(count_key)])))
         #: The mask of each reading; :class:`~torch_denkf.transforms.DEnKFTransform` warns if its filter reads none.
