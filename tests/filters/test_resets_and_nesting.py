@@ -251,3 +251,16 @@ def test_other_options_are_checked_like_those_of_the_constructor():
         filter.with_options(prefix="next")
     assert filter.with_options(forecast_keys=None).options() == filter.options()
     assert filter.with_options(init_key=("a", ("b",))).init_key == ("a", "b")
+
+
+@pytest.mark.parametrize("left_out", [["y0"], ["y1"], ["y0", "y1"]])
+def test_a_reading_of_a_sequence_is_left_out_as_if_it_were_masked(float64, left_out):
+    first, second = (
+        parts_of_reading(i, *between, info_prefix=f"info{i}", observed_key=f"o{i}")[f"a{i}"]
+        for i, between in enumerate([("forecast", "mid"), ("mid", "belief")])
+    )
+    filter = blocks(named=True).with_modules({"first.1": first, "second.1": second})
+    frame = filter.initialise(TensorDict({"y0": torch.randn(3, 1), "y1": torch.randn(3, 1)}, [3]))
+    hidden = {f"o{key[1]}": torch.zeros(3, 1, dtype=torch.bool) for key in left_out}
+    masked = filter.step(frame.copy().update(hidden))
+    close(filter.step(frame.exclude(*left_out), without=left_out), masked, [MEAN, VAR])
