@@ -176,3 +176,32 @@ def test_limited_particles_come_near_the_median_and_the_others_stay(float64):
     assert 10.0 <= float(out["ensemble"][3]) <= 12.0  # ten from a median between one and two
     assert float(out["mean"]) == pytest.approx(float(out["ensemble"].mean()))
     assert float(out["var"]) == pytest.approx(100.0)
+
+
+def test_limited_members_follow_a_mean_out_of_reach(float64):
+    """The ceiling is a hundred: the mean stays within a thousand times ten, and the members around it."""
+    ensemble = torch.randn(50, 1) + 1e9
+    held = {"ensemble": ensemble, "mean": ensemble.mean(-2), "var": ensemble.var(-2)}
+    out = Ensemble().limited(held, 100.0)
+    assert out["mean"].tolist() == [10_000.0]
+    torch.testing.assert_close(out["ensemble"].mean(-2), out["mean"])
+    torch.testing.assert_close(out["ensemble"].var(-2), held["var"])
+
+
+def test_where_nothing_is_limited_members_on_a_space_stay_to_the_bit():
+    """Also where another row is limited; taken off the mean and put back they would be rounded."""
+    space = Circle()
+    ensemble = torch.randn(2, 50, 1) * torch.tensor([0.3, 1e-3]).reshape(2, 1, 1) + 1.0
+    held = {"ensemble": ensemble, "mean": space.mean(ensemble), "var": ensemble.var(-2)}
+    out = Ensemble(space=space).limited(held, 1e-4)["ensemble"]
+    assert out[1].equal(ensemble[1])
+    assert float(out[0].var()) == pytest.approx(1e-4, rel=0.01)
+
+
+def test_the_mean_of_particles_that_are_not_limited_stays_to_the_bit():
+    ensemble = torch.cat([torch.tensor([0.0, 1.0, 2.0, 1e6]).unsqueeze(-1), torch.randn(4, 1)], -1)
+    mean = ensemble.mean(-2) + torch.tensor([0.0, 1e-3])  # what an update wrote
+    held = {"ensemble": ensemble, "log_weight": torch.full((4,), 0.25).log(), "mean": mean, "var": ensemble.var(-2)}
+    out = Particles().limited(held, 100.0)
+    assert out["mean"][1] == mean[1]
+    assert out["mean"][0] < 10.0

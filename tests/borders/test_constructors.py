@@ -15,6 +15,7 @@ from torch_denkf.baselines.lstm_cell import LSTMUpdate
 from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.functional.manifolds import Circle, Flat
+from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import (
     AroundState,
     CholeskyNoise,
@@ -215,6 +216,7 @@ WRONG_TYPES = {
     "dims": (lambda: Select([0.5]), "dims", "0.5"),
     "error of a sensor": (lambda: KalmanFilter(**PARTS, sensor_error=1.0), "sensor_error is a FadingBias", "float"),
     "error of an EKF's": (lambda: linear_filter("EKF", sensor_error=1.0), "sensor_error is a FadingBias", "float"),
+    "a class": (lambda: KalmanFilter(**PARTS, sensor_error=FadingBias), "sensor_error is a FadingBias", "FadingBias"),
     "visibility": (lambda: linear_filter("UKF", visibility=Select([0])), "visibility is a Visibility", "Select"),
 }
 

@@ -7,7 +7,9 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system, toy_denkf, toy_frames
+from torch_denkf.filters import Filter
 from torch_denkf.modules import ConstantNoise, LinearObservation, SubModel
+from torch_denkf.modules.stochastic import deterministic
 from torch_denkf.running import run_module
 
 MEAN, ENSEMBLE = ("belief", "mean"), ("belief", "ensemble")
@@ -140,3 +142,64 @@ def test_parts_of_different_sizes():
         torch.manual_seed(1)
         outs.append(filter.sequence(frames.copy())[MEAN])
     torch.testing.assert_close(outs[1], outs[0])
+
+
+def test_a_deterministic_run_does_not_change_what_is_drawn_after_it():
+    filter, other = toy_denkf(), toy_denkf()
+    other.load_state_dict(filter.state_dict())
+    frames = toy_frames((3, 5))
+    with deterministic(other):
+        other.sequence(frames.copy())
+    outs = []
+    for model in (filter, other):
+        torch.manual_seed(1)
+        outs.append(model.sequence(frames.copy())[MEAN])
+    torch.testing.assert_close(*outs, rtol=0, atol=0)
+    assert {*other.draw_noise(frames.copy())["noise"].keys()} == {"initial", "sensor", "transition"}
+
+
+class Normalised(nn.Module):
+    """Batch normalisation of all rows, which in training needs more than one."""
+
+    def __init__(self):
+        super().__init__()
+        self.norm = nn.BatchNorm1d(2)
+
+    def forward(self, reading):
+        return self.norm(reading.flatten(0, -2)).reshape(reading.shape)
+
+
+def test_a_batch_normalisation_does_not_notice_the_trial_step():
+    """It counts one batch a sequence, in training; and all noise is drawn in bulk."""
+    sensor = TensorDictModule(Normalised(), ["raw"], ["observation"])
+    plain = linear_denkf("perturbed", noisy=True)
+    filter = Filter({"normal": sensor, **dict(plain.module.named_children())}, initial=plain.initial)
+    frames = TensorDict({"raw": torch.randn(3, 5, 2)}, [3, 5])
+    drawn = filter.draw_noise(frames.copy())
+    assert sensor.module.norm.num_batches_tracked == 0
+    assert {*drawn["noise"].keys()} >= {"transition", "analysis"}
+    filter.sequence(frames)
+    assert sensor.module.norm.num_batches_tracked == 1
+    assert all(part.training for part in filter.modules())
+
+
+def test_the_trial_step_calls_no_hooks():
+    filter, calls = linear_denkf("perturbed", noisy=True), []
+    filter["analysis"].register_forward_hook(lambda *_: calls.append("hook"))
+    filter["transition"].register_forward_pre_hook(lambda *_: calls.append("pre-hook"))
+    filter.draw_noise(readings(3, 5))
+    assert not calls
+
+
+def test_what_a_module_asked_for_before_is_drawn_where_its_reading_has_not_come():
+    filter = linear_denkf("perturbed", noisy=True)
+    filter.draw_noise(readings(3, 5))
+    drawn = filter.draw_noise(TensorDict({}, [3, 5]))["noise"]
+    assert drawn["analysis"].shape == (3, 5, 6, 2)
+
+
+def test_a_draw_of_which_a_part_is_missing_is_drawn_whole():
+    filter, frames = toy_denkf(layer="flipout"), toy_frames((3, 5))
+    drawn = filter.draw_noise(frames.copy())["noise", "transition"].exclude("perturbation")
+    frames["noise", "transition"] = drawn
+    assert {*filter.draw_noise(frames)["noise", "transition"].keys()} == {"signs", "perturbation"}

@@ -197,7 +197,7 @@ def test_other_modules_make_a_new_filter():
     filter = blocks(named=True)
     frames = TensorDict({"y0": torch.randn(5, 1), "y1": torch.randn(5, 1)}, [5])
     before = filter.structure
-    for place in ("third", "second.7", "second.1.network", "initial.mean"):
+    for place in ("third", "second.7", "second.1.network", "initial.mean", "nowhere.second", "second.nowhere.1"):
         with pytest.raises(KeyError, match=f"no module at '{place}'"):
             filter.with_modules({place: filter["second"]})
     with pytest.raises(ValueError, match="no module writes"):
@@ -222,3 +222,45 @@ def test_a_new_module_that_would_lose_readings_is_named():
     with pytest.raises(ValueError, match=r"'wheels' \(KalmanAnalysis\) takes in .* the reading would be lost"):
         two.with_modules(gps=KalmanAnalysis(one, one, observation_key="gps"))
     assert two["gps"] is gps
+
+
+def test_a_module_of_a_list_is_exchanged_by_its_number():
+    filter = Filter(*linear_denkf()._module_iter(), initial=linear_denkf().initial)
+    last = len(filter) - 1
+    for place in (last, str(last)):
+        new = EnsembleAnalysis("sakov", observation_key="observation")
+        assert filter.with_modules({place: new})[last] is new
+
+
+def test_a_new_filter_has_hooks_and_buffers_of_its_own():
+    filter = linear_denkf()
+    other, calls = filter.with_options(check_finite=False), []
+    other.register_forward_hook(lambda *_: calls.append("other"))
+    other.register_buffer("own", torch.zeros(1))
+    filter(filter.initialise(TensorDict({"observation": torch.zeros(3, 2)}, [3])))
+    assert not calls
+    assert "own" not in dict(filter.named_buffers())
+
+
+def test_other_options_are_checked_like_those_of_the_constructor():
+    filter = linear_denkf()
+    for option in ({"prefx": "imu"}, {"initial": filter.initial}, {"prefix": 3}, {"check_finite": "no"}):
+        with pytest.raises(TypeError, match=next(iter(option))):
+            filter.with_options(**option)
+    with pytest.raises(ValueError, match='prefix="next"'):
+        filter.with_options(prefix="next")
+    assert filter.with_options(forecast_keys=None).options() == filter.options()
+    assert filter.with_options(init_key=("a", ("b",))).init_key == ("a", "b")
+
+
+@pytest.mark.parametrize("left_out", [["y0"], ["y1"], ["y0", "y1"]])
+def test_a_reading_of_a_sequence_is_left_out_as_if_it_were_masked(float64, left_out):
+    first, second = (
+        parts_of_reading(i, *between, info_prefix=f"info{i}", observed_key=f"o{i}")[f"a{i}"]
+        for i, between in enumerate([("forecast", "mid"), ("mid", "belief")])
+    )
+    filter = blocks(named=True).with_modules({"first.1": first, "second.1": second})
+    frame = filter.initialise(TensorDict({"y0": torch.randn(3, 1), "y1": torch.randn(3, 1)}, [3]))
+    hidden = {f"o{key[1]}": torch.zeros(3, 1, dtype=torch.bool) for key in left_out}
+    masked = filter.step(frame.copy().update(hidden))
+    close(filter.step(frame.exclude(*left_out), without=left_out), masked, [MEAN, VAR])

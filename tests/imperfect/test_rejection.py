@@ -446,6 +446,10 @@ def test_a_reading_that_is_not_there_is_named():
         ({"spaces": {"y": SE2()}}, ValueError, "spaces names 'y'"),
         ({"limit": -1.0}, ValueError, "limit must be"),
         ({"count_key": 3}, TypeError, "count_key of RejectReadings is a key"),
+        ({"noises": ["x"]}, TypeError, "noises is a dict"),
+        ({"spaces": {"x": 3}}, TypeError, "the space of 'x' is a Space"),
+        ({"masks": {"x": "x"}}, ValueError, "got 'x' twice"),
+        ({"count_key": "seen"}, ValueError, "got 'seen' twice"),
         ({"limits": 3}, TypeError, "RejectReadings takes no argument 'limits'"),
     ],
 )

@@ -26,7 +26,7 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import set_recurrent_mode
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
-from torch_denkf._arguments import Checked
+from torch_denkf._arguments import Checked, check_arguments
 from torch_denkf._checks import check_count
 from torch_denkf._registered import compiler, diagnosis, primers
 from torch_denkf._slices import as_rows, starts_of
@@ -136,20 +136,27 @@ class Filter(Checked, TensorDictSequential):
         check_module("initial", initial)
         super().__init__(*modules)
         self.initial = initial
-        self.init_key, self.control_keys = unravel_key(init_key), list(control_keys)
-        self.forecast_keys, self.check_finite = dict(forecast_keys or {}), check_finite
-        self.fixed_options: dict[str, Any] = {
-            "update_at_reset": update_at_reset,
-            "variance_ceiling": variance_ceiling,
-            "prefix": prefix,
-        }
-        if prefix == "next":
-            raise ValueError('prefix="next" is where torchrl keeps the next step: give the filter another name')
+        self._set_options(
+            control_keys,
+            init_key,
+            forecast_keys,
+            check_finite,
+            update_at_reset=update_at_reset,
+            variance_ceiling=variance_ceiling,
+            prefix=prefix,
+        )
         self.compiled: Any = None
         #: Called with the filter and a :class:`Record` of each run, before anything is written.
         self.observers: list[Observer] = diagnosis().default_observers()
         diagnosis().check_precision(self)
         self._sort()
+
+    def _set_options(self, control_keys, init_key, forecast_keys, check_finite, **fixed: Any) -> None:
+        if fixed["prefix"] == "next":
+            raise ValueError('prefix="next" is where torchrl keeps the next step: give the filter another name')
+        self.init_key, self.control_keys = unravel_key(init_key), list(control_keys)
+        self.forecast_keys, self.check_finite = dict(forecast_keys or {}), check_finite
+        self.fixed_options = fixed
 
     def _sort(self) -> None:
         """Sorts the modules, and looks up once what each run reads and writes."""
@@ -192,6 +199,10 @@ class Filter(Checked, TensorDictSequential):
     def with_options(self, **options: Unpack[FilterOptions]) -> Filter:
         """Returns a filter of the same modules with other options, see the class.
 
+        Raises:
+            TypeError: if there is no such option, or it is of another kind.
+            ValueError: if an option is out of range.
+
         Example:
             >>> from torch_denkf.filters import KalmanFilter
             >>> one = torch.eye(1)
@@ -199,13 +210,13 @@ class Filter(Checked, TensorDictSequential):
             >>> kf.with_options(prefix="imu").carry_keys
             [('imu', 'belief', 'mean'), ('imu', 'belief', 'cov')]
         """
+        names = [*FilterOptions.__annotations__]
+        unknown = [name for name in options if name not in names]
+        if unknown:
+            raise TypeError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(names)}")
+        check_arguments(Filter, (), options)
         new = _shallow(self)
-        new.fixed_options = {**self.fixed_options}
-        for name, value in options.items():
-            if name in new.fixed_options:
-                new.fixed_options[name] = value
-            else:
-                setattr(new, name, value)
+        new._set_options(**{**self.options(), **options})
         return new._renewed(self)
 
     def with_modules(
@@ -236,15 +247,12 @@ class Filter(Checked, TensorDictSequential):
         """
         new = _shallow(self)
         for place, module in {**(modules or {}), **others}.items():
-            check_module(place, module)
+            check_module(place := str(place), module)
             where: torch.nn.Module = new
             *path, name = [place] if place == "initial" else ["module", *".module.".join(place.split(".")).split(".")]
             for step in path:
-                inner = where._modules.get(step)
-                if inner is None:
-                    break
-                where._modules[step] = where = _shallow(inner)
-            if name not in where._modules:
+                where._modules[step] = where = _shallow(where._modules.get(step) or torch.nn.Module())
+            if where._modules.get(name) is None:
                 places = [*(name for name, _ in named_modules_of(self)), "initial"]
                 raise KeyError(f"{type(self).__name__} has no module at {place!r}; it has {places}.")
             where._modules[name] = module
@@ -691,7 +699,8 @@ class Filter(Checked, TensorDictSequential):
         shapes = {
             key: value.shape[len(size) :] for key, value in entries.items() if key[0] not in ("noise", "previous")
         }
-        kind = tuple(sorted(shapes.items(), key=str))
+        # Modules may draw at some times and not at others, as those under `deterministic` do.
+        kind = (*sorted(shapes.items(), key=str), *(part.noise_names for _, part in self._random))
         if kind not in self._drawn:
             self._drawn[kind] = self._trial(entries, size)
         drawn, places = self._drawn[kind], dict(self.structure.modules) if places is None else places
@@ -730,5 +739,7 @@ class Filter(Checked, TensorDictSequential):
 def _shallow(module: torch.nn.Module) -> Any:
     """Copies a module whose sub-modules can be exchanged without those of the original."""
     new = copy(module)
-    new._modules = dict(module._modules)
+    for name, value in vars(module).items():
+        if isinstance(value, dict) and name.startswith("_"):  # torch's, of parameters, buffers, modules and hooks
+            vars(new)[name] = value.copy()
     return new

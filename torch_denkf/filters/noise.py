@@ -20,7 +20,10 @@ Drawn = dict[str, tuple[SubModel, dict[str, Any]]]
 
 @contextmanager
 def recorded_draws(filter: nn.Module, parts: Sequence[tuple[str, SubModel]]) -> Iterator[Drawn]:
-    """Records the sizes that sub-models ask for when they draw noise; forward hooks are not called meanwhile.
+    """Records the sizes that sub-models ask for when they draw noise, without a trace of that.
+
+    Forward hooks are not called meanwhile. Networks are in evaluation mode: a batch normalisation of one row raises,
+    and one of several would count them.
 
     Args:
         filter: whose modules they are.
@@ -33,16 +36,17 @@ def recorded_draws(filter: nn.Module, parts: Sequence[tuple[str, SubModel]]) -> 
         own = [place] if place in places else [name for name, other in parts if other is part]  # in its own forward
         drawn.update(dict.fromkeys(own, (part, sizes)))
 
-    hooked = [(part, part._forward_hooks, part._forward_pre_hooks) for part in filter.modules()]
+    before = [(part, part._forward_hooks, part._forward_pre_hooks, part.training) for part in filter.modules()]
     RECORDERS.append(record)
     try:
-        for part, *_ in hooked:
+        for part, *_ in before:
             part._forward_hooks, part._forward_pre_hooks = OrderedDict(), OrderedDict()
+            part.training = part.training and isinstance(part, SubModel)  # whose noise may depend on it
         yield drawn
     finally:
         RECORDERS.remove(record)
-        for part, hooks, pre_hooks in hooked:
-            part._forward_hooks, part._forward_pre_hooks = hooks, pre_hooks
+        for part, hooks, pre_hooks, training in before:
+            part._forward_hooks, part._forward_pre_hooks, part.training = hooks, pre_hooks, training
 
 
 def draw_noise(

@@ -161,8 +161,9 @@ class FilterParts:
 def check_kind(name: str, value: object) -> None:
     """Raises a ``TypeError`` unless a ``sensor_error`` or a ``visibility`` is one, or ``None``."""
     kind, words = {"sensor_error": (SensorError, "FadingBias"), "visibility": (Visibility, "Visibility")}[name]
-    if value is not None and not isinstance(value, kind):
-        raise TypeError(f"{name} is a {words}, or None; got {type(value).__name__}")
+    if value is not None and (isinstance(value, type) or not isinstance(value, kind)):  # a class has the methods, too
+        got = value.__name__ if isinstance(value, type) else type(value).__name__
+        raise TypeError(f"{name} is a {words}, or None; got {'the class ' * isinstance(value, type)}{got}")
 
 
 def check_moments(owner: str, initial: TensorDictModuleBase) -> None:

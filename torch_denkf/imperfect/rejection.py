@@ -63,9 +63,10 @@ class RejectReadings(Checked, Transform):
             to ``False``.
 
     Raises:
-        ValueError: if ``masks`` is empty, another argument names a reading that is not in ``masks``, or ``on_bad`` is
-            unknown. In a call, if a mask is not boolean or of another shape; with ``on_bad="raise"``, if a reading is
-            bad.
+        TypeError: for a key that is none, a space that is none, or ``noises`` that are no dict.
+        ValueError: if ``masks`` is empty, another argument names a reading that is not in ``masks``, two entries have
+            one key, or ``on_bad`` is unknown. In a call, if a mask is not boolean or of another shape; with
+            ``on_bad="raise"``, if a reading is bad.
         KeyError: in a call, if a reading or its noise is missing.
 
     Example:
@@ -97,6 +98,9 @@ class RejectReadings(Checked, Transform):
             raise ValueError(f'masks says the mask of each reading, such as {{"gps": "gps_observed"}}; got {masks!r}')
         if on_bad not in get_args(OnBad):
             raise ValueError(f'on_bad is "mask" or "raise"; got {on_bad!r}')
+        for name, value in (("noises", noises), ("spaces", spaces)):
+            if value is not None and not isinstance(value, Mapping):
+                raise TypeError(f"{name} is a dict, from the key of a reading; got {type(value).__name__}")
         for key in (*masks, *masks.values(), *(noises or {}).values()):
             check_key("each name in masks and noises", key)
         masks = {unravel_key(key): unravel_key(mask) for key, mask in masks.items()}
@@ -107,6 +111,15 @@ class RejectReadings(Checked, Transform):
             unknown = [key for key in keys if key not in masks]
             if unknown:
                 raise ValueError(f"{name} names {unknown[0]!r}, of which masks says no mask; it has {list(masks)}")
+        for key, space in spaces.items():
+            if not isinstance(space, Space):
+                raise TypeError(f"the space of {key!r} is a Space, such as Circle(); got {space!r}")
+        numbers, marks = {*masks, *noises.values()}, {*masks.values()}
+        twice = (numbers & marks) | ((numbers | marks) & {unravel_key(count_key)})
+        if twice:
+            raise ValueError(
+                f"readings and noises, masks and the count need keys of their own; got {twice.pop()!r} twice"
+            )
         written = dict.fromkeys([*masks, *noises.values(), *masks.values()])
         super().__init__(in_keys=list(written), out_keys=list(dict.fromkeys([*written, unravel_key(count_key)])))
         #: The mask of each reading; :class:`~torch_denkf.transforms.DEnKFTransform` warns if its filter reads none.
