@@ -136,15 +136,8 @@ class Filter(Checked, TensorDictSequential):
         check_module("initial", initial)
         super().__init__(*modules)
         self.initial = initial
-        self._set_options(
-            control_keys,
-            init_key,
-            forecast_keys,
-            check_finite,
-            update_at_reset=update_at_reset,
-            variance_ceiling=variance_ceiling,
-            prefix=prefix,
-        )
+        fixed = {"update_at_reset": update_at_reset, "variance_ceiling": variance_ceiling, "prefix": prefix}
+        self._set_options(control_keys, init_key, forecast_keys, check_finite, **fixed)
         self.compiled: Any = None
         #: Called with the filter and a :class:`Record` of each run, before anything is written.
         self.observers: list[Observer] = diagnosis().default_observers()
@@ -341,9 +334,8 @@ class Filter(Checked, TensorDictSequential):
             kept = self.outer(previous_key(key))
             found[kept] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
         found[self.outer(KNOWN)] = Unbounded(shape=(1,), dtype=torch.bool, device=value.device)
-        return primers().LastAction(
-            {key: self.outer(previous_key(key)) for key in self.structure.controls}, primers=found
-        )
+        actions = {key: self.outer(previous_key(key)) for key in self.structure.controls}
+        return primers().LastAction(actions, primers=found)
 
     def compile(self, *, chunk: int = 4, **options) -> Filter:
         """From now on runs steps, and sequences in chunks of steps, through ``torch.compile``.
@@ -603,15 +595,9 @@ class Filter(Checked, TensorDictSequential):
             steps = steps._replace(update_at_reset=False)
         strategy = steps if self.compiled is None or gathered.resumed else self.compiled.of(self, steps)
         with set_recurrent_mode(False):
-            outputs = strategy.scan(
-                gathered.before,
-                gathered.inputs,
-                Call(torch.Size(size[:-1])),
-                gathered.begins,
-                gathered.starts,
-                cuts,
-                tuple(key for key in keep if key in structure.step_keys),
-            )[1]
+            kept, one = tuple(key for key in keep if key in structure.step_keys), Call(torch.Size(size[:-1]))
+            starts = gathered.begins, gathered.starts
+            outputs = strategy.scan(gathered.before, gathered.inputs, one, *starts, cuts, kept)[1]
         steps.blank(outputs, gathered.fresh)
         outputs.update({key: frames[key] for key in keep if key in frames})
         return self.finished(Record("sequence", tensordict, size, entries, outputs), given), rows
