@@ -32,4 +32,4 @@ class Once:
         """Warns the first time that ``about`` comes up."""
         if about not in self.said:
             self.said.add(about)
-            warnings.warn(f"{text} Said once.", stacklevel=5)
+            warnings.warn(f"{text} Said once.", stacklevel=6)
