@@ -68,6 +68,14 @@ class Processes:
         dist.broadcast_object_list(box, src=0)
         return box[0]
 
+    def any(self, here: bool) -> bool:
+        """Tells whether something is so in any of the processes; the same answer in all."""
+        if self.world_size == 1:
+            return here
+        count = torch.tensor(int(here), device=self.device)
+        dist.all_reduce(count)
+        return bool(count)
+
     def average_(self, parameters: Iterable[nn.Parameter], values: torch.Tensor) -> torch.Tensor:
         """Averages the gradients in place over the processes.
 
