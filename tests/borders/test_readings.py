@@ -130,7 +130,7 @@ def frames_of(name, *batch, value=float("nan"), masked=False):
 
 
 def rejecting(name, **options):
-    """What rejects bad readings in front of the filter of that name."""
+    """Returns the rejection of bad readings in front of the filter of that name."""
     _, key, by_component = FILTERS[name]
     return RejectReadings({key: "observed"}, by_component=[key] if by_component else [], **options)
 

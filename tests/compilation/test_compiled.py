@@ -160,7 +160,7 @@ def test_a_stochastic_analysis_of_a_users_own_compiles(float64):
 
 
 def test_a_first_call_that_resets_all_rows_is_compared_all_the_same():
-    """Where the belief is reset nothing of the transition shows, and one function serves all steps."""
+    """Looks at rows that go on: at a reset nothing of the transition shows, and one function serves all steps."""
 
     def wrong_after_a_step(graph, example):
         def run(*inputs):

@@ -140,7 +140,7 @@ def test_a_reading_that_a_start_does_not_use_may_be_anything(name, update_at_res
 @every_filter
 @pytest.mark.parametrize("update_at_reset", [False, True])
 def test_so_may_it_in_the_sequence_that_a_loss_filters(name, update_at_reset):
-    """Where an episode begins in a policy's data, and where a recording does; behind RejectReadings with gradients."""
+    """Compares at resets in a policy's data and in a recording; behind RejectReadings with gradients."""
     filter = FILTERS[name](update_at_reset=update_at_reset)
     data = policy_data(filter, anew=(0, 3))[0]
     recording = data.select("observation").set("is_init", torch.arange(7).eq(3).expand(2, 7).unsqueeze(-1))

@@ -110,7 +110,7 @@ class CompiledSteps:
             compiled = torch.compile(own, fullgraph=True, dynamic=False, **self._arguments(device))
             self._functions[kind] = compiled, set()
         function, compared = self._functions[kind]
-        mode = torch.is_grad_enabled(), some.dtype  # for each torch.compile compiles anew
+        mode = torch.is_grad_enabled(), some.dtype  # torch.compile compiles again for each
         if mode not in compared and has_values(some):
             refuse_other_numbers(
                 function,

@@ -66,7 +66,7 @@ def worth_checking(guards: Sequence) -> list[bool]:
 
 
 #: What the compiled functions close over, and never changes.
-_CLOSED_OVER = ("writes", "batch", "cuts", "first", "keep", "keys", "start_keys", "steps")
+_CLOSED_OVER = ("writes", "batch", "cuts", "keep", "keys", "start_keys", "steps")
 #: Attributes that hold the names of entries.
 _KEYS = frozenset({"in_keys", "_in_keys", "out_keys", "_out_keys_apparent", "optional_keys", "reading_keys", "_wants"})
 #: Where a filter's structure holds modules; all else in it are names.

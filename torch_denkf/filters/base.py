@@ -341,7 +341,7 @@ class Filter(Checked, TensorDictSequential):
         """From now on runs steps, and sequences in chunks of steps, through ``torch.compile``.
 
         The first call of each kind (chunk, batch size, with or without gradients) compiles, later ones reuse that;
-        copies and pickles of the filter compile anew. Noise is drawn outside, so a seed gives what it gives eagerly, up
+        copies and pickles of the filter compile again. Noise is drawn outside: a seed gives what it gives eagerly, up
         to rounding. Some calls stay eager: :meth:`predict`; ``step(without=...)``; in a policy, steps in which rows may
         reset, and sequences of its data.
 

@@ -261,7 +261,7 @@ class GatedAnalysis(Around):
         return {**out, **dict(zip((*self.state_keys, *self._further), own, strict=True))}
 
     def _analyse(self, entries: Entries, call: Call) -> Entries:
-        """What the analysis writes; an ensemble's predictions and reading are plain numbers already."""
+        """Returns what the analysis writes; an ensemble's predictions and reading are plain numbers already."""
         return (self.module.on_aligned if self.of_ensemble else self.module.on_entries)(entries, call)
 
     def _with_noise(self, entries: Entries, call: Call) -> Entries:

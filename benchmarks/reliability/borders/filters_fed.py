@@ -111,7 +111,7 @@ def _stepped(filter: Filter, frames: TensorDict) -> TensorDict:
 
 
 def _front(filter: Any, on_bad: OnBad) -> RejectReadings:
-    """What judges the readings of a filter in front of it."""
+    """Returns the module in front of a filter that checks its readings."""
     reading = "measurement" if "measurement" in getattr(filter, "in_keys", ()) else "observation"
     return RejectReadings({reading: "observed"}, on_bad=on_bad)
 
