@@ -62,6 +62,12 @@ def semidefinite_root(cov: Tensor) -> Tensor:
     return std.unsqueeze(-1) * cholesky(correlation)
 
 
+def cholesky_of_correlation(cov: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the Cholesky factor of the correlations ``[*B, N, N]``, and 1 / the standard deviations, 0 for none."""
+    correlation, _, inverse = _correlation(cov)
+    return cholesky(correlation), inverse
+
+
 def semidefinite_solve(cov: Tensor, right: Tensor) -> Tensor:
     """Solve P X = Y for a covariance P, also a singular one; X then is one of the solutions.
 

@@ -30,6 +30,7 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_values
 from torch_denkf.beliefs import is_samples
 from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.modules.around import AroundInitial, Wrapper
 from torch_denkf.modules.process_noise import as_process_noise
@@ -391,7 +392,8 @@ class BiasedBelief(AroundInitial):
         if "ensemble" in names:
             ensemble = written[names["ensemble"]]
             noise = cast(Tensor, self._noise(entries, [ensemble], call._replace(sample=True)))
-            ensemble = torch.cat([ensemble, std.to(ensemble.dtype) * noise.to(ensemble.dtype)], -1)
+            noise = exact_draws(noise.to(ensemble.dtype), ensemble)
+            ensemble = torch.cat([ensemble, std.to(ensemble.dtype) * noise], -1)
             mean = ensemble_mean(ensemble)
             now = {"ensemble": ensemble, "mean": mean, "var": ensemble_var(ensemble, mean)}
         else:

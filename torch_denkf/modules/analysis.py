@@ -9,6 +9,7 @@ import torch
 
 from torch_denkf._checks import check_choice, check_values
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.functional.moments import ensemble_cov
@@ -44,6 +45,7 @@ class EnsembleAnalysis(EnsembleUpdate):
             :mod:`torch_denkf.functional.manifolds`.
         reading_space: in which the reading lives, such as ``Circle()`` for an angle; innovation and R are tangents.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
+        draws: of ``"perturbed"``, ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.exact_draws`.
         **keys: see :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs
             learned observations, not one reading.
 
@@ -78,6 +80,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         space: Space | None = None,
         reading_space: Space | None = None,
         covariance: bool = False,
+        draws: Literal["exact", "random"] = "exact",
         **keys: Unpack[EnsembleAnalysisKeys],
     ):
         pair = isinstance(taper, tuple) and len(taper) == 2 and all(isinstance(part, torch.Tensor) for part in taper)
@@ -100,6 +103,8 @@ class EnsembleAnalysis(EnsembleUpdate):
             **keys,
         )
         check_dims("inflated", inflated or [])
+        check_choice("draws", draws, ("exact", "random"))
+        self.exact = draws == "exact"
         self.inflated = None if inflated is None else list(inflated)
         self.scheme, self.covariance = scheme, covariance
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
@@ -122,6 +127,19 @@ class EnsembleAnalysis(EnsembleUpdate):
             shape = (*batch_size, members, observation_dim)
             return torch.randn(shape, device=device, dtype=dtype, generator=generator)
         return None
+
+    def _noise(self, entries, values, call):
+        """Makes perturbations exact here, so that :meth:`compute` and :meth:`move_past` have the same ones."""
+        noise = super()._noise(entries, values, call)
+        if self.scheme != "perturbed" or not self.exact or noise is None or noise.shape[-1] >= noise.shape[-2]:
+            return noise
+        forecast, predicted = values[:2]
+        if self.space is not None:
+            forecast = self.space.minus(forecast, self.space.near(forecast).unsqueeze(-2))
+        size = noise.shape[-2]
+        return (
+            exact_draws(noise, predicted, forecast) * ((size - 1) / size) ** 0.5
+        )  # analyse() takes a sample of N(0, I)
 
     def noise_sizes(self, forecast, predicted, *_):
         """E and O, from the ensemble and its predicted observations."""

@@ -3,14 +3,16 @@ r"""Initial beliefs: the first ensemble :math:`X_0 = [x^1_0, \dots, x^E_0]` of a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, unravel_key
 from torch import nn
 
-from torch_denkf._checks import check_count, check_values
+from torch_denkf._checks import check_choice, check_count, check_values
 from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.tensors import (
     as_floating,
@@ -35,6 +37,7 @@ class _InitialEnsemble(Initial):
         out_keys: Sequence[NestedKey],
         optional_keys: Sequence[NestedKey] = (),
         space: Space | None = None,
+        draws: Literal["exact", "random"] = "exact",
     ):
         super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=optional_keys)
         std = as_standard_deviations("std", std)
@@ -42,6 +45,8 @@ class _InitialEnsemble(Initial):
         if space is not None:
             space.check(tangent=std)
         check_count("ensemble_size", ensemble_size, least=2, cure="One member has no variance")
+        check_choice("draws", draws, ("exact", "random"))
+        self.exact = draws == "exact"
         self.register_buffer("std", std)
         self.ensemble_size, self.state_dim = ensemble_size, std.numel()
 
@@ -56,7 +61,8 @@ class _InitialEnsemble(Initial):
         """Ensemble, mean and variance."""
         if noise is None:
             noise = self.draw_noise(batch_size, device=center.device, dtype=center.dtype)
-        away = std.unsqueeze(-2) * noise.to(center.dtype)
+        noise = noise.to(center.dtype)
+        away = std.unsqueeze(-2) * (exact_draws(noise) if self.exact else noise)
         if self.space is not None:
             ensemble = self.space.plus(center.unsqueeze(-2), away)
             return ensemble, *moments_on(self.space, ensemble)
@@ -75,6 +81,7 @@ class GaussianPrior(_InitialEnsemble):
         std: standard deviations ``[S]``.
         ensemble_size: E.
         space: in which the state lives; ``None`` for plain numbers. ``mean`` is a point, ``std`` is of the tangents.
+        draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.exact_draws`.
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
 
     Example:
@@ -91,9 +98,10 @@ class GaussianPrior(_InitialEnsemble):
         *,
         ensemble_size: int = 32,
         space: Space | None = None,
+        draws: Literal["exact", "random"] = "exact",
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
-        super().__init__(std, ensemble_size, [], out_keys, space=space)
+        super().__init__(std, ensemble_size, [], out_keys, space=space, draws=draws)
         mean = as_floating(mean, "mean")
         if space is not None:
             space.check(mean=mean)
@@ -115,6 +123,7 @@ class AroundState(_InitialEnsemble):
         ensemble_size: E.
         state_key: the known state ``[*B, S]``.
         space: in which the state lives; ``None`` for plain numbers. ``std`` is of the tangents.
+        draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.exact_draws`.
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
 
     Raises:
@@ -134,9 +143,10 @@ class AroundState(_InitialEnsemble):
         ensemble_size: int = 32,
         state_key: NestedKey = "state",
         space: Space | None = None,
+        draws: Literal["exact", "random"] = "exact",
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
-        super().__init__(std, ensemble_size, [state_key], out_keys, space=space)
+        super().__init__(std, ensemble_size, [state_key], out_keys, space=space, draws=draws)
         if space is not None:
             self.input_dim = space.point_dim
 
@@ -158,6 +168,7 @@ class FromSensor(_InitialEnsemble):
         observation_key: learned observations ``[*B, E, O]`` or a reading ``[*B, O]``.
         noise_variance_key: variances ``[*B, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
+        draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.exact_draws`.
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
 
     Raises:
@@ -181,9 +192,12 @@ class FromSensor(_InitialEnsemble):
         observation_key: NestedKey = ("sensor", "ensemble"),
         noise_variance_key: NestedKey = ("sensor", "noise"),
         observed_key: NestedKey = "observed",
+        draws: Literal["exact", "random"] = "exact",
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
-        super().__init__(std, ensemble_size, [observation_key, noise_variance_key], out_keys, [observed_key])
+        super().__init__(
+            std, ensemble_size, [observation_key, noise_variance_key], out_keys, [observed_key], draws=draws
+        )
         register_location(self, "mean", mean)
         check_dims("dims", dims, once=True, size=self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)

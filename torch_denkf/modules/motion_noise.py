@@ -3,13 +3,15 @@ r"""Process noise of an ensemble, where the transition has none or too little of
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Literal, cast
 
 import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_choice
+from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.weighted import weighted_mean
@@ -42,6 +44,8 @@ class NoisyTransition(Transition):
         forecast_mean_key: the mean of the forecast before the noise, ``[*B, S]``.
         log_weight_key: optional log-weights of the belief ``[*B, E]``.
         space: in which the state lives; ``None`` for plain numbers. Noise and ``dims`` are of the tangents.
+        draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.exact_draws`; those of weighted particles
+            are random.
 
     Raises:
         KeyError: if an entry is missing.
@@ -74,6 +78,7 @@ class NoisyTransition(Transition):
         forecast_mean_key: NestedKey = ("forecast", "mean"),
         log_weight_key: NestedKey = ("belief", "log_weight"),
         space: Space | None = None,
+        draws: Literal["exact", "random"] = "exact",
     ):
         check_module("transition", transition)
         check_module("noise", noise)
@@ -89,6 +94,8 @@ class NoisyTransition(Transition):
         self.log_weight_key, self.space = unravel_key(log_weight_key), check_space("space", space)
         self.before, self.mean_key, self.forecast_mean_key = before, *map(unravel_key, (mean_key, forecast_mean_key))
         check_dims("dims", dims or (), once=True)
+        check_choice("draws", draws, ("exact", "random"))
+        self.exact = draws == "exact"
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
 
     def draw_noise(self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_):
@@ -146,6 +153,9 @@ class NoisyTransition(Transition):
         if normal is None:
             return ensemble
         normal = normal[..., :size]  # a point may have more numbers than its tangent
+        if self.exact and self.log_weight_key not in entries:
+            near = 0 if self.space is None else self.space.near(ensemble).unsqueeze(-2)
+            normal = exact_draws(normal, ensemble if self.space is None else self.space.minus(ensemble, near))
         if covariance.ndim == len(call.batch_size) + 1:
             noise = covariance.sqrt().unsqueeze(-2) * normal
         else:

@@ -25,7 +25,13 @@ from torch.nn import functional as F
 
 from torch_denkf._checks import check_choice, check_count, check_number
 from torch_denkf.functional.kernels.dropped_relu import dropped_relu
-from torch_denkf.functional.kernels.random_bits import dropout_factor, random_bytes, random_signs, representable_rate
+from torch_denkf.functional.kernels.random_bits import (
+    balanced_bytes,
+    dropout_factor,
+    random_bytes,
+    random_signs,
+    representable_rate,
+)
 
 __all__ = ["FlipoutLinear", "StochasticMLP", "deterministic"]
 
@@ -114,6 +120,8 @@ class StochasticMLP(nn.Module):
         activation: the non-linearity of hidden layers, ReLU by default.
         output_gain: factor on the last layer's initial weights; a small one starts a residual model near the
             identity, zero starts it there.
+        balanced: whether each unit is dropped in the same share of an ensemble's members, drawn without replacement
+            (``"dropout"``); its mean is then nearer to that of infinitely many members. ``False`` for independent draws.
 
     Shapes:
         input ``[*, in_features]``, output ``[*, out_features]``. Noise: for dropout, uint8 random bytes
@@ -142,6 +150,7 @@ class StochasticMLP(nn.Module):
         posterior_std: float = 0.05,
         activation: Callable[[], nn.Module] = nn.ReLU,
         output_gain: float = 1.0,
+        balanced: bool = True,
     ):
         check_number("posterior_std", posterior_std, above=0)
         super().__init__()
@@ -151,7 +160,7 @@ class StochasticMLP(nn.Module):
         for size in num_cells:
             check_count("num_cells", size, cure=f"It holds the widths of the hidden layers: {list(num_cells)}")
         check_number("output_gain", output_gain)
-        self.layer, self.rate = layer, representable_rate(rate)
+        self.layer, self.rate, self.balanced = layer, representable_rate(rate), balanced
         self.sample = True
         sizes = [in_features, *num_cells, out_features]
         self.in_features, self.out_features = in_features, out_features
@@ -203,6 +212,8 @@ class StochasticMLP(nn.Module):
         if not self.noise_size:
             return None
         rows = (*batch_size, *members, self.noise_size)
+        if self.layer == "dropout" and members and self.balanced:
+            return balanced_bytes(rows[:-2], *rows[-2:], device=device, generator=generator)
         if self.layer == "dropout":
             return random_bytes(rows, device=device, generator=generator)
         size = sum(self._perturbation_sizes())
@@ -223,7 +234,7 @@ class StochasticMLP(nn.Module):
         """
         sample = self.sample if sample is None else sample
         if sample and noise is None and self.noise_size:
-            noise = self.draw_noise((), *x.shape[:-1], device=x.device, dtype=x.dtype)
+            noise = self.draw_noise(x.shape[:-1], device=x.device, dtype=x.dtype)
         run: Sequence[tuple[Callable[..., torch.Tensor], torch.Tensor | None]]
         if self.layer == "flipout":
             run = self._flipout(noise) if sample else [(partial(layer, sample=False), None) for layer in self.layers]

@@ -1,0 +1,99 @@
+"""Draws that are exact to second order, against the moments that they are to have."""
+
+import pytest
+import torch
+
+from torch_denkf.functional.draws import exact_draws
+from torch_denkf.functional.kernels.random_bits import balanced_bytes
+
+
+def correlated(members, dim, batch=(50,), scale=1.0):
+    return torch.randn(*batch, members, dim) @ torch.randn(dim, dim) * scale + 5
+
+
+@pytest.mark.parametrize(("members", "dim", "state"), [(32, 2, 5), (32, 5, 5), (64, 20, 20), (9, 2, 5), (3, 2, 0)])
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e4])
+def test_mean_covariance_and_correlations_are_exact(members, dim, state, scale, float64):
+    ensemble = correlated(members, state, scale=scale) if state else None
+    draws = exact_draws(torch.randn(50, members, dim), *([] if ensemble is None else [ensemble]))
+    assert draws.mean(-2).abs().max() < 1e-9
+    torch.testing.assert_close(draws.mT @ draws / (members - 1), torch.eye(dim).expand(50, -1, -1), atol=1e-7, rtol=0)
+    if ensemble is not None:
+        anomalies = ensemble - ensemble.mean(-2, keepdim=True)
+        anomalies = anomalies / anomalies.std(-2, keepdim=True)
+        assert (draws.mT @ anomalies).abs().max() / (members - 1) < 1e-5  # the ridge of rank-deficient members
+
+
+@pytest.mark.parametrize(
+    ("members", "dim", "state"), [(32, 5, 5), (8, 3, 6), (8, 6, 6), (8, 7, 3), (6, 9, 4), (4, 3, 40)]
+)
+def test_with_few_members_they_are_never_worse_than_random_ones(members, dim, state):
+    ensemble = correlated(members, state, (2000,))
+    anomalies = ensemble - ensemble.mean(-2, keepdim=True)
+    q, errors = torch.eye(dim), []
+    for draws in (torch.randn(2000, members, dim), None):
+        draws = exact_draws(torch.randn(2000, members, dim), ensemble) if draws is None else draws
+        away = draws - draws.mean(-2, keepdim=True)
+        moved, before = anomalies @ torch.ones(state, dim), anomalies.mT @ anomalies
+        total = (moved + away).mT @ (moved + away) - moved.mT @ moved
+        assert before.isfinite().all()
+        errors.append(
+            torch.stack(
+                [
+                    draws.mean(-2).square().mean(),
+                    (total / (members - 1) - q).square().mean(),
+                    (away.mT @ away / (members - 1) - q).square().mean(),
+                ]
+            )
+        )
+    assert (errors[1] <= 1.05 * errors[0] + 1e-6).all()  # of 2,000 rows each sum is known to 3 %
+
+
+def test_each_draw_is_standard_normal_beside_many_members():
+    """A third moment of 0, a fourth of nearly 3, and no correlation from member to member but -1 / (E - 1)."""
+    draws = exact_draws(torch.randn(20_000, 32, 2))
+    assert abs(draws.pow(3).mean()) < 0.01
+    assert abs(draws.pow(4).mean() - 3 * 31 / 33 * (31 / 32) ** 2) < 0.02  # of a coordinate on a sphere
+    assert abs((draws[:, 0] * draws[:, 1]).mean() + 1 / 32) < 0.01
+
+
+def test_members_without_spread_and_draws_without_spread():
+    alike = torch.ones(32, 3)
+    draws = exact_draws(torch.randn(32, 2), alike)
+    torch.testing.assert_close(draws.mT @ draws / 31, torch.eye(2), atol=1e-4, rtol=0)
+    assert exact_draws(torch.zeros(32, 2), torch.randn(32, 3)).eq(0).all()
+    half = torch.stack([torch.randn(32), torch.zeros(32)], -1)
+    assert exact_draws(half)[:, 1].eq(0).all()
+    torch.testing.assert_close(exact_draws(half)[:, 0].square().sum() / 31, torch.tensor(1.0), atol=1e-4, rtol=0)
+
+
+def test_the_gradient_is_that_of_finite_differences(float64):
+    normal, ensemble = torch.randn(2, 8, 2), torch.randn(2, 8, 3, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda members: exact_draws(normal, members), ensemble, atol=1e-5)
+
+
+def test_rows_of_a_batch_do_not_know_of_each_other(float64):
+    normal, ensemble = torch.randn(3, 16, 2), torch.randn(3, 16, 4)
+    whole = exact_draws(normal, ensemble)
+    for row in range(3):
+        torch.testing.assert_close(whole[row], exact_draws(normal[row], ensemble[row]))
+
+
+@pytest.mark.parametrize("members", [2, 5, 16, 30, 32, 64, 100, 512])
+def test_each_unit_is_dropped_in_the_same_share_of_the_members(members):
+    draws = balanced_bytes((20,), members, 300)
+    dropped = (draws < 26).sum(-2)
+    share = 26 / 256 * members
+    assert dropped.min() >= int(share)
+    assert dropped.max() <= -(-26 * members // 256)
+    assert abs((draws < 26).float().mean() - 26 / 256) < 4 * (0.25 / (20 * 300 * members)) ** 0.5 + 0.01
+    single = balanced_bytes((20_000,), members, 1)[:, 0, 0].double()  # one byte by itself is uniform
+    assert abs(single.mean() - 127.5) < 4 * 73.9 / 20_000**0.5
+    assert abs(single.var() / 5461.25 - 1) < 0.04
+
+
+def test_units_are_dropped_independently_of_each_other():
+    dropped = (balanced_bytes((4000,), 32, 8) < 64).double()
+    joint = (dropped.mT @ dropped / 32).mean(0)
+    off = joint[~torch.eye(8, dtype=torch.bool)]
+    assert (off - 1 / 16).abs().max() < 0.004  # of 4000 x 32 pairs, four standard deviations
