@@ -52,7 +52,7 @@ def test_equals_the_function(float64, scheme, batch, masked):
     if noise is not None:
         td["noise", "self"] = noise
     result = expected(td, scheme, perturbation=noise)
-    out = EnsembleAnalysis(scheme)(td)
+    out = EnsembleAnalysis(scheme, draws="random")(td)
     assert_belief(out, result.ensemble)
     for name in ("innovation", "nis", "log_likelihood"):
         assert out["info", name].equal(getattr(result, name))
@@ -82,7 +82,7 @@ def test_rotation_given_and_drawn(float64):
 
 @pytest.mark.parametrize("scheme", ["perturbed", "etkf"])
 def test_bulk_noise_is_what_a_step_would_use(float64, scheme):
-    module = EnsembleAnalysis(scheme, rotate=scheme == "etkf")
+    module = EnsembleAnalysis(scheme, rotate=scheme == "etkf", draws="random")
     td = inputs()
     noise = module.draw_noise([3], members=E, observation_dim=OBS, dtype=torch.float64)
     first = module(td.copy().set(("noise", "self"), noise))["belief", "ensemble"]

@@ -5,6 +5,8 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.factories import linear_denkf
+from torch_denkf.functional.draws import exact_draws
+from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.modules import AroundState, FromSensor, GaussianPrior
 
 E = 40_000
@@ -98,8 +100,19 @@ class TestFromSensor:
 def test_noise_given(float64):
     noise = torch.randn(3, 4, 2)
     td = TensorDict({("noise", "self"): noise}, [3])
-    out = GaussianPrior([1.0, 2.0], [3.0, 4.0], ensemble_size=4)(td)["belief", "ensemble"]
-    assert out.equal(torch.tensor([1.0, 2.0]) + torch.tensor([3.0, 4.0]) * noise)
+    mean, std = torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0])
+    for draws, expected in (("random", noise), ("exact", exact_draws(noise))):
+        out = GaussianPrior(mean, std, ensemble_size=4, draws=draws)(td.copy())["belief", "ensemble"]
+        assert out.equal(mean + std * expected)
+
+
+@pytest.mark.parametrize("batch", [[], [3]])
+def test_the_first_ensemble_has_the_priors_moments(float64, batch):
+    td = GaussianPrior([1.0, 2.0], [3.0, 4.0], ensemble_size=8)(TensorDict({}, batch))
+    torch.testing.assert_close(td["belief", "mean"], torch.tensor([1.0, 2.0]).expand(*batch, 2))
+    torch.testing.assert_close(
+        ensemble_cov(td["belief", "ensemble"]), torch.tensor([[9.0, 0], [0, 16]]).expand(*batch, 2, 2)
+    )
 
 
 def test_gradient_through_a_trainable_center(float64):

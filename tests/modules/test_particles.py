@@ -128,7 +128,7 @@ def test_motion_noise_before_the_motion_moves_the_pose():
 def test_noise_model_reads_the_weighted_mean(weights):
     model = DiagonalNoise(1, in_features=S, num_cells=(4,), in_key=("belief", "mean"), out_key=("forecast", "q"))
     torch.nn.init.normal_(model.module.layers[-1].weight)
-    noisy = NoisyTransition(shift(), model, [1])
+    noisy = NoisyTransition(shift(), model, [1], draws="random")
     assert noisy.in_keys == [("belief", "ensemble")]
     td = belief((4,)) if weights else belief((4,)).exclude(("belief", "log_weight"))
     td["belief", "mean"] = torch.full((4, S), torch.nan)  # whatever it was before

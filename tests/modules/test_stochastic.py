@@ -146,12 +146,12 @@ class TestBothKinds:
         torch.manual_seed(1)
         drawn = net(x)
         torch.manual_seed(1)
-        noise = net.draw_noise([6], 4) if layer == "dropout" else net.draw_noise([6, 4])
+        noise = net.draw_noise([6, 4])
         assert net(x, noise).equal(drawn)
         assert net(x, noise).equal(net(x, noise))
 
     def test_members_are_uncorrelated(self, layer):
-        net = StochasticMLP(3, 1, (8,), layer=layer, rate=0.3, posterior_std=0.3)
+        net = StochasticMLP(3, 1, (8,), layer=layer, rate=0.3, posterior_std=0.3, balanced=False)
         x = torch.randn(3).expand(2, 3)
         with torch.no_grad():
             if layer == "dropout":

@@ -17,7 +17,7 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
     1 / sqrt(E). An ensemble that adds them up in each step is far from what its Q says. Exact draws do not; for a
     linear Gaussian system such an ensemble is the Kalman filter.
 
-    For all three E must be at least q + S + 2. With fewer members mean and covariance are exact, and the draws
+    For all three E must be at least S + 5/4 q + 3. With fewer members mean and covariance are exact, and the draws
     uncorrelated with as many leading directions of the members as there is room for; with E <= q the mean alone is.
 
     Args:
@@ -42,8 +42,8 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
     draws = normal - normal.mean(-2, keepdim=True)
     if dim >= size:
         return draws
-    room = size - 1 - dim
-    if uncorrelated and room:
+    room = size - 1 - dim - (2 + dim // 4)  # q draws of just q dimensions are nearly dependent: scaling up their rounding
+    if uncorrelated and room > 0:
         away = torch.cat([members - members.mean(-2, keepdim=True) for members in uncorrelated], -1).to(draws.dtype)
         if away.shape[-1] > room:
             away = _leading(away, room)

@@ -1,0 +1,201 @@
+"""Oracle: the Kalman filter, which an ensemble with exact draws is on linear systems, whatever was drawn."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from torch_denkf.filters import DEnKF, KalmanFilter
+from torch_denkf.functional.manifolds import SO3, Circle, Euclidean
+from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.imperfect import FadingBias
+from torch_denkf.modules import (
+    AroundState,
+    ConstantNoise,
+    EnsembleAnalysis,
+    GaussianPrior,
+    LearnedObservation,
+    LearnedTransition,
+    NoisyTransition,
+)
+from torch_denkf.smoothers import FixedLag
+
+E, S, T = 16, 3, 12
+Q = torch.tensor([0.3, 0.0, 0.1], dtype=torch.float64)
+R = torch.tensor([0.5, 0.2], dtype=torch.float64)
+
+
+@pytest.fixture(autouse=True)
+def double(float64):
+    """All in double precision: then the two are equal to rounding."""
+
+
+def system():
+    f = torch.tensor([[0.9, 0.3, 0.0], [-0.3, 0.9, 0.2], [0.0, 0.0, 0.95]])
+    return f, torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.5, 1.0]])
+
+
+def linear(matrix):
+    layer = nn.Linear(*matrix.shape[::-1], bias=False)
+    layer.weight = nn.Parameter(matrix.clone())
+    return layer
+
+
+def parts(members=E):
+    f, h = system()
+    return {
+        "transition": LearnedTransition(linear(f - torch.eye(S))),
+        "observation": LearnedObservation(linear(h)),
+        "initial": GaussianPrior(torch.ones(S), torch.tensor([1.0, 2.0, 0.5]), ensemble_size=members),
+    }
+
+
+def kalman(**kwargs):
+    f, h = system()
+    prior = {"mean": torch.ones(S), "cov": torch.tensor([1.0, 2.0, 0.5]).square().diag()}
+    return KalmanFilter(f, h, process_noise=Q, noise=R, observation_key="reading", **prior, **kwargs)
+
+
+def frames():
+    data = TensorDict({"reading": torch.randn(4, T, 2)}, [4, T])
+    data["observed"] = torch.rand(4, T, 2) < 0.7
+    data["is_init"] = torch.zeros(4, T, 1, dtype=torch.bool)
+    data["is_init"][1, 5] = True
+    return data
+
+
+def denkf(scheme, **kwargs):
+    made = parts()
+    return DEnKF(
+        made["transition"],
+        None,
+        made["observation"],
+        ConstantNoise(R, in_key="reading"),
+        EnsembleAnalysis(scheme, observation_key="reading"),
+        initial=made["initial"],
+        process_noise=Q,
+        **kwargs,
+    )
+
+
+def assert_is_kalman(out, oracle, atol):
+    torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=atol)
+    torch.testing.assert_close(ensemble_cov(out["belief", "ensemble"]), oracle["belief", "cov"], rtol=0, atol=atol)
+    for name in ("nis", "log_likelihood"):
+        torch.testing.assert_close(out["info", name], oracle["info", name], rtol=0, atol=10 * atol)
+
+
+@pytest.mark.parametrize("scheme", ["etkf", "perturbed"])
+def test_is_the_kalman_filter(scheme):
+    data = frames()
+    assert_is_kalman(denkf(scheme).sequence(data.copy()), kalman().sequence(data), 1e-9)
+
+
+@pytest.mark.parametrize("scheme", ["etkf", "perturbed"])
+def test_steps_are_the_kalman_filter(scheme):
+    data, filter = frames()[:, :4], denkf(scheme)
+    row = filter.initialise(data[:, 0].copy())
+    expected = kalman().initialise(data[:, 0].copy())
+    for t in range(4):
+        row = filter.step(row.update(data[:, t].select("reading", "observed")))
+        expected = kalman().step(expected.update(data[:, t].select("reading", "observed")))
+        torch.testing.assert_close(row["belief", "mean"], expected["belief", "mean"], rtol=0, atol=1e-9)
+
+
+def test_with_errors_of_the_sensor():
+    data = frames()
+
+    def bias():
+        return FadingBias([0.4, 0.7], time=5.0, trainable=False)
+
+    oracle = kalman(sensor_error=bias()).sequence(data.copy())
+    out = denkf("etkf", sensor_error=bias()).sequence(data)
+    torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-8)
+    torch.testing.assert_close(ensemble_cov(out["belief", "ensemble"]), oracle["belief", "cov"], rtol=0, atol=1e-8)
+
+
+def test_of_several_sensors():
+    data, made = frames().exclude("observed"), parts(members=24)
+    rows = system()[1]
+    sensors = {
+        name: FusedSensor(LearnedObservation(linear(row[None])), r[None], observation_key=name)
+        for name, row, r in zip("ab", rows, R, strict=True)
+    }
+    data["a"], data["b"] = data["reading"].split(1, -1)
+    fused = FusedFilter(made["transition"], sensors, initial=made["initial"], process_noise=Q)
+    out, oracle = fused.sequence(data.copy()), kalman().sequence(data)
+    torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
+
+
+def test_a_lag_leaves_the_belief_exact():
+    data = frames()
+    out, oracle = FixedLag(denkf("perturbed"), 2).sequence(data.copy()), kalman().sequence(data)
+    torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
+
+
+def test_noise_of_some_dimensions_before_and_behind_the_motion():
+    f, _ = system()
+    ensemble = torch.randn(5, E, S)
+    td = TensorDict({("belief", "ensemble"): ensemble}, [5])
+    noise = ConstantNoise(torch.tensor([0.7]), in_key=("belief", "ensemble"))
+    q = torch.zeros(S, S)
+    q[2, 2] = 0.49
+    moved = ensemble_cov(ensemble)
+    for before, expected in ((False, f @ moved @ f.T + q), (True, f @ (moved + q) @ f.T)):
+        noisy = NoisyTransition(LearnedTransition(linear(f - torch.eye(S))), noise, [2], before=before)
+        out = noisy(td.copy())["forecast", "ensemble"]
+        torch.testing.assert_close(ensemble_cov(out), expected, rtol=0, atol=1e-10)
+        torch.testing.assert_close(out.mean(-2), ensemble.mean(-2) @ f.T, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("space", [Euclidean(1) * Circle(), SO3()])
+def test_on_a_space_the_tangents_have_the_moments(space):
+    """Members that are spread little: the covariance of the tangents grows by Q, to second order of the spread."""
+    std = torch.full((space.tangent_dim,), 1e-3)
+    start = AroundState(std, ensemble_size=E, space=space)
+    point = space.plus(
+        torch.zeros(space.point_dim).index_fill(0, torch.tensor([0]), 1.0), torch.zeros(space.tangent_dim)
+    )
+    td = start(TensorDict({"state": point}))
+    noisy = NoisyTransition(
+        Still(), ConstantNoise(2 * std, in_key=("belief", "mean"), out_key=("forecast", "noise")), space=space
+    )
+    out = noisy(td)["forecast", "ensemble"]
+    tangents = space.minus(out, point)
+    assert tangents.mean(-2).abs().max() < 1e-6
+    torch.testing.assert_close(ensemble_cov(tangents), 5e-6 * torch.eye(len(std)), rtol=0, atol=5e-9)
+
+
+class Still(nn.Module):
+    """A motion that is none."""
+
+    in_keys = [("belief", "ensemble")]  # noqa: RUF012
+    out_keys = [("forecast", "ensemble")]  # noqa: RUF012
+
+    def forward(self, td):
+        return td.set(("forecast", "ensemble"), td["belief", "ensemble"])
+
+
+def test_random_draws_stay_what_they_were():
+    td = TensorDict({("belief", "ensemble"): torch.randn(E, S), ("noise", "self"): torch.randn(E, S)})
+    noise = ConstantNoise(Q, in_key=("belief", "ensemble"))
+    noisy = NoisyTransition(LearnedTransition(nn.Linear(S, S)), noise, draws="random")
+    plain = noisy.module["transition"](td.copy())["forecast", "ensemble"]
+    out = noisy(td.copy())["forecast", "ensemble"]
+    torch.testing.assert_close(out, plain + Q * td["noise", "self"])
+    with pytest.raises(ValueError, match="draws"):
+        NoisyTransition(LearnedTransition(nn.Linear(S, S)), noise, draws="exactly")
+
+
+def test_weighted_particles_draw_at_random():
+    td = TensorDict({("belief", "ensemble"): torch.zeros(E, S), ("belief", "log_weight"): torch.zeros(E)})
+    td["noise", "self"] = torch.ones(E, S)
+    noisy = NoisyTransition(still(), ConstantNoise(torch.ones(S), in_key=("belief", "ensemble")))
+    assert noisy(td)["forecast", "ensemble"].eq(1).all()
+
+
+def still():
+    return LearnedTransition(
+        nn.Linear(S, S, bias=False).requires_grad_(False).apply(lambda layer: layer.weight.zero_())
+    )
