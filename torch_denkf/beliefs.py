@@ -149,8 +149,10 @@ class Ensemble(Belief):
     def derived(self, name, *carried):
         """Computes mean, variances and covariance of the sample."""
         (ensemble,) = carried
-        if self.space is not None and name in _SUMMARIES:
-            return moments_on(self.space, ensemble)[_SUMMARIES.index(name)]
+        if self.space is not None and name == "mean":
+            return self.space.mean(ensemble)
+        if self.space is not None:
+            ensemble = self.space.minus(ensemble, self.space.mean(ensemble).unsqueeze(-2))
         sample = {"mean": ensemble_mean, "var": ensemble_var, "cov": ensemble_cov}.get(name)
         return None if sample is None else sample(ensemble)
 

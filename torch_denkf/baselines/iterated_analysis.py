@@ -18,6 +18,7 @@ from torch_denkf.functional.smoothing.iterated import iterated_smoothing
 from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.gaussian import further_keys
 from torch_denkf.modules.motion_noise import NoisyTransition
+from torch_denkf.modules.spaces import mean_reading, told
 from torch_denkf.running import check_module, random_parts, run_module
 from torch_denkf.smoothers.past import moments_of
 from torch_denkf.submodel import Call, Entries, Update, flat_noise
@@ -144,11 +145,12 @@ class IteratedAnalysis(Update):
         """The belief, the smoothed belief, and the diagnostics."""
         ensemble, reading, variance = (self.required(entries, key) for key in self.in_keys[:3])
         space, on = self.space, self.reading_space
+        observed = told(on, entries.get(self.observed_key))
         if reading.ndim == ensemble.ndim:
-            reading = reading.mean(-2) if on is None else on.mean(reading)
+            reading = mean_reading(on, reading, observed)
         center = ensemble[..., :1, :] if space is None else space.mean(ensemble).unsqueeze(-2)
         start = ensemble if space is None else space.minus(ensemble, center)
-        observed, dim = entries.get(self.observed_key), start.shape[-1]
+        dim = start.shape[-1]
         noise = self._motion_noise(entries, start, call)
         whole = torch.cat([start, *noise.values()], -1)
 

@@ -16,7 +16,7 @@ from torchrl.envs.transforms import Transform
 from torch_denkf._arguments import Checked, check_key
 from torch_denkf._checks import check_mask, check_number, flag_value
 from torch_denkf.diagnosis import entry_of
-from torch_denkf.functional.manifolds import Euclidean, Space, places_of
+from torch_denkf.functional.manifolds import Space, places_of
 from torch_denkf.submodel import Entries
 
 __all__ = ["RejectReadings"]
@@ -272,7 +272,7 @@ def _whole_parts(space: Space, points: Tensor, tangents: Tensor | None) -> tuple
     parts: list[tuple[Tensor, Tensor]] = []
     for place in places_of(space):
         point, tangent = points[..., place.point], None if tangents is None else tangents[..., place.tangent]
-        if isinstance(place.space, Euclidean):
+        if place.space.flat is not None:
             known = point if tangent is None else point & tangent
             parts.append((known, known))
             continue

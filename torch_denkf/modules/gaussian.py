@@ -13,7 +13,7 @@ from torch import nn
 from torch_denkf._checks import check_number
 from torch_denkf.functional.gaussian import GaussianUpdate
 from torch_denkf.functional.manifolds import Space, check_space, is_flat
-from torch_denkf.modules._spaces import mean_reading
+from torch_denkf.modules.spaces import mean_reading, told
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.running import check_module, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, SubModel, Transition, Update
@@ -187,7 +187,7 @@ class GaussianAnalysis(Update):
         """The belief and the diagnostics."""
         mean, cov, observation, noise = (self.required(entries, key) for key in self.in_keys[:4])
         if observation.ndim > mean.ndim:
-            observation = mean_reading(self.reading_space, observation)
+            observation = mean_reading(self.reading_space, observation, entries.get(self.observed_key))
         update, observed = self._update(entries, mean, cov, observation, noise, call._replace(sample=False))
         values = updated(update, observed, self.inflation)
         return dict(zip(self.out_keys, values, strict=True))
@@ -236,7 +236,7 @@ class GaussianAnalysis(Update):
             written = run_module(self.module, {**entries, self.ensemble_key: states}, call)
         given, made = entries.get(self.observed_key), written.get(self.observed_key)
         mask = given if made is None else made if given is None else made & given
-        return written[self.predicted_key], mask
+        return written[self.predicted_key], told(self.reading_space, mask)
 
 
 def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: float = 1.0) -> tuple[torch.Tensor, ...]:

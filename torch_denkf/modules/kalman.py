@@ -13,7 +13,7 @@ from torch_denkf._checks import check_covariance, check_number, check_shape, che
 from torch_denkf.functional import kalman_predict, kalman_update
 from torch_denkf.functional.linalg import product_of_known
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.modules._spaces import mean_reading
+from torch_denkf.modules.spaces import mean_reading
 from torch_denkf.modules.gaussian import as_covariance, further_keys, updated
 from torch_denkf.modules.tensors import as_standard_deviations, register_constant, register_matrix
 from torch_denkf.running import run_module
@@ -272,7 +272,7 @@ class KalmanAnalysis(Update):
         *noise, observed = rest
         noise = noise[0] if noise else self.noise.expand(*mean.shape[:-1], *self.noise.shape)
         if observation.ndim > mean.ndim:
-            observation = mean_reading(self.reading_space, observation)
+            observation = mean_reading(self.reading_space, observation, None)
         if self.reading_space is not None:  # the same turn as the prediction
             predicted = mean @ self.matrix.mT
             observation = predicted + self.reading_space.minus(observation, predicted)

@@ -150,7 +150,8 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
         predicted, observed = self._observe(entries, around, call)
         if on is not None and on.flat is None:
             expected = on.mean(predicted, weights.mean)
-            predicted, on = on.minus(predicted, expected.unsqueeze(-2)), None
             observation = self._innovation(observation, expected, observed)
+            mask = None if observed is None else observed.unsqueeze(-2)
+            predicted, on = on.innovation(predicted, expected.unsqueeze(-2), mask), None
         update = unscented_update(points, predicted, observation, noise, weights, observed=observed, space=on)
         return self._moved(mean, update), observed

@@ -159,8 +159,11 @@ class Flat(Space):
         parts = [(of_circles if turns else of_lines)(*own) for (turns, _), own in zip(self._runs, runs, strict=True)]
         return tuple(torch.cat(own, -1) for own in zip(*parts, strict=True))
 
-    def _whole(self, known):
-        return known, known
+    def told(self, observed):
+        """The mask itself: numbers are hidden one by one."""
+        return observed, observed
+
+    _whole = told
 
 
 class Euclidean(Flat):

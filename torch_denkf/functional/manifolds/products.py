@@ -48,6 +48,11 @@ class Opposite(Space):
         return self.part.tangent_dim
 
     @property
+    def parts(self) -> Sequence[Space]:  # type: ignore[override]
+        """Those of the space, each with its steps on the other side."""
+        return tuple(part.flat or Opposite(part) for part in self.part.parts)
+
+    @property
     def _angles(self) -> int:  # type: ignore[override]
         return self.part._angles
 
@@ -214,9 +219,14 @@ class Repeated(Space):
         return self.count * self.part.tangent_dim
 
     @property
+    def parts(self) -> Sequence[Space]:  # type: ignore[override]
+        """N times the same."""
+        return (self.part,) * self.count
+
+    @property
     def flat(self):
         """The parts side by side, where these are lines and circles."""
-        return _joined([self.part] * self.count)
+        return _joined(self.parts)
 
     def compose(self, first, second):
         """Point by point."""
@@ -299,7 +309,7 @@ def places_of(space: Space) -> list[Place]:
     todo = [space]
     while todo:
         part = todo.pop(0)
-        if isinstance(part, Product) or (isinstance(part, Flat) and len(part.parts) > 1):
+        if part.parts and tuple(part.parts) != (part,):
             todo = [*part.parts, *todo]
             continue
         ends = point + part.point_dim, tangent + part.tangent_dim

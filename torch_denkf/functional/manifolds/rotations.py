@@ -109,6 +109,9 @@ class SE2(Space):
         angles, first = points[..., :1], points[..., :1, :1]
         return super()._between(torch.cat([first + wrap_angles(angles - first), points[..., 1:]], -1), weights)
 
+    def _told(self, observed):
+        return _one_by_one(observed, 1, 1, (1, 2))
+
     @staticmethod
     def _arc(angle: Tensor) -> tuple[Tensor, Tensor]:
         """sin(a) / a and (1 - cos(a)) / a."""
@@ -229,6 +232,9 @@ class _RotationAndVectors(Space):
         quaternions = torch.where(opposite, -points[..., :4], points[..., :4])
         return super()._between(torch.cat([quaternions, points[..., 4:]], -1), weights)
 
+    def _told(self, observed):
+        return _one_by_one(observed, 3, 4, (self.vectors, 3))
+
     def _vectors(self, value: Tensor, begin: int) -> Tensor:
         return value[..., begin:].unflatten(-1, (self.vectors, 3))
 
@@ -283,6 +289,14 @@ class Turned(_RotationAndVectors):
     """
 
     vectors: int
+
+
+def _one_by_one(observed: Tensor, angles: int, numbers: int, vectors: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Narrows a mask of tangents to a whole rotation and whole vectors, which are told apart."""
+    turn, others = observed[..., :angles].all(-1, keepdim=True), observed[..., angles:].unflatten(-1, vectors).all(-1)
+    others = others.repeat_interleave(vectors[1], -1)
+    points, tangents = (torch.cat([turn.expand(*turn.shape[:-1], size), others], -1) for size in (numbers, angles))
+    return points, tangents
 
 
 def _turn(pose: Tensor, vector: Tensor) -> Tensor:
