@@ -14,6 +14,8 @@ from torch_denkf.diagnosis.composition import check_composition as check_composi
 from torch_denkf.diagnosis.errors import entry_of as entry_of
 from torch_denkf.diagnosis.errors import explained as explained
 from torch_denkf.diagnosis.errors import missing_entry as missing_entry
+from torch_denkf.diagnosis.evaluation import Evaluation as Evaluation
+from torch_denkf.diagnosis.evaluation import evaluate
 from torch_denkf.diagnosis.inputs import check_actions as check_actions
 from torch_denkf.diagnosis.inputs import check_inputs as check_inputs
 from torch_denkf.diagnosis.inputs import check_joined_readings as check_joined_readings
@@ -28,6 +30,7 @@ from torch_denkf.diagnosis.slices import UnmarkedSlices
 
 __all__ = [
     "check_analysis",
+    "evaluate",
 ]
 
 
