@@ -58,7 +58,9 @@ def test_a_belief_that_knows_its_error(kind, space):
 
 def test_a_pose_has_the_axes_of_the_body():
     data = beliefs("EKF")
-    mean, var, cov, truth = (data[key][0] for key in (("belief", "mean"), ("belief", "var"), ("belief", "cov"), "state"))
+    mean, var, cov, truth = (
+        data[key][0] for key in (("belief", "mean"), ("belief", "var"), ("belief", "cov"), "state")
+    )
     out = evaluate(make("EKF", SPACE), data, level=0.95)
     plain = interval_coverage(mean, var, truth, level=0.95)
     assert plain[1] > 0.98 and plain[2] < 0.3  # in the axes of the world the intervals mean nothing
