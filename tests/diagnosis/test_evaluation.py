@@ -63,7 +63,8 @@ def test_a_pose_has_the_axes_of_the_body():
     )
     out = evaluate(make("EKF", SPACE), data, level=0.95)
     plain = interval_coverage(mean, var, truth, level=0.95)
-    assert plain[1] > 0.98 and plain[2] < 0.3  # in the axes of the world the intervals mean nothing
+    assert plain[1] > 0.98
+    assert plain[2] < 0.3
     assert out.coverage.sub(0.95).abs().max() < 0.02
     assert nees(mean, cov, truth).mean > 100 > 5 > out.nees.mean
     expected = nees(mean[1:], cov[1:], truth[1:], space=SPACE, level=0.95)
@@ -78,12 +79,15 @@ def test_truths_that_are_known_in_part():
     pose = evaluate(filter, data, data["state"][..., :3])
     torch.testing.assert_close(pose.rmse[:3], whole.rmse[:3])
     assert pose.count.tolist() == [N] * 3 + [0]
-    assert pose.rmse[3].isnan() and pose.coverage[3].isnan() and abs(pose.nees.mean - 3) < 0.2
+    assert pose.rmse[3].isnan()
+    assert pose.coverage[3].isnan()
+    assert abs(pose.nees.mean - 3) < 0.2
     data["state_observed"] = torch.ones(1, N + 1, 1, dtype=torch.bool)
     data["state_observed"][:, 100:] = False
     part = evaluate(filter, data)
     torch.testing.assert_close(part.rmse, evaluate(filter, data[:, :100]).rmse)
-    assert part.count.tolist() == [99] * 4 and part.nees.values.shape == (99,)
+    assert part.count.tolist() == [99] * 4
+    assert part.nees.values.shape == (99,)
 
 
 def test_frames_are_filtered_first_and_smoothed_beliefs_are_scored_by_their_name():
@@ -99,7 +103,9 @@ def test_frames_are_filtered_first_and_smoothed_beliefs_are_scored_by_their_name
     assert evaluate(named, named.sequence(data.copy())).rmse.equal(evaluate(filter, written).rmse)
     written["smoothed"] = TensorDict({"mean": truth, "var": torch.ones_like(truth)}, [4, 8])
     smoothed = evaluate(filter, written, belief="smoothed")
-    assert smoothed.rmse.abs().max() < 1e-7 and smoothed.nees is None and smoothed.coverage.tolist() == [1.0] * 3
+    assert smoothed.rmse.abs().max() < 1e-7
+    assert smoothed.nees is None
+    assert smoothed.coverage.tolist() == [1.0] * 3
 
 
 def test_wrong_calls_are_refused():

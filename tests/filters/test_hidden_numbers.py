@@ -1,4 +1,4 @@
-"""A number that a mask hides is nowhere: not in a belief, and not in a gradient. Every filter, every space of readings."""
+"""A number that a mask hides has no part in a belief, nor in a gradient: every filter, every space of readings."""
 
 import math
 
@@ -204,3 +204,17 @@ def test_of_a_pose_that_is_not_known_nothing_moves():
     out = make("EKF", SE2()).sequence(RejectReadings({"pose": "observed"}, spaces={"pose": SE2()})(data))
     assert out[MEAN][1].tolist() == [0.5, 50.0, 20.0]
     assert out["info", "nis"][1].item() == 0
+
+
+@pytest.mark.parametrize("name", [name for name in SPACES if name != "numbers"])
+def test_covariances_of_members_are_of_tangents(name):
+    """Also at a start, where they follow from the members."""
+    space, data = SPACES[name], frames(SPACES[name])[0][0, :1].exclude("observed")
+    filter = make("etkf", space)
+    analysis = EnsembleAnalysis("etkf", space=space, reading_space=space, observation_key="pose", covariance=True)
+    out = filtered(filter.with_modules(analysis=analysis), data.unsqueeze(0))[0]
+    away = space.minus(out["belief", "ensemble"], space.mean(out["belief", "ensemble"]).unsqueeze(-2))
+    expected = away.mT @ away / (E - 1)
+    torch.testing.assert_close(out["belief", "cov"], expected, rtol=0, atol=1e-3)  # an update's mean is rounded
+    torch.testing.assert_close(out["belief", "cov"][..., 0, :, :], expected[..., 0, :, :])
+    torch.testing.assert_close(out[VAR][..., 0, :], expected[..., 0, :, :].diagonal(dim1=-2, dim2=-1))

@@ -93,7 +93,8 @@ def evaluate(
         held = filter.inside(data := filter.sequence(data.copy())).get(belief)
     if held is None:
         raise KeyError(f"{type(filter).__name__} writes no {belief!r}: pass what its smoother wrote.")
-    space, (kind,) = filter.structure.space, kinds_of([(belief, name) for name in held.keys()], filter.structure.space)
+    space = filter.structure.space
+    (kind,) = kinds_of([(belief, name) for name in list(held.keys())], space)
     mean, var = (entry_of(held, name, "evaluate", "Keep it in the sequence.") for name in ("mean", "var"))
     truth = _known(filter, data, truth, mean)
     error, known = state_difference(truth, mean, space=space), known_tangents(truth, space)
