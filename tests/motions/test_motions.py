@@ -199,7 +199,7 @@ def test_noise_added_step_by_step_is_that_of_the_sensors(float64, make):
 
 
 def test_noises_of_a_step_are_those_of_a_walk_and_of_its_integral():
-    """Variances of n small steps of a walk, and of the sum of where it stood, in the middle of each, times their length."""
+    """Variances of n small steps of a walk, and of where it stands in the middle of each, times their length."""
     n, dt, density = 4000, 0.5, [0.3, 2.0]
     small = dt / n
     left = dt - small * (torch.arange(n, dtype=torch.float64) + 0.5)  # of a step's length, behind each small step

@@ -186,7 +186,7 @@ class Space:
         return self.plus(point, std * noise)
 
     def check(self, **values: Tensor) -> None:
-        """Raises unless the last dimension of each value has the right size, and no rotation is boolean.
+        """Raises unless the last dimension of each value has the right size, and no point is boolean.
 
         Args:
             **values: a ``tangent``, the mask of one, ``observed``, and any points.
@@ -194,13 +194,12 @@ class Space:
         Raises:
             ValueError: if it has not; names the value.
         """
-        turns = self.flat is None or self.flat.circular
         for name, value in values.items():
             kind = "tangent" if name in ("tangent", "observed") else "point"
             due = self.tangent_dim if kind == "tangent" else self.point_dim
-            is_flag = " of flags" if turns and kind == "point" and value.dtype == torch.bool else ""
-            if is_flag or value.shape[-1:] != (due,):
-                raise ValueError(f"{name} has shape {list(value.shape)}{is_flag}; a {kind} of {self} is [*, {due}].")
+            flags = " of flags" if value.dtype == torch.bool and name != "observed" else ""
+            if flags or value.shape[-1:] != (due,):
+                raise ValueError(f"{name} has shape {list(value.shape)}{flags}; a {kind} of {self} is [*, {due}].")
 
 
 def check_space(name: str, space: Space | None, *, flat: bool = False) -> Space | None:
