@@ -55,7 +55,8 @@ class RejectReadings(Checked, Transform):
         noises: for a reading the entry with its variances ``[*B, O]`` or its covariance ``[*B, O, O]``. Those of a
             reading that is rejected for them become one, and the identity.
         spaces: for a reading the space in which it is a point ``[*B, P]``. Its parts, such as the pose, are rejected as
-            a whole and become the neutral point; plain numbers are rejected one by one. The mask ``[*B, D]`` is of the
+            a whole and become the neutral point; plain numbers are rejected one by one. A quaternion of zeros is bad,
+            too. The mask ``[*B, D]`` is of the
             components of a tangent, and so is the noise.
         on_bad: ``"mask"`` to reject bad readings, ``"raise"`` to raise where no mask hides them. To raise, one flag is
             read back from the device in each call; under ``torch.compile`` and ``torch.vmap`` nothing raises.
@@ -65,8 +66,8 @@ class RejectReadings(Checked, Transform):
     Raises:
         TypeError: for a key that is none, a space that is none, or ``noises`` that are no dict.
         ValueError: if ``masks`` is empty, another argument names a reading that is not in ``masks``, two entries have
-            one key, or ``on_bad`` is unknown. In a call, if a mask is not boolean or of another shape; with
-            ``on_bad="raise"``, if a reading is bad.
+            one key, or ``on_bad`` is unknown. In a call, if a mask is not boolean or of another shape, or a reading has
+            not the size of its space's points; with ``on_bad="raise"``, if a reading is bad.
         KeyError: in a call, if a reading or its noise is missing.
 
     Example:
@@ -184,6 +185,12 @@ class RejectReadings(Checked, Transform):
         """
         size, value = tensordict.ndim, entry_of(tensordict, key, "RejectReadings", "Rename it in the constructor.")
         good, neutral = self._within(value), value.new_zeros(())
+        if key in self.spaces:
+            self.spaces[key].check(**{repr(key): value})
+            neutral = self.spaces[key].neutral(value)
+            point = torch.where(good, value, neutral)
+            point = point if point.is_floating_point() else point.float()
+            good = good & self.spaces[key].normalise(point).isfinite()  # a quaternion of zeros is no rotation
         known = good.unsqueeze(-1).flatten(size).all(-1, keepdim=True)
         if key in self.spaces or key in self.by_component:  # samples of one reading count together
             known = good.flatten(size, -2).all(-2) if good.ndim > size + 1 else good
@@ -195,7 +202,6 @@ class RejectReadings(Checked, Transform):
         if key in self.spaces:
             points, known = _whole_parts(self.spaces[key], known, noise)
             good = points.reshape(*points.shape[:-1], *(1,) * (value.ndim - points.ndim), points.shape[-1])
-            neutral = self.spaces[key].neutral(value)
         elif noise is not None:
             known = known & (noise if key in self.by_component else noise.all(-1, keepdim=True))
         written[key] = torch.where(good, value, neutral)
@@ -241,6 +247,8 @@ class RejectReadings(Checked, Transform):
                         due = f"at most {self.limit:g} in size" if abs(number) < torch.inf else "finite"
                         due = "at least zero" if bool(negative[tuple(place)]) else due
                         yield f"{name!r} is {number:g} at {[*row, *place]}, and a {what} must be {due}{cure}"
+                    if name == key in self.spaces:
+                        yield f"{name!r} at {row} is no point of {self.spaces[key]}: {value.tolist()}{cure}"
                     if name == noise:
                         yield f"{name!r} at {row} is no covariance: symmetric, without negative eigenvalues{cure}"
 
