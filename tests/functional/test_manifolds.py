@@ -520,6 +520,13 @@ def test_headings_on_both_sides_of_pi_have_a_point_near_their_mean():
     assert SE2().near(points)[0].item() == pytest.approx((3.1 + (2 * math.pi - 3.1) + 3.0) / 3)
 
 
+@pytest.mark.parametrize("space", [SO3(), SE3(), SE23(), Opposite(SE3()), Opposite(SE23())])
+def test_the_length_of_a_readings_quaternion_does_not_matter(space):
+    expected, reading = (space.exp(torch.randn(space.tangent_dim)) for _ in range(2))
+    longer = torch.cat([1.5 * reading[:4], reading[4:]])
+    torch.testing.assert_close(space.innovation(longer, expected), space.innovation(reading, expected))
+
+
 @pytest.mark.parametrize("space", [SO3(), SE2(), SE3(), Circle(), Repeated(SO3(), 2), Euclidean(1) * Circle()])
 def test_flags_and_scalars_are_no_points(space):
     point = space.exp(torch.zeros(space.tangent_dim))

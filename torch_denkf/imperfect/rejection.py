@@ -186,7 +186,7 @@ class RejectReadings(Checked, Transform):
         size, value = tensordict.ndim, entry_of(tensordict, key, "RejectReadings", "Rename it in the constructor.")
         good, neutral = self._within(value), value.new_zeros(())
         if key in self.spaces:
-            self.spaces[key].check(**{repr(key): value})
+            self.spaces[key].check(**{repr(key): value[(0,) * size] if 0 not in value.shape[:size] else value})
             neutral = self.spaces[key].neutral(value)
             point = torch.where(good, value, neutral)
             point = point if point.is_floating_point() else point.float()

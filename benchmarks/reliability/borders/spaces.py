@@ -118,7 +118,7 @@ def like(change: Change, near: float = 1e-6, **options: Any) -> Callable[..., bo
     return lambda way, result: finite(result) and same(result, way(change, **options), rtol=near, atol=near)
 
 
-def target(name: str, way: Callable[..., Frames], wrong: d.Wrong, word: str, right: Any = None) -> Target:
+def target(name: str, way: Callable[..., Any], wrong: d.Wrong, word: str, right: Any = None) -> Target:
     """Changed frames in one way to run a filter."""
     rights = lambda what, change: right and partial(right, way)  # noqa: E731
     return Target("spaces", name, (word,), lambda change, folder: way(change), wrong, rights=rights)
@@ -157,7 +157,6 @@ def masked(kind: str, name: str) -> Iterator[Target]:
     masks = {
         "too wide": lambda mask: torch.cat([mask] * 3, -1),
         "too narrow": lambda mask: torch.cat([mask] * 2, -1)[:, : max(2, space.tangent_dim - 1)],
-        "of numbers": lambda mask: mask.float(),
         "without its last dimension": lambda mask: mask[:, 0],
     }
     if space.point_dim != space.tangent_dim:
@@ -165,8 +164,11 @@ def masked(kind: str, name: str) -> Iterator[Target]:
     if space.tangent_dim <= 3:
         masks.pop("too narrow")
     wrong = d.Wrong({what: partial(_changed, key="observed", change=change) for what, change in masks.items()})
+    numbers = d.Wrong({"of numbers": partial(_changed, key="observed", change=Tensor.float)})
     for run_name, way in (("sequence", run), ("step", stepped)):
-        yield target(f"{kind}, {name}, {run_name}, mask", partial(way, kind, name), wrong, "observed")
+        way = partial(way, kind, name)
+        yield target(f"{kind}, {name}, {run_name}, mask", way, wrong, "observed")
+        yield target(f"{kind}, {name}, {run_name}, a mask", way, numbers, "observed", like(_sound, 0.0))
 
 
 def _changed(space: Space, data: Frames, key: str, change: Callable[[Tensor], Tensor]) -> Frames:
@@ -175,7 +177,7 @@ def _changed(space: Space, data: Frames, key: str, change: Callable[[Tensor], Te
 
 def rejected(kind: str, name: str) -> Iterator[Target]:
     """A part that is broken is a missing reading."""
-    space, place = SPACES[name], places_of(SPACES[name])[0]
+    place = places_of(SPACES[name])[0]
     lost = place.tangent if place.space.flat is None else slice(0, 1)
     way = partial(run, kind, name, on_bad="mask")
     wrong = d.Wrong(
@@ -205,9 +207,10 @@ def scored(name: str) -> Iterator[Target]:
         "without its last dimension": truth(lambda state: state[:, 0]),
         "all NaN": truth(lambda state: state * NAN),
         "one step": truth(lambda state: state[None].expand(T, T, -1)),
-        "missing": lambda space, data: data.exclude("state"),
     }
+    missing = d.Wrong({"missing": lambda space, data: data.exclude("state")})
     yield target(f"evaluate, {name}, truth", way, d.Wrong(shapes), "truth")
+    yield target(f"evaluate, {name}, true states", way, missing, "state")
 
 
 def products() -> Iterator[Target]:

@@ -58,7 +58,7 @@ class Opposite(Space):
 
     def compose(self, first, second):
         """The second, then the first."""
-        return self.part.compose(second, first)
+        return self.part.compose(self.part.normalise(second), first)  # a reading may be so to rounding alone
 
     def inverse(self, point):
         """That of the space."""
