@@ -16,7 +16,7 @@ from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.transforms.envs_for_tests import base_env, forked_env, toy_base_env, toy_filter
 from torch_denkf import DEnKF, DEnKFTransform, FusedFilter, FusedSensor, RejectReadings
-from torch_denkf.functional.manifolds import SE2, SO3, Circle, Euclidean, Product
+from torch_denkf.functional.manifolds import SE2, SE3, SO3, Circle, Euclidean, Product
 from torch_denkf.modules import EKFAnalysis, LinearTransition, MomentPrior, Select
 
 NAN, INF = torch.nan, torch.inf
