@@ -149,10 +149,9 @@ class Ensemble(Belief):
     def derived(self, name, *carried):
         """Computes mean, variances and covariance of the sample."""
         (ensemble,) = carried
-        if self.space is not None and name == "mean":
-            return self.space.mean(ensemble)
         if self.space is not None:
-            ensemble = self.space.minus(ensemble, self.space.mean(ensemble).unsqueeze(-2))
+            mean = self.space.mean(ensemble).unsqueeze(-2)
+            ensemble = mean if name == "mean" else self.space.minus(ensemble, mean)
         sample = {"mean": ensemble_mean, "var": ensemble_var, "cov": ensemble_cov}.get(name)
         return None if sample is None else sample(ensemble)
 

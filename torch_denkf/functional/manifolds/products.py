@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf.functional.manifolds.flat import Flat
-from torch_denkf.functional.manifolds.space import Space, blocks, eye
+from torch_denkf.functional.manifolds.space import Space, blocks, eye, side_by_side
 
 __all__ = ["Opposite", "Place", "Product", "Repeated", "places_of", "whole_parts"]
 
@@ -335,12 +335,7 @@ def whole_parts(space: Space, known: Tensor) -> tuple[Tensor, Tensor]:
         >>> whole_parts(Product(SO3(), Euclidean(2)), torch.tensor([True, True, False, True, True, False]))[1]
         tensor([False, False, False,  True, False])
     """
-    points, tangents = [], []
-    for place in places_of(space):
-        whole, told = place.space._whole(known[..., place.point])
-        points.append(whole)
-        tangents.append(told)
-    return torch.cat(points, -1), torch.cat(tangents, -1)
+    return side_by_side([place.space._whole(known[..., place.point]) for place in places_of(space)])
 
 
 def _joined(parts: Sequence[Space]) -> Flat | None:

@@ -151,9 +151,8 @@ class Space:
         self.check(observed=observed)
         if not self.parts:
             return self._told(observed)
-        apart = zip(self.parts, observed.split([part.tangent_dim for part in self.parts], -1), strict=True)
-        points, tangents = zip(*[part.told(own) for part, own in apart], strict=True)
-        return torch.cat(points, -1), torch.cat(tangents, -1)
+        apart = observed.split([part.tangent_dim for part in self.parts], -1)
+        return side_by_side([part.told(own) for part, own in zip(self.parts, apart, strict=True)])
 
     def align(self, predicted: Tensor, reading: Tensor, observed: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Maps predictions and a reading to plain numbers, which can be averaged and subtracted.
@@ -236,6 +235,12 @@ def is_flat(*spaces: Space | None) -> bool:
 def eye(like: Tensor, size: int) -> Tensor:
     """Returns the identity ``[*, size, size]`` for points ``[*, N]``."""
     return torch.eye(size, dtype=like.dtype, device=like.device).expand(*like.shape[:-1], size, size)
+
+
+def side_by_side(parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Joins masks of the points and tangents of parts."""
+    points, tangents = zip(*parts, strict=True)
+    return torch.cat(points, -1), torch.cat(tangents, -1)
 
 
 def blocks(parts: Sequence[Tensor]) -> Tensor:
