@@ -48,7 +48,7 @@ def test_a_belief_that_knows_its_error(kind, space):
     std = torch.linspace(0.1, 0.2, space.tangent_dim)  # narrow: the mean of members turns their axes
     size, n = (200, 500) if kind == "particles" else (16, N)
     out = evaluate(make(kind, space), beliefs(kind, space, std, size, n), level=0.8)
-    assert out.count.tolist() == [n] * space.tangent_dim
+    assert out.known.tolist() == [n] * space.tangent_dim
     assert (out.coverage - 0.8).abs().max() < 5 * (0.16 / n) ** 0.5
     own = 1.0 if kind == "EKF" else 1 + 1 / size  # the mean of members is off by its own share
     torch.testing.assert_close(out.rmse, std * own**0.5, rtol=5 / n**0.5, atol=0)
@@ -78,7 +78,7 @@ def test_truths_that_are_known_in_part():
     filter, whole = make("EKF", SPACE), evaluate(make("EKF", SPACE), data)
     pose = evaluate(filter, data, data["state"][..., :3])
     torch.testing.assert_close(pose.rmse[:3], whole.rmse[:3])
-    assert pose.count.tolist() == [N] * 3 + [0]
+    assert pose.known.tolist() == [N] * 3 + [0]
     assert pose.rmse[3].isnan()
     assert pose.coverage[3].isnan()
     assert abs(pose.nees.mean - 3) < 0.2
@@ -86,7 +86,7 @@ def test_truths_that_are_known_in_part():
     data["state_observed"][:, 100:] = False
     part = evaluate(filter, data)
     torch.testing.assert_close(part.rmse, evaluate(filter, data[:, :100]).rmse)
-    assert part.count.tolist() == [99] * 4
+    assert part.known.tolist() == [99] * 4
     assert part.nees.values.shape == (99,)
 
 

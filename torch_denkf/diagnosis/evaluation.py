@@ -31,7 +31,7 @@ class Evaluation(NamedTuple):
         nees: normalised estimation error squared of the components whose truth is known, over the elements where all of
             these are: their number for a consistent filter, also where the covariance is that of a sample. ``None``
             without a covariance, or with fewer than three members more than components.
-        count: elements whose truth is known, ``[D]``.
+        known: elements whose truth is known, ``[D]``.
     """
 
     rmse: Tensor
@@ -39,7 +39,7 @@ class Evaluation(NamedTuple):
     coverage: Tensor
     crps: Tensor
     nees: NEES | None
-    count: Tensor
+    known: Tensor
 
 
 @torch.no_grad()

@@ -64,7 +64,7 @@ class Flat(Space):
         return self
 
     @property
-    def parts(self) -> tuple[Space, ...]:
+    def parts(self) -> tuple[Space, ...]:  # type: ignore[override]
         """The lines that stand side by side, and each circle."""
         return tuple(
             part for turns, count in self._runs for part in ([Circle()] * count if turns else [Euclidean(count)])

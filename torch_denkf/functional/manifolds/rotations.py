@@ -26,10 +26,10 @@ _SMALL = {torch.float32: 0.25, torch.float64: 1e-2}  # angles squared below whic
 _NEAR = {torch.float32: 1e-2, torch.float64: 1e-4}  # tangents squared below which the arc tangent's series is as exact
 
 
-def _one_by_one(self: Space, observed: Tensor) -> tuple[Tensor, Tensor]:
+def _one_by_one(self: Space, known: Tensor) -> tuple[Tensor, Tensor]:
     """Narrows a mask of tangents to a whole rotation and whole vectors, which are told apart."""
-    turn, size = observed[..., : self._angles].all(-1, keepdim=True), 2 if self._angles == 1 else 3
-    vectors = observed[..., self._angles :].unflatten(-1, ((self.tangent_dim - self._angles) // size, size))
+    turn, size = known[..., : self._angles].all(-1, keepdim=True), 2 if self._angles == 1 else 3
+    vectors = known[..., self._angles :].unflatten(-1, ((self.tangent_dim - self._angles) // size, size))
     vectors = vectors.all(-1).repeat_interleave(size, -1)
     turns = [turn.repeat_interleave(count, -1) for count in (self.point_dim - vectors.shape[-1], self._angles)]
     return side_by_side([(turns[0], turns[1]), (vectors, vectors)])
