@@ -71,13 +71,13 @@ class Whole(SubModel):
         return ensemble
 
 
-def make(kind, space, model=None, reading_space=None, dim=None):
+def make(kind, space, model=None, reading_space=None, dim=None, key="pose"):
     """A filter whose state is read as it is, or by a model of ``dim`` numbers, with an R that is trained."""
     model, reading_space = (Whole(), space) if model is None else (model, reading_space)
     std, q = ([value] * space.tangent_dim for value in (0.2, 0.05))
-    noise = ConstantNoise([0.1] * (dim or space.tangent_dim), in_key="pose", trainable=True)
+    noise = ConstantNoise([0.1] * (dim or space.tangent_dim), in_key=key, trainable=True)
     around = AroundState(std, ensemble_size=E, state_key="start", space=space)
-    read = {"reading_space": reading_space, "observation_key": "pose"}
+    read = {"reading_space": reading_space, "observation_key": key}
     if kind in ("EKF", "UKF"):
         of, start = {"EKF": EKF, "UKF": UKF}[kind], GaussianAround(std, state_key="start", space=space)
         return of(Stays(), None, model, noise, initial=start, process_noise=q, **read)
@@ -121,12 +121,12 @@ def frames(space):
     return data, hidden
 
 
-def filtered(filter, data):
+def filtered(filter, data, key="pose"):
     """What a filter writes, with one noise for all runs; and the readings, whose gradients can be asked for."""
     torch.manual_seed(2)
     noise = filter.draw_noise(data[:1, :1].clone()).get("noise", None)
-    pose = data["pose"].clone().requires_grad_()
-    data = data.clone().set("pose", pose + 0)
+    pose = data[key].clone().requires_grad_()
+    data = data.clone().set(key, pose + 0)
     if noise is not None:
         data["noise"] = noise.expand(data.shape)
     return filter.sequence(data), pose
@@ -218,3 +218,19 @@ def test_covariances_of_members_are_of_tangents(name):
     torch.testing.assert_close(out["belief", "cov"], expected, rtol=0, atol=1e-3)  # an update's mean is rounded
     torch.testing.assert_close(out["belief", "cov"][..., 0, :, :], expected[..., 0, :, :])
     torch.testing.assert_close(out[VAR][..., 0, :], expected[..., 0, :, :].diagonal(dim1=-2, dim2=-1))
+
+
+@pytest.mark.parametrize("kind", ["EKF", "UKF", "sensor", "particles", "IEnKS"])
+@pytest.mark.parametrize("name", ["SE3", "Product"])
+def test_nor_does_one_among_learned_samples(kind, name):
+    key, space = ("sensor", "ensemble"), SPACES[name]
+    data, hidden = frames(space)
+    rng = torch.Generator().manual_seed(4)
+    samples = space.plus(data["pose"][:, :1].unsqueeze(-2), 0.1 * torch.randn(T, E, space.tangent_dim, generator=rng))
+    data[key] = torch.where(hidden.unsqueeze(-2), data["pose"].unsqueeze(-2), samples)
+    data[key][:, :1] = samples
+    out, pose = filtered(make(kind, space, Whole(), space, key=key), data, key)
+    (gradient,) = torch.autograd.grad(out[MEAN].sum() + out[VAR].sum(), pose)
+    assert gradient.any()
+    for found in (out[MEAN], out[VAR], gradient):
+        torch.testing.assert_close(found, found[:, :1].expand_as(found), rtol=1e-12, atol=1e-12)

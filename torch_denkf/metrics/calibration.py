@@ -97,7 +97,8 @@ def interval_coverage(
 ) -> Tensor:
     """Share of the truth inside the central interval of a Gaussian, ``mean ± z sqrt(variance)``.
 
-    It is ``level`` for a calibrated belief, less for an overconfident one.
+    It is ``level`` for a calibrated belief, less for an overconfident one. Without ``space`` variances of points are of
+    other axes than their differences: :func:`torch_denkf.diagnosis.evaluate` takes the space from a filter.
 
     Args:
         mean: ``[*B, S]``.
