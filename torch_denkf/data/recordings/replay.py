@@ -22,6 +22,7 @@ from torch_denkf.data.recordings.tables import Readings, Table
 from torch_denkf.data.replay import EpisodeReplay
 from torch_denkf.data.statistics import picture_statistics
 from torch_denkf.data.times import Span, interpolate, last_reading, nearest_reading, row_times, rows_ago
+from torch_denkf.diagnosis.logs import look_at_repeats
 
 __all__ = ["Recording", "RecordingReplay"]
 
@@ -319,7 +320,8 @@ def _on_clock(
         key: stream.times if isinstance(stream, Readings) else stream["time"].numpy() for key, stream in streams.items()
     }
     came = {key: stream.arrived if _comes_late(stream) else taken[key] for key, stream in streams.items()}
-    times = {key: np.unique(of) for key, of in came.items()}
+    ends = {key: getattr(stream, "until", None) for key, stream in streams.items() if key != clock}
+    times = {key: np.unique(of if ends.get(key) is None else np.append(of, ends[key])) for key, of in came.items()}
     try:
         rows = row_times(times, clock, span)
     except ValueError as error:
@@ -329,6 +331,8 @@ def _on_clock(
     out: dict[str, Tensor] = {}
     for key, stream in recording.streams.items():
         read = streams[key]
+        if isinstance(stream, Table) and stream.repeats is None and key != "action":  # commands are held
+            look_at_repeats(read.values, read.columns, stream.file)
         if stream.sample == "linear":
             values, seen = interpolate(taken[key], read.values, rows, stream.tolerance)
         else:
