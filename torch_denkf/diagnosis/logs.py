@@ -129,7 +129,7 @@ def _gap(moments: np.ndarray) -> tuple[str, str] | None:
 
 def look_at_numbers(
     values: np.ndarray, columns: Sequence[str], place: object, cure: str = "", dtype: torch.dtype = torch.float32
-) -> None:
+) -> bool:
     """Warns of columns whose steps the dtype that they are handed out in does not resolve.
 
     Args:
@@ -139,9 +139,12 @@ def look_at_numbers(
         cure: what to pass; by default ``origin=`` of a table.
         dtype: of what is handed out.
 
+    Returns:
+        Whether there are any.
+
     Examples:
         >>> with warnings.catch_warnings(record=True) as said:
-        ...     look_at_numbers(5.4e6 + 0.02 * np.arange(201.0)[:, None], ["north"], "run1.csv")
+        ...     _ = look_at_numbers(5.4e6 + 0.02 * np.arange(201.0)[:, None], ["north"], "run1.csv")
         >>> print(said[0].message)
         run1.csv: 'north' moves by 0.02 a row near 5400002, where float32 resolves 0.5; pass origin={'north': 5400002.0}
     """
@@ -160,15 +163,16 @@ def look_at_numbers(
             digits = -int(np.floor(np.log10(max(np.ptp(column), step))))
             found.append((name, step, middle, resolved, round(middle, digits)))
     if not found:
-        return
+        return False
     what = str(dtype).removeprefix("torch.")
     texts = [
-        f"moves by {step:.3g} a row near {middle:.9g}, where {what} resolves {least:.2g}"
+        f"moves by {step:.3g} a row near {middle:.10g}, where {what} resolves {least:.2g}"
         for _, step, middle, least, _ in found
     ]
     origins = ", ".join(f"{name!r}: {origin}" for name, *_, origin in found)
     seen = ", ".join([texts[0], *(f"{one[0]!r} {text}" for one, text in zip(found[1:], texts[1:], strict=True))])
     warn_of_log(place, found[0][0], seen, cure or f"pass origin={{{origins}}}")
+    return True
 
 
 def look_at_repeats(values: np.ndarray, columns: Sequence[str], place: object) -> None:

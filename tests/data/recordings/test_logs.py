@@ -159,7 +159,7 @@ def test_arrivals_of_repeated_fixes(tmp_path):
 def test_the_log_of_a_car():
     """Its GPS is repeated until the next fix, and its degrees need an origin; nothing else is wrong in it."""
     columns = ["latitude", "longitude"]
-    with pytest.warns(UserWarning) as said:
+    with pytest.warns(UserWarning, match="car.csv: 'latitude'") as said:
         replay(imu=Table(CAR, ["yawrate"], time="millis", unit="ms"), gps=Table(CAR, columns, "millis", "ms"))
     texts = [str(one.message) for one in said]
     assert len(texts) == 2
@@ -221,7 +221,7 @@ def test_times_of_pictures(tmp_path):
         replay(camera=Images(tmp_path / "images"))
     assert len(replay(camera=Images(tmp_path / "images", unit="ns"))) == 8
     masked = np.ma.masked_equal(np.arange(8.0), 3.0)
-    with pytest.raises(ValueError, match="times of .*images has masked elements"):
+    with pytest.raises(ValueError, match=r"times of .*images has masked elements"):
         replay(camera=Images(tmp_path / "images", times=masked))
 
 
