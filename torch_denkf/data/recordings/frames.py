@@ -18,7 +18,7 @@ from tensordict import TensorDict
 
 from torch_denkf._checks import check_number
 from torch_denkf.data.cache import cache_folder, cached, stamp
-from torch_denkf.data.pictures import CURE, decode_picture, scaled, text_of_size, unnamed_file
+from torch_denkf.data.pictures import CURE, decode_picture, picture_files, scaled, text_of_size, unnamed_file
 from torch_denkf.data.recordings.tables import check_stream, check_times, read_numbers
 from torch_denkf.data.text import read_number
 from torch_denkf.data.video import NOT_DECODED, decoded_frames, say_if_cut
@@ -204,11 +204,7 @@ class Images(Frames):
     def _files(self, source: Path) -> list[Path]:
         if not source.is_dir():
             raise FileNotFoundError(f"no folder {self.file}; check the path")
-        files = [
-            file  # hidden ones, such as ._1.png, are a file manager's
-            for file in source.iterdir()
-            if file.suffix.lower() in _SUFFIXES and not file.name.startswith(".") and file.is_file()
-        ]
+        files = picture_files(source, _SUFFIXES)
         if not files:
             raise ValueError(f"no images in {source}; expected names that end in {', '.join(_SUFFIXES)}")
         return sorted(files, key=_in_order)
