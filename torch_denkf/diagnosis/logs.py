@@ -48,7 +48,7 @@ def warn_of_log(place: object, column: str, seen: str, cure: str) -> None:
 
 
 def look_at_times(
-    times: np.ndarray, place: object, column: str, unit: str = "s", looks: Collection[str] = LOOKS
+    times: np.ndarray, place: object, column: str, unit: str | None = "s", looks: Collection[str] = LOOKS
 ) -> None:
     """Warns of times that stand in another unit, go back, have gaps as of another clock, or come in bursts.
 
@@ -56,7 +56,7 @@ def look_at_times(
         times: s, ``[n]``, in the order of the log; it may be a random one.
         place: the file or log.
         column: the column of the times, or the sensor.
-        unit: in which they were read.
+        unit: in which they were read; None where that cannot be said, but they are in s.
         looks: some of :data:`LOOKS`.
 
     Examples:
@@ -73,7 +73,8 @@ def look_at_times(
     if not faults:
         return
     others = ", ".join(repr(name) for name in SECONDS if name != unit)
-    cures = [f"if the times are not in {unit!r}, pass unit={' or '.join(others.rsplit(', ', 1))}"]
+    passed = "write them in s" if unit is None else f"pass unit={' or '.join(others.rsplit(', ', 1))}"
+    cures = [f"if the times are not in {unit or 's'!r}, {passed}"]
     cures += [cure for _, cure in faults if cure]
     warn_of_log(place, column, ", and ".join(seen for seen, _ in faults), "; ".join(cures))
 

@@ -75,7 +75,7 @@ def read_corner_drive(file: str | Path, rows: int | None = None) -> tuple[Tensor
     if rows is not None:
         check_count("rows", rows, least=2, most=features.shape[-1], cure=f"{file} has {features.shape[-1]}")
     count = features.shape[-1] if rows is None else rows
-    look_at_times(stamps[0], file, "time_stamps")
+    look_at_times(stamps[0], file, "time_stamps", None)
     features = features[..., :count]
     pairs = _pairs(features)
     time = torch.as_tensor(stamps[0, :count] - stamps[0, 0]).unsqueeze(-1)
