@@ -102,7 +102,7 @@ def message_rows(
     first = min(stream.times[0] for stream in streams.values()) if start is None else float(start)
     if start is not None and first > (last := max(stream.times[-1] for stream in streams.values())):
         raise ValueError(f"start={start!r} is behind the last message, {last:.15g} s: pass an earlier one, or unit=.")
-    drives = {name: streams.pop(name).once() for name in dict.fromkeys(driving)}
+    drives = {name: streams.pop(name).once(name) for name in dict.fromkeys(driving)}
     heard = {name: stream.since(first) for name, stream in streams.items()}
     _look_at_gaps({**heard, **drives}, unit)
     for name, drive in drives.items():
@@ -138,11 +138,11 @@ class _Stream:
         """The messages from a time on."""
         return self.kept(self.times >= first)
 
-    def once(self) -> _Stream:
+    def once(self, name: str) -> _Stream:
         """The last message of each time, without those that are not finite."""
         finite = self.kept(np.isfinite(self.values).all(1))
         if not len(finite.times):
-            raise ValueError("A sensor that drives the motion has no message that is finite.")
+            raise ValueError(f"{name!r} drives the motion and has no message that is finite.")
         return finite.kept(np.append(np.diff(finite.times) > 0, True))
 
     def events(self) -> np.ndarray:
