@@ -51,6 +51,7 @@ def test_large_numbers(dtype, origin, step, resolved):
         ([(20.0 * k, "gps", [0.0]) for k in range(50)], "'gps' has steps of usually 20 s"),  # ms
         (messages(begin=1.7e12, rate=1.0), "'gps' has times up to 1.7e\\+12 s"),
         ([(0.0, "pose", [0.0]), *messages(begin=1.7e9)], "'pose' has nothing for 1.7e\\+09 s after 0 s"),
+        ([(0.0, "pose", [0.0]), (1.7e9, "gps", [0.0])], "'pose' has nothing for 1.7e\\+09 s after 0 s"),
         (messages() + messages(begin=0.3), "'gps' goes back by 1.69 s, to 0.3 s, at 200 of 400"),
         ([*messages()[:50], (-3600.0, "gps", [0.0]), *messages()[51:]], "'gps' goes back by 3600 s.* has nothing for"),
         (messages() + messages(begin=7200.0), "'gps' has nothing for 7198 s"),
@@ -59,7 +60,17 @@ def test_large_numbers(dtype, origin, step, resolved):
             "'imu' comes in bursts: 9",
         ),
     ],
-    ids=["ns", "ms", "since 1970", "a stamp that was not set", "two runs", "an hour back", "two runs apart", "bursts"],
+    ids=[
+        "ns",
+        "ms",
+        "since 1970",
+        "a stamp that was not set",
+        "two messages",
+        "two runs",
+        "an hour back",
+        "two runs apart",
+        "bursts",
+    ],
 )
 def test_stamps_that_no_log_has(log, seen):
     with pytest.warns(UserWarning, match="the log: .* pass unit='ms', 'us' or 'ns'") as said:

@@ -31,6 +31,7 @@ _SLOWEST, _FASTEST = 5.0, 5e-5  # s: usual steps of sensors lie between
 _LATEST = 1e11  # s: beyond is no time since 1970, before the year 5138
 LOOKS = ("late", "back", "steps", "gaps")
 _LONG, _STEPS = 60.0, 100  # a gap is longer than so many s, and than so many usual steps
+_YEARS = 1e8  # s: a gap in any log
 _BACK = 10  # usual steps, and one s, by which a stamp that is out of order goes back
 _FEW = 0.02  # a share of stamps: if more go back, nobody has sorted them
 _ENOUGH = 100  # steps from which on their distribution is judged
@@ -118,12 +119,12 @@ def _stepping(moments: np.ndarray) -> tuple[str, str] | None:
 
 def _gap(moments: np.ndarray) -> tuple[str, str] | None:
     steps = np.diff(moments)
-    usual = float(np.median(steps)) if len(steps) > 2 else np.inf
+    usual = float(np.median(steps)) if len(steps) > 2 else _YEARS / _STEPS
     longest = steps.max(initial=0.0)
-    if longest <= max(_LONG, _STEPS * usual):
+    if longest <= max(_LONG, min(_STEPS * usual, _YEARS)):
         return None
-    seen = (
-        f"has nothing for {longest:.4g} s after {moments[steps.argmax()]:.15g} s, where steps are usually {usual:.3g} s"
+    seen = f"has nothing for {longest:.4g} s after {moments[steps.argmax()]:.15g} s" + (
+        f", where steps are usually {usual:.3g} s" if len(steps) > 2 else ""
     )
     return seen, "keep runs apart, and leave out times that were never set"
 

@@ -89,7 +89,7 @@ def message_rows(
         check_number(f"delay of {name!r}", delay)
         streams[name] = replace(streams[name], times=streams[name].times - delay)
     for name, stream in streams.items():
-        if name in (origin or {}):
+        if origin is not None and name in origin:
             streams[name] = stream = replace(
                 stream, values=in_origin(stream.values, origin[name], f"origin of {name!r}")
             )

@@ -68,7 +68,7 @@ def from_pretrained(
     model = load_folder(folder, known)
     if not hasattr(model, "settings"):
         config = read_folder_config(folder, known)
-        model.builder, model.settings = config["builder"], config["settings"]  # type: ignore[assignment]
+        model.builder, model.settings = config["builder"], config["settings"]
     return model  # type: ignore[return-value]
 
 
@@ -119,9 +119,12 @@ def save_pretrained(
     """
     known = _registered.builders()
     own = getattr(model, "settings", None)
-    if builder is None and settings is None and own is not None and not isinstance(own, type):
+    if builder is None and settings is None:
         builder = known.get(getattr(model, "builder", ""))
-        settings = asdict(own) if is_dataclass(own) else own if isinstance(own, Mapping) else None
+        if is_dataclass(own) and not isinstance(own, type):
+            settings = asdict(own)
+        elif isinstance(own, Mapping):
+            settings = own
     if builder is None or settings is None:
         raise ValueError(
             f"it is not known what builds this {type(model).__name__}; pass builder=FUNCTION and settings={{...}}, a "

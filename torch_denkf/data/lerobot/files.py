@@ -163,9 +163,10 @@ def _check_totals(file: Path, info: dict, listed: Path, episodes: Sequence[Episo
             )
 
 
-def _chosen(chosen: Sequence[int], listed: Path, episodes: Sequence[EpisodeFiles]) -> list[EpisodeFiles]:
+def _chosen(chosen: object, listed: Path, episodes: Sequence[EpisodeFiles]) -> list[EpisodeFiles]:
     there = [episode.number for episode in episodes]
-    if isinstance(chosen, str) or not isinstance(chosen, Iterable) or not (numbers := list(chosen)):
+    numbers = list(chosen) if isinstance(chosen, Iterable) and not isinstance(chosen, str | bytes) else []
+    if not numbers:
         raise ValueError(f"episodes holds numbers of episodes, such as [0, 2], or is None for all; got {chosen!r}")
     if unknown := [number for number in numbers if number not in there]:
         raise ValueError(f"episodes names {unknown[:10]}, but {listed} lists {_some(sorted(there))}")

@@ -319,9 +319,12 @@ def _on_clock(
     taken = {
         key: stream.times if isinstance(stream, Readings) else stream["time"].numpy() for key, stream in streams.items()
     }
-    came = {key: stream.arrived if _comes_late(stream) else taken[key] for key, stream in streams.items()}
-    ends = {key: getattr(stream, "until", None) for key, stream in streams.items() if key != clock}
-    times = {key: np.unique(of if ends.get(key) is None else np.append(of, ends[key])) for key, of in came.items()}
+    came: dict[str, Any] = {}
+    times: dict[str, np.ndarray] = {}
+    for key, stream in streams.items():
+        came[key] = stream.arrived if _comes_late(stream) else taken[key]
+        until = None if key == clock else getattr(stream, "until", None)
+        times[key] = np.unique(came[key] if until is None else np.append(came[key], until))
     try:
         rows = row_times(times, clock, span)
     except ValueError as error:

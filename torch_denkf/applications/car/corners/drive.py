@@ -115,13 +115,12 @@ def _read_entries(file: Path) -> dict[str, np.ndarray]:
         raise FileNotFoundError(f"no file {file}; check the path")
     damaged = f"{file} is no npz file of numbers ({{}}); download or copy it anew"
     try:
+        with zipfile.ZipFile(file) as archive:
+            if (size := sum(part.file_size for part in archive.infolist())) > MOST_BYTES:
+                raise ValueError(f"it announces {size} bytes")
         with np.load(file) as stored:
-            if not isinstance(stored, np.lib.npyio.NpzFile):
-                raise ValueError("it is one array")
             if missing := [name for name in ENTRIES if name not in stored.files]:
                 raise KeyError(f"{file} has no {missing}; it has {stored.files}. It should hold {list(ENTRIES)}")
-            if (size := sum(part.file_size for part in stored.zip.infolist())) > MOST_BYTES:
-                raise ValueError(f"it announces {size} bytes")
             return {name: stored[name].astype(np.float64, casting="same_kind") for name in ENTRIES}
     except (ValueError, TypeError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(damaged.format(error)) from error

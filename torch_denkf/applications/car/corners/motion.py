@@ -55,8 +55,8 @@ class CornerNoise:
 
     def __post_init__(self):
         for each in fields(self):
-            needed = each.name in ("pixel", "disparity", "freedom")
-            check_number(each.name, getattr(self, each.name), **({"above": 0} if needed else {"least": 0}))
+            above = 0 if each.name in ("pixel", "disparity", "freedom") else None
+            check_number(each.name, getattr(self, each.name), least=0, above=above)
 
     def stereo_var(self, corners: Tensor, offset: Tensor, stale: Tensor) -> Tensor:
         """Variance of the error that stays with a corner, ``[*]`` in pixels^2, before anything is seen of it.
