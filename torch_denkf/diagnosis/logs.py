@@ -35,7 +35,7 @@ _YEARS = 1e8  # s: a gap in any log
 _BACK = 10  # usual steps, and one s, by which a stamp that is out of order goes back
 _FEW = 0.02  # a share of stamps: if more go back, nobody has sorted them
 _ENOUGH = 100  # steps from which on their distribution is judged
-_SHORT, _WIDE = 0.05, 6.0  # mean steps: of bursts, there are many below the one, and some above the other
+_TINY, _SHORT, _WIDE = 0.01, 0.05, 6.0  # mean steps: of bursts, there are many below the one, and some above the other
 _RESOLVED = 20  # steps of a column have at least so many steps of its dtype
 _READERS = ("torch_denkf", "torchrl", "tensordict")  # torchrl's data sets are made by a function of its own
 
@@ -107,8 +107,11 @@ def _stepping(moments: np.ndarray) -> tuple[str, str] | None:
     if len(steps) < _ENOUGH:
         return None
     mean = float(np.sort(steps)[: int(0.99 * len(steps))].mean())
-    short, wide = (steps < _SHORT * mean).mean(), (steps > _WIDE * mean).mean()
-    if not (short >= 0.2 or (short >= 0.02 and wide >= 0.005)):
+    # Of events that come at random, 1 % of the steps are below _TINY, 5 % below _SHORT, and 0.2 % above _WIDE.
+    tiny, short, wide = (
+        float(part.mean()) for part in (steps < _TINY * mean, steps < _SHORT * mean, steps > _WIDE * mean)
+    )
+    if tiny < 0.03 and short < 0.2 and (short < 0.02 or wide < 0.005):
         return None
     seen = (
         f"comes in bursts: {short:.1%} of the steps are below {_SHORT * mean:.2g} s, {wide:.1%} above "

@@ -203,6 +203,8 @@ def test_large_numbers(tmp_path, cached):
     assert len(said) == 1
     kept = open_all(root, **options, origin={"state": 2.1e9})[:]["state"]
     assert_close(kept, torch.from_numpy(ticks).float())
+    near = open_all(root, **options, origin={"state": torch.tensor([2.1e9 + 1] * 3, dtype=torch.float64)})[:]["state"]
+    assert_close(near, torch.from_numpy(ticks - 1).float())  # not another origin's entry of the cache
     each = open_all(root, **options, origin={"state": [2.1e9, 2.1e9 + 7, 2.1e9], "action": 1.0}, dims=[1])[:]
     assert_close(each["state"], torch.from_numpy(ticks - 7)[:, 1:2].float())
     assert_close(each["action"], torch.from_numpy(actions(0, 40) - 1))

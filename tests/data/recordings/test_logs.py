@@ -186,6 +186,14 @@ def test_the_logs_of_a_wheeled_robot(tmp_path):
         assert len(replay(state=Table(tmp_path / "run.csv", time="t"))) == len(lines) - 1
 
 
+def queued(rate, count=2000):
+    """Of 5 % of the stamps the step is 0.2 ms, of 2 % it is 0.16 s; the others make up for both."""
+    steps = np.full(count, 1 / rate)
+    order = np.random.default_rng(0).permutation(count)
+    steps[order[: count // 20]], steps[order[-count // 50 :]] = 2e-4, 0.16
+    return steps.cumsum()
+
+
 def bursts(count=1000):
     """A sensor of 100 Hz, of whose stamps some are those of a queue that is emptied at once."""
     time = np.arange(count) * 0.01
@@ -204,8 +212,20 @@ def bursts(count=1000):
         (np.append(0.0, 1.7e9 + np.arange(200) / 10), "has nothing for 1.7e\\+09 s after 0 s"),
         (np.append(np.arange(200), 3600 * 24 + np.arange(200)) / 10, "has nothing for 8620 s after 19.9 s"),
         (bursts(), "comes in bursts: .* below"),
+        (queued(100.0), "comes in bursts: .* below"),
+        (queued(20.0), "comes in bursts: .* below"),
     ],
-    ids=["ns", "ms", "too short", "since 1970", "first is zero", "two runs", "bursts"],
+    ids=[
+        "ns",
+        "ms",
+        "too short",
+        "since 1970",
+        "first is zero",
+        "two runs",
+        "bursts",
+        "a queue of 100 Hz",
+        "a queue of 20 Hz",
+    ],
 )
 def test_times_that_no_log_has(tmp_path, time, seen):
     file = write_csv(tmp_path / "run.csv", time=time, x=np.arange(len(time)))

@@ -84,12 +84,15 @@ def read_recording(
     keys = {"state": state_key} if action_key is None else {"state": state_key, "action": action_key}
     widths = {name: layout.width(key) for name, key in keys.items()}
     names = layout.names(state_key)
-    origin = dict(origin or {})
-    if unknown := [name for name in origin if name not in keys]:
+    if unknown := [name for name in origin or {} if name not in keys]:
         raise ValueError(f"origin names {unknown}; it holds numbers for {list(keys)}")
+    origins = {
+        name: (-in_origin(np.zeros((1, widths[name])), given, f"origin of {name!r}"))[0].tolist()
+        for name, given in (origin or {}).items()
+    }
     folder = cache_folder(cache)
     if folder is None:
-        return DecodedRecording(_read(layout, keys, widths, size, None, progress, origin), layout.fps, names, root)
+        return DecodedRecording(_read(layout, keys, widths, size, None, progress, origins), layout.fps, names, root)
     key = [
         _FORMAT,
         str(root),
@@ -97,13 +100,13 @@ def read_recording(
         keys,
         layout.fps,
         *size,
-        repr(origin),
+        origins,
         [episode.number for episode in layout.episodes],
     ]
     key += [(str(file.relative_to(root)), *stamp(file)) for file in _files(layout)]
     digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
     entry = folder / f"lerobot-{root.name}-{layout.camera}-{size[0]}x{size[1]}-{digest}"
-    rows = cached(entry, lambda: _read(layout, keys, widths, size, folder, progress, origin))
+    rows = cached(entry, lambda: _read(layout, keys, widths, size, folder, progress, origins))
     return DecodedRecording(rows, layout.fps, names, root)
 
 
@@ -159,7 +162,7 @@ def _read(
     size: tuple[int, int],
     folder: Path | None,
     progress: bool,
-    origin: Mapping[str, Any],
+    origin: Mapping[str, Sequence[float]],
 ) -> TensorDict:
     check_files(layout)
     check_empty(layout)
@@ -179,7 +182,7 @@ def _read(
             for name, key in keys.items():
                 values = vectors(rows, opened, key, widths[name])
                 if name in origin:
-                    values = in_origin(values, origin[name], f"origin of {name!r}")
+                    values = values - np.array(origin[name])
                 numbers[name][at] = values
                 labels = layout.names(key) or [f"{key}[{place}]" for place in range(widths[name])]
                 if key not in swallowed and look_at_numbers(values, labels, opened, f"pass origin={{{name!r}: ...}}"):
