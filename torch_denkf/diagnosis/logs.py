@@ -161,7 +161,8 @@ def look_at_numbers(
         if not len(moves):
             continue
         tensor = torch.from_numpy(np.ascontiguousarray(column))
-        resolved = torch.finfo(dtype).eps * 2.0 ** np.floor(np.log2(np.abs(column).max()))
+        size = np.quantile(np.abs(column[column != 0]), 0.9)  # an outlier is no reason to move the others
+        resolved = torch.finfo(dtype).eps * 2.0 ** np.floor(np.log2(size))
         step = float(np.median(moves))
         if _RESOLVED * resolved > step and bool((tensor.to(dtype).double() != tensor).any()):
             middle = float(np.median(column))
@@ -209,7 +210,7 @@ def look_at_repeats(values: np.ndarray, columns: Sequence[str], place: object) -
     warn_of_log(
         place,
         slow[0],
-        f"repeats its last reading in {1 - kept / len(values):.0%} of the rows".replace("%", " %")
+        f"repeats its last reading in {100 * (1 - kept / len(values)):.0f} % of the rows"
         + (f", with {slow[1:]}" if slow[1:] else "")
         + ", and each row counts as a new one",
         f"{cure}, or repeats='keep' if the sensor has read in each",

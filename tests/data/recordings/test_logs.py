@@ -65,6 +65,8 @@ def test_numbers_that_float32_holds_are_not_warned_of(tmp_path):
         "large_ticks": 2.0**31 + 1024 * np.arange(200.0),  # each is a float32
         "pressure": 101325 + random.normal(size=200),
         "still": np.full(200, 5.4e6 + 0.03),
+        "outlier": np.where(np.arange(200) == 70, 1e12 / 3, random.normal(size=200)),
+        "mostly_zero": np.where(np.arange(200) % 20 == 7, random.normal(size=200), 0.0),
     }
     file = write_csv(tmp_path / "run.csv", time=time, **columns)
     rows = replay(state=Table(file))["state"]
