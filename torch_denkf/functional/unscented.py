@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
 from torch_denkf.functional.gaussian import GaussianUpdate, _check_moments, solve_for_gain
-from torch_denkf.functional.linalg import semidefinite_root
+from torch_denkf.functional.linalg import as_covariance, semidefinite_root
 from torch_denkf.functional.manifolds import Space, check_space
 
 
@@ -193,7 +193,7 @@ def unscented_update(
     check_shape("observation", observation, (*batch, dim), "[*B, O]")
     if noise.ndim == expected.ndim:
         check_shape("noise", noise, (*batch, dim), "variances [*B, O]")
-        noise = noise.diag_embed()
+        noise = as_covariance(noise, expected)
     else:
         check_shape("noise", noise, (*batch, dim, dim), "variances [*B, O] or covariances [*B, O, O]")
     innovation = observation - expected if space is None else space.minus(observation, expected)

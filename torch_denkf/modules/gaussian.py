@@ -12,6 +12,7 @@ from torch import nn
 
 from torch_denkf._checks import check_number
 from torch_denkf.functional.gaussian import GaussianUpdate
+from torch_denkf.functional.linalg import as_covariance
 from torch_denkf.functional.manifolds import Space, check_space, is_flat
 from torch_denkf.modules._spaces import mean_reading
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
@@ -250,11 +251,6 @@ def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: fl
         cov = inflated if observed is None else torch.where(observed.any(-1)[..., None, None], inflated, cov)
     variance = cov.diagonal(dim1=-2, dim2=-1)
     return update.mean, cov, variance, update.innovation, update.nis, update.log_likelihood
-
-
-def as_covariance(noise: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
-    """Covariance ``[*B, N, N]`` from variances ``[*B, N]``, or as it is; ``mean`` ``[*B, S]`` tells them apart."""
-    return noise.diag_embed() if noise.ndim == mean.ndim else noise
 
 
 def further_keys(

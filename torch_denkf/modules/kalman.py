@@ -11,10 +11,10 @@ from torch import nn
 
 from torch_denkf._checks import check_covariance, check_number, check_shape, check_square, check_values
 from torch_denkf.functional import kalman_predict, kalman_update
-from torch_denkf.functional.linalg import product_of_known
+from torch_denkf.functional.linalg import as_covariance, product_of_known
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules._spaces import mean_reading
-from torch_denkf.modules.gaussian import as_covariance, further_keys, updated
+from torch_denkf.modules.gaussian import further_keys, updated
 from torch_denkf.modules.tensors import as_standard_deviations, register_constant, register_matrix
 from torch_denkf.running import run_module
 from torch_denkf.submodel import Call, Entries, Initial, Transition, Update
