@@ -6,13 +6,14 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictSequential
 from torch import nn
 
 from tests.filters.factories import linear_system
 from torch_denkf import EKF, UKF, DEnKF, FusedFilter, FusedSensor, ParticleFilter, RejectReadings
 from torch_denkf.filters import Filter
+from torch_denkf.functional.manifolds import SO3
 from torch_denkf.modules import (
+    ConstantNoise,
     EKFAnalysis,
     EnsembleAnalysis,
     GaussianPrior,
@@ -23,6 +24,7 @@ from torch_denkf.modules import (
     MomentPrior,
     SubModel,
 )
+from torch_denkf.motions import AttitudeMotion, PoseOf
 from torch_denkf.submodel import Sensor
 
 NAN = torch.nan
@@ -215,3 +217,59 @@ def test_without_check_finite_nothing_is_looked_at():
 
 
 # ------------------------------------------------------------------------------------------- causes of other numbers
+
+
+def attitude(kind):
+    """A filter of an attitude, whose steps differ in length, and a row for it."""
+    motion, r = AttitudeMotion("dt", gyro_noise=0.1, gyro_walk=0.01), ConstantNoise([0.1] * 3, in_key="y")
+    space = motion.space
+    if kind == "EKF":
+        initial = MomentPrior(space.neutral(), 0.01 * torch.eye(6), space=space)
+    else:
+        initial = GaussianPrior(space.neutral(), 0.1 * torch.ones(6), ensemble_size=16, space=space)
+    options = {"process_noise": motion.process_noise, "initial": initial}
+    reading = {"observation_key": "y", "reading_space": SO3()}
+    if kind == "EKF":
+        filter = EKF(motion, None, PoseOf(space), r, **options, **reading)
+    else:
+        analysis = EnsembleAnalysis("etkf", space=space, **reading)
+        filter = DEnKF(motion, None, PoseOf(space), r, analysis, **options)
+    rows = TensorDict({"y": torch.tensor([1.0, 0, 0, 0]).repeat(2, 3, 1), "gyro": torch.zeros(2, 3, 3)}, [2, 3])
+    return filter, rows.set("dt", torch.full((2, 3, 1), 0.1))
+
+
+WRONG = {
+    "a quaternion of zeros": ("y", 0.0, r"'y', which is no point of SO3\(\): it has \[0, 0, 0, 0\]"),
+    "time that runs back": ("dt", -0.1, r"the process noise that NoiseOfStep .* makes of .*'dt' \[-0.1\]"),
+    "a step of 3e12 years": ("dt", 1e20, r"'dt' \[1e\+20\]"),
+    "a reading beyond float32": ("gyro", 1e30, r"'gyro' \[1e\+30, 1e\+30, 1e\+30\]"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+@pytest.mark.parametrize("kind", ["EKF", "etkf"])
+def test_the_cause_is_the_input_and_not_the_motion(kind, what):
+    torch.manual_seed(0)
+    filter, rows = attitude(kind)
+    key, value, message = WRONG[what]
+    rows[key][1, 1] = value
+    row = filter.initialise(rows[:, 0].copy()).update(rows[:, 1])
+    if kind == "EKF" and what == "a step of 3e12 years":  # finite: the attitude is not known, and the reading tells it
+        assert filter.step(row)["belief", "mean"].isfinite().all()
+        return
+    with pytest.raises(ValueError, match=message) as error:
+        filter.step(row)
+    assert "in row [1]" in str(error.value)
+    with pytest.warns(UserWarning, match=r"NaN from row \[1, 1\] of the sequence on, because of .*" + message):
+        out = filter.sequence(rows)
+    assert out["belief", "mean"][0].isfinite().all()
+
+
+@pytest.mark.parametrize("kind", ["EKF", "etkf"])
+def test_a_belief_that_is_no_rotation_is_named(kind):
+    filter, rows = attitude(kind)
+    row = filter.initialise(rows[:, 0].copy()).update(rows[:, 1])
+    key = filter.carry_keys[0]
+    row[key] = torch.zeros_like(row[key])
+    with pytest.raises(ValueError, match=re.escape(f"{key!r}, which is no point of Product")):
+        filter.step(row)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from tensordict import NestedKey
 from torch import Tensor
 
@@ -80,10 +79,10 @@ class WrongNoise(Once):
 
     def _raise_of_belief(self, filter: Filter, record: Record, key: NestedKey, var: Tensor, wrong: Tensor) -> None:
         row = tuple(wrong.nonzero()[0].tolist())
-        place = int(var[row].argmin())
+        place, least = int(var[row].argmin()), float(var[row].detach().min())
         where = f" in row {list(row)}" if row else ""
         raise ValueError(
-            f"The new belief has a negative variance in {key!r}{where}: component {place} is {float(var[row][place]):g}. "
+            f"The new belief has a negative variance in {key!r}{where}: component {place} is {least:g}. "
             f"The covariance that the step began with, {filter.carry_keys}, or a noise is none. {COVARIANCE}"
         )
 

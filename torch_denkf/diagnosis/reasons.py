@@ -150,7 +150,8 @@ _DIVERGED = "its motion: all inputs are finite, and the filter diverged"
 
 def reason(structure: Structure, entries: Entries, written: Entries) -> str:
     """Returns why one row, ``[]``, of which all inputs are finite, has no finite belief."""
-    now = {**entries, **{key: value for key, value in written.items() if key not in structure.carry}}
+    belief = {*structure.carry, *structure.belief}
+    now = {**{key: value for key, value in written.items() if key not in belief}, **entries}
     return (
         _noise(structure, now)
         or _no_point(structure, now)
@@ -197,8 +198,9 @@ def _no_point(structure: Structure, now: Entries) -> str:
         if value is None or value.shape[-1] != space.point_dim:
             continue
         if value.isfinite().all() and not space.normalise(value).isfinite().all():
+            who = repr(key) if key in structure.carry else named(structure, key)
             return (
-                f"{named(structure, key)}, which is no point of {space}: it has {_told(value)}. A rotation is a "
+                f"{who}, which is no point of {space}: it has {_told(value)}. A rotation is a "
                 "quaternion of length one, [1, 0, 0, 0] for none"
             )
     return ""
