@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TypedDict
 
 import torch
@@ -82,21 +82,24 @@ class GaussianTransition(Transition):
 
     def on_entries(self, entries, call):
         """The forecast."""
-        return self.with_cross(entries, call, wanted=False)[0]
+        return self.with_link(entries, call, wanted=False)[0]
 
-    def with_cross(self, entries: Entries, call: Call, *, wanted: bool = True) -> tuple[Entries, torch.Tensor | None]:
-        """Returns the forecast; and, where wanted, the covariance of the states before and after ``[*B, S, S]``."""
+    def with_link(self, entries: Entries, call: Call, *, wanted: bool = True) -> tuple[Entries, Sequence[torch.Tensor]]:
+        """Returns the forecast; and, where wanted, how it follows from the state before: A, M, B and Q.
+
+        The covariance before is A M Aᵀ, that of the states before and after is A M Bᵀ, the forecast's B M Bᵀ + Q.
+        """
         mean, cov = (self.required(entries, key) for key in self.in_keys[:2])
-        mean, cov, cross = self._forecast(entries, mean, cov, call._replace(sample=False), wanted)
+        mean, cov, link = self._forecast(entries, mean, cov, call._replace(sample=False), wanted)
         work = {**entries, self.out_keys[0]: mean}
         noise = run_module(self.process_noise, work, call.part("process_noise"))
-        cov = cov + as_covariance(noise[unravel_key(self.process_noise.out_keys[0])], mean)
-        return {self.out_keys[0]: mean, self.out_keys[1]: cov}, cross
+        noise = as_covariance(noise[unravel_key(self.process_noise.out_keys[0])], mean)
+        return {self.out_keys[0]: mean, self.out_keys[1]: cov + noise}, (*(link or ()), noise)
 
     def _forecast(
         self, entries: Entries, mean, cov, call: Call, wanted: bool
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        """Mean and covariance before the process noise is added, and where wanted the cross-covariance."""
+    ) -> tuple[torch.Tensor, torch.Tensor, Sequence[torch.Tensor] | None]:
+        """Mean and covariance before the process noise is added, and where wanted A, M and B."""
         raise NotImplementedError
 
     def _move(self, entries: Entries, states: torch.Tensor, call: Call) -> torch.Tensor:
