@@ -47,7 +47,8 @@ class WrongNoise(Once):
             return
         structure, dims = filter.structure, len(record.batch_size)
         if self._known[0] is not structure:
-            self._known = structure, noises_of(structure), [kind.key("var") for kind in structure.kinds]
+            variances = [kind.key("var") for kind in structure.kinds if not set(structure.carry).isdisjoint(kind.carry)]
+            self._known = structure, noises_of(structure), variances
         values = {**record.entries, **record.written}
         for noise in self._known[1]:
             value, mask = values.get(noise.key), None if noise.mask is None else values.get(noise.mask)
