@@ -26,6 +26,7 @@ BORDERS = (
     "filters_made",
     "sub_models",
     "filters_fed",
+    "noises",
     "smoothers",
     "kitti",
     "lerobot",
