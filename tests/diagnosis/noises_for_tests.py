@@ -94,7 +94,7 @@ def run(filter, frames, way):
     if way == "sequence":
         return filter.sequence(frames.copy())
     row = filter.initialise(frames[:, 0].exclude("is_init"))
-    for t in range(1, T):
+    for t in range(1, frames.shape[1]):
         row = filter.step(row.update(frames[:, t].exclude("is_init")))
     return row
 

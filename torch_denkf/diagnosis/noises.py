@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from tensordict import NestedKey
 from torch import Tensor
 
@@ -10,6 +11,7 @@ from torch_denkf.diagnosis.once import Once
 from torch_denkf.diagnosis.reasons import (
     COVARIANCE,
     NoiseEntry,
+    bad_inputs,
     cure_of,
     flaw_of,
     named,
@@ -90,14 +92,15 @@ class WrongNoise(Once):
     def _warn_of_nan(self, filter: Filter, record: Record) -> None:
         """Names the cause of the first NaN of a sequence, which goes on to its end."""
         structure, dims = filter.structure, len(record.batch_size)
-        mean = next((record.written[k] for kind in structure.kinds if (k := kind.key("mean")) in record.written), None)
-        if mean is None or mean.is_cuda or not flag_value(mean.isnan().any()):
+        made = [record.written.get(kind.key(name)) for kind in structure.kinds for name in ("mean", "var")]
+        wrong = [value.isnan().any(-1) for value in made if value is not None and not value.is_cuda]
+        if not wrong or not flag_value(torch.stack([each.any() for each in wrong]).any()):
             return
-        wrong = mean.isnan().any(-1)
-        first = wrong.nonzero()[wrong.nonzero()[:, -1].argmin()].tolist()
+        nan = torch.stack(wrong).any(0)
+        first = nan.nonzero()[nan.nonzero()[:, -1].argmin()].tolist()
         *row, time = first
-        entries = {k: v[tuple(first)].detach() for k, v in record.entries.items() if v.shape[:dims] == wrong.shape}
-        written = {k: v[tuple(first)].detach() for k, v in record.written.items() if v.shape[:dims] == wrong.shape}
+        entries = {k: v[tuple(first)].detach() for k, v in record.entries.items() if v.shape[:dims] == nan.shape}
+        written = {k: v[tuple(first)].detach() for k, v in record.written.items() if v.shape[:dims] == nan.shape}
         before = (*row, time - 1)
         for key in structure.carry if time else ():
             if key in record.written:
@@ -107,10 +110,7 @@ class WrongNoise(Once):
                 entries[key] = entries[previous_key(key)]
             elif time and key in record.entries:
                 entries[key] = record.entries[key][before].detach()
-        bad = [
-            named(structure, key) for key, value in entries.items() if value.is_floating_point() and value.isnan().any()
-        ]
-        why = f"NaN in {' and '.join(bad)}" if bad else reason(structure, entries, written)
+        why = bad_inputs(structure, entries, written) or reason(structure, entries, written)
         text = f"The belief is NaN from row {first} of the sequence on, because of {why}. {cure_of(why)}"
         if "no covariance" in why:
             raise ValueError(text)

@@ -17,7 +17,18 @@ from torch_denkf.modules.around import Wrapper
 from torch_denkf.running import reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, SubModel, Transition, Update, in_role
 
-__all__ = ["COVARIANCE", "NoiseEntry", "cure_of", "flaw_of", "no_covariance", "noises_of", "reason", "why_not_finite"]
+__all__ = [
+    "COVARIANCE",
+    "NoiseEntry",
+    "bad_inputs",
+    "cure_of",
+    "flaw_of",
+    "named",
+    "no_covariance",
+    "noises_of",
+    "reason",
+    "why_not_finite",
+]
 
 #: States what a covariance is, and what to do about a noise that is none.
 COVARIANCE = (
@@ -95,7 +106,7 @@ def why_not_finite(structure: Structure, entries: Entries, written: Entries) -> 
         entries: what the step read.
         written: what it wrote.
     """
-    why = _bad_inputs(structure, entries, written) or _of_first_row(structure, entries, written)
+    why = bad_inputs(structure, entries, written) or _of_first_row(structure, entries, written)
     return (
         f"The new belief is not finite, because of {why}. The tensordict was left as it is. {cure_of(why)}"
         "Where an input is not finite: a mask that is False hides it, and RejectReadings in front of the filter makes "
@@ -109,25 +120,43 @@ def cure_of(why: str) -> str:
     return f"{COVARIANCE} " if "no covariance" in why else ""
 
 
-def _bad_inputs(structure: Structure, entries: Entries, written: Entries) -> str:
+def bad_inputs(structure: Structure, entries: Entries, written: Entries) -> str:
     """Names inputs that are not finite and that no mask hides, and flaws of the belief that was given."""
-    kinds, hidden = dict(structure.carried), {}
-    for noise in noises_of(structure):
-        mask = None if noise.mask is None else written.get(noise.mask, entries.get(noise.mask))
-        hidden[noise.key] = None if mask is None else ~mask
-    bad = []
+    kinds, bad = dict(structure.carried), []
+    masks = {
+        unravel_key(key): unravel_key(part.observed_key)
+        for _, module in structure.update
+        for part in in_role(module, Update)
+        for key in part.reading_keys
+        if part.observed_key is not None
+    }
     for key, value in entries.items():
         if not value.is_floating_point():
             continue
-        gone = hidden.get(key)
-        if gone is not None:
-            gone = gone if value.ndim == gone.ndim else (gone.unsqueeze(-1) | gone.unsqueeze(-2))
-            value = torch.where(gone, 0, value)
-        if not (kinds.get(key) or Belief()).finite(key[-1], value):
+        mask = written.get(masks.get(key), entries.get(masks.get(key)))
+        finite = (kinds.get(key) or Belief()).finite(key[-1], value)
+        if not finite and mask is not None and _hides(mask, value):
+            finite = torch.where(_shown(mask, value), value, 0).isfinite().all()
+        if not finite:
             bad.append(key)
+    given = [key for key in bad if key not in structure.frame_keys]
     if bad:
-        return f"NaN or infinity in {bad}"
+        return f"NaN or infinity in {given or named(structure, bad[0])}"
     return " and ".join(flaw for kind in structure.kinds for flaw in kind.flaws(entries))
+
+
+def _hides(mask: Tensor, value: Tensor) -> bool:
+    """Tells whether a mask ``[*B, 1]`` or ``[*B, O]`` fits a value ``[*B, O]``, ``[*B, E, O]`` or ``[*B, O, O]``."""
+    batch = mask.shape[:-1]
+    return value.shape[: len(batch)] == batch and mask.shape[-1] in (1, value.shape[-1])
+
+
+def _shown(mask: Tensor, value: Tensor) -> Tensor:
+    """Marks what a mask shows of a value; of a covariance ``[*B, O, O]`` rows and columns."""
+    if value.ndim == mask.ndim:
+        return mask
+    square = value.shape[-1] == value.shape[-2]
+    return mask.unsqueeze(-2) & (mask.unsqueeze(-1) if square else mask.new_ones(1))
 
 
 def _of_first_row(structure: Structure, entries: Entries, written: Entries) -> str:

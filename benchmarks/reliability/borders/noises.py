@@ -23,6 +23,7 @@ NAN, INF = float("nan"), float("inf")
 GAUSSIAN = ("KalmanFilter", "EKF", "UKF", "FusedEKF")
 SAMPLED = ("etkf", "perturbed", "sakov", "particles", "FusedEnsemble")
 BELIEF = [("belief", "mean"), ("belief", "var")]
+Change = Callable[[TensorDict], TensorDict]
 BELOW = st.floats(-1e30, -1e-6)
 
 
@@ -65,7 +66,7 @@ COVARIANCES = d.Wrong(
 )
 
 
-def _fed(name: str, which: str, way: str, change: Callable[[TensorDict], TensorDict], value: Tensor, _: Any) -> Any:
+def _fed(name: str, which: str, way: str, change: Change, value: Tensor, _: Any) -> Any:
     modules = {"R": Given("r", ("sensor", "noise")), "Q": Given("q", ("forecast", "noise"))}
     frames = sound_frames()
     sound = torch.tensor([0.5, 0.3]) if value.ndim == 1 else SOUND
@@ -87,13 +88,19 @@ def _hidden(frames: TensorDict) -> TensorDict:
     return frames
 
 
+def _without_second(frames: TensorDict) -> TensorDict:
+    frames["observed"] = frames["observed"].expand(*frames.batch_size, 2).clone()
+    frames["observed"][AT] = torch.tensor([True, False])
+    return frames
+
+
 def _rejected(frames: TensorDict) -> TensorDict:
     return RejectReadings({"observation": "observed"}, noises={"observation": "r"})(frames)
 
 
-def _unread(name: str, way: str, sound: Tensor, result: TensorDict) -> bool:
+def _unread(name: str, way: str, sound: Tensor, result: TensorDict, hide: Change = _hidden) -> bool:
     """Right where the result is that of a hidden reading."""
-    return finite(result) and same(result, _fed(name, "R", way, _hidden, sound, None), rtol=1e-5)
+    return finite(result) and same(result, _fed(name, "R", way, hide, sound, None), rtol=1e-5)
 
 
 def _far(kind: str, way: str, key: str, number: float, _: Path) -> Any:
@@ -129,7 +136,11 @@ def targets() -> Iterator[Target]:
                     kinds["covariance"] = COVARIANCES
                 for kind, wrong in kinds.items():
                     act = partial(_fed, name, which, way, lambda frames: frames)
-                    yield Target("noises", f"{name}, {way}, {which}, {kind}", (word,), act, wrong)
+                    # An infinite variance is that of a reading that says nothing.
+                    right = partial(_unread, name, way, SOUND.diagonal(), hide=_without_second)
+                    rights = {"inf": right} if name in SAMPLED else {}
+                    rights = rights if which == "R" else {}
+                    yield Target("noises", f"{name}, {way}, {which}, {kind}", (word,), act, wrong, rights=rights)
                     if which == "R":
                         for how, change in (("hidden", _hidden), ("rejected", _rejected)):
                             act = partial(_fed, name, which, way, change)
