@@ -114,6 +114,19 @@ def test_such_a_reading_is_missing_behind_reject_readings(name, wrong):
     assert out["belief", "mean"].equal(run(filter, hidden, "sequence")["belief", "mean"])
 
 
+@pytest.mark.parametrize("name", SAMPLED)
+def test_an_infinite_variance_is_that_of_a_component_that_says_nothing(name):
+    found = []
+    for r in ([0.5, torch.inf], [0.5, 0.3]):
+        torch.manual_seed(0)
+        filter, frames = filter_and_frames(name, "R", "entry", "vector", r)
+        if torch.inf not in r:
+            frames["observed"] = frames["observed"].expand(B, T, 2).clone()
+            frames["observed"][AT] = torch.tensor([True, False])
+        found.append(run(filter, frames, "sequence")["belief", "mean"])
+    torch.testing.assert_close(*found)
+
+
 def test_a_negative_covariance_that_was_given_is_named():
     """It would stay below zero where little is learned, without a NaN."""
     filter, frames = filter_and_frames("EKF", "R", "entry", "vector", [0.5, 0.3])
