@@ -92,8 +92,8 @@ class GaussianTransition(Transition):
         mean, cov = (self.required(entries, key) for key in self.in_keys[:2])
         mean, cov, link = self._forecast(entries, mean, cov, call._replace(sample=False), wanted)
         work = {**entries, self.out_keys[0]: mean}
-        noise = run_module(self.process_noise, work, call.part("process_noise"))
-        noise = as_covariance(noise[unravel_key(self.process_noise.out_keys[0])], mean)
+        written = run_module(self.process_noise, work, call.part("process_noise"))
+        noise = as_covariance(written[unravel_key(self.process_noise.out_keys[0])], mean)
         return {self.out_keys[0]: mean, self.out_keys[1]: cov + noise}, (*(link or ()), noise)
 
     def _forecast(
