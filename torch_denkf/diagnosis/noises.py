@@ -51,11 +51,13 @@ class WrongNoise(Once):
         if self._known[0] is not structure:
             variances = [kind.key("var") for kind in structure.kinds if not set(structure.carry).isdisjoint(kind.carry)]
             self._known = structure, noises_of(structure), variances
-        values = {**record.entries, **record.written}
         for noise in self._known[1]:
-            value, mask = values.get(noise.key), None if noise.mask is None else values.get(noise.mask)
+            value = _found(record, noise.key)
             if value is None or value.ndim not in (dims + 1, dims + 2) or value.shape[:dims] != record.batch_size:
                 continue
+            if value.ndim == dims + 1 and not flag_value((value < 0).any()):
+                continue
+            mask = None if noise.mask is None else _found(record, noise.mask)
             wrong = no_covariance(value.detach(), mask, dims)
             if flag_value(wrong.any()):
                 self._raise(filter, record, noise, value, mask, wrong)
@@ -115,3 +117,8 @@ class WrongNoise(Once):
         if "no covariance" in why:
             raise ValueError(text)
         self.warn("nan", text)
+
+
+def _found(record: Record, key: NestedKey) -> Tensor | None:
+    """Returns an entry that a run wrote, or read."""
+    return record.written.get(key, record.entries.get(key))

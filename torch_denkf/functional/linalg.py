@@ -91,7 +91,7 @@ def semidefinite_solve(cov: Tensor, right: Tensor) -> Tensor:
 def is_covariance(cov: Tensor) -> Tensor:
     """Tells which matrices are covariances up to rounding: symmetric and positive semi-definite, without NaN.
 
-    What is tested are the correlations, so that metres and milliradians count alike. Nothing is differentiated.
+    Rounding is relative to the variances, so that metres and milliradians count alike. Nothing is differentiated.
 
     Args:
         cov: ``[*B, N, N]``.
@@ -105,13 +105,12 @@ def is_covariance(cov: Tensor) -> Tensor:
         tensor([ True, False, False])
     """
     cov = cov.detach() if cov.dtype == torch.float64 else cov.detach().float()  # there is no factor in half precision
-    variance = cov.diagonal(dim1=-2, dim2=-1)
-    inverse = torch.where(variance > 0, variance, 1).rsqrt()
-    correlation = cov * inverse.unsqueeze(-1) * inverse.unsqueeze(-2)
-    rounding = 100 * cov.shape[-1] * torch.finfo(cov.dtype).eps
-    symmetric = ((correlation - correlation.mT).abs() <= rounding).flatten(-2).all(-1)
-    factor = cholesky(correlation + torch.full_like(variance, rounding).diag_embed())
-    return (variance >= 0).all(-1) & symmetric & factor.isfinite().flatten(-2).all(-1)
+    variance, rounding = cov.diagonal(dim1=-2, dim2=-1), 100 * cov.shape[-1] * torch.finfo(cov.dtype).eps
+    largest = rounding**2 * (variance.unsqueeze(-1) * variance.unsqueeze(-2))
+    symmetric = ((cov - cov.mT).square() <= largest).flatten(-2).all(-1)
+    # A variance of zero is one, but beside a covariance, which the factor's next row divides by it.
+    ridge = rounding * variance + torch.finfo(cov.dtype).tiny
+    return symmetric & cholesky(cov + ridge.diag_embed())[..., -1, -1].isfinite()
 
 
 def as_covariance(noise: Tensor, mean: Tensor) -> Tensor:

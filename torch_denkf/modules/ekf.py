@@ -68,7 +68,8 @@ class EKFTransition(GaussianTransition):
         if self.stop_jacobian_gradient:
             jacobian = jacobian.detach()
         moved = jacobian @ cov @ jacobian.mT
-        return forecast, (moved + moved.mT) / 2, (torch.eye(cov.shape[-1]).to(cov), cov, jacobian)
+        link = (torch.eye(cov.shape[-1]).to(cov), cov, jacobian) if wanted else None
+        return forecast, (moved + moved.mT) / 2, link
 
 
 class EKFAnalysis(GaussianAnalysis):
