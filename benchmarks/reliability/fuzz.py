@@ -32,6 +32,8 @@ BORDERS = (
     "lerobot",
     "ur5",
     "recordings",
+    "logs",
+    "corners",
     "caches",
     "checkpoints",
     "packages",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from xml.etree import ElementTree
 
 import mujoco
@@ -37,6 +37,9 @@ class LeggedErrors:
         joint_offset: constant, rad.
         joint: white, rad.
         joint_rate: white, rad/s.
+
+    Raises:
+        ValueError: if a number is negative or not finite.
     """
 
     gyro: float = math.radians(0.005)
@@ -48,6 +51,10 @@ class LeggedErrors:
     joint_offset: float = math.radians(0.5)
     joint: float = math.radians(0.05)
     joint_rate: float = 0.02
+
+    def __post_init__(self):
+        for each in fields(self):
+            check_number(each.name, getattr(self, each.name), least=0)
 
 
 class LeggedEnv(EnvBase):
@@ -89,6 +96,8 @@ class LeggedEnv(EnvBase):
         seed: int = 0,
     ):
         super().__init__(batch_size=[])
+        if not (errors is None or isinstance(errors, LeggedErrors)):
+            raise TypeError(f"errors must be LeggedErrors or None; got {errors!r}")
         self.errors, self.dt, self.on, self.off = LeggedErrors() if errors is None else errors, dt, on, off
         check_number("pushes", pushes, least=0)
         self.pushes = pushes
