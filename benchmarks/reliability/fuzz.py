@@ -27,6 +27,7 @@ BORDERS = (
     "sub_models",
     "filters_fed",
     "spaces",
+    "noises",
     "smoothers",
     "kitti",
     "lerobot",

@@ -24,7 +24,9 @@ from torch_denkf.diagnosis.inputs import check_noise as check_noise
 from torch_denkf.diagnosis.inputs import check_precision as check_precision
 from torch_denkf.diagnosis.inputs import readings_to_leave_out as readings_to_leave_out
 from torch_denkf.diagnosis.masks import UnreadMasks
+from torch_denkf.diagnosis.noises import WrongNoise
 from torch_denkf.diagnosis.policy import PolicyStart
+from torch_denkf.diagnosis.reasons import why_not_finite as why_not_finite
 from torch_denkf.diagnosis.shapes import ReadingRanks
 from torch_denkf.diagnosis.slices import UnmarkedSlices
 
@@ -36,4 +38,12 @@ __all__ = [
 
 def default_observers() -> list[Any]:
     """Returns the observers that a new filter has."""
-    return [UnmarkedSlices(), ReadingRanks(), UnreadMasks(), CeilingReached(), NarrowEnsemble(), PolicyStart()]
+    return [
+        UnmarkedSlices(),
+        ReadingRanks(),
+        UnreadMasks(),
+        WrongNoise(),
+        CeilingReached(),
+        NarrowEnsemble(),
+        PolicyStart(),
+    ]

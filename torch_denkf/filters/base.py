@@ -80,9 +80,10 @@ class Filter(Checked, TensorDictSequential):
         forecast_keys: the forecast of each carried entry, where it cannot be told by its name.
         variance_ceiling: the belief's variances are clamped to it, so that an unstable system that nobody observes
             stays finite, with one warning; in the state's units squared. ``None`` for no ceiling.
-        check_finite: whether a step raises where its new belief is not finite. In a sequence the NaN of a belief that
-            diverges goes on to its end. Readings are checked, or rejected, by
-            ``torch_denkf.imperfect.RejectReadings`` in front of the filter.
+        check_finite: whether a step raises where its new belief is not finite, and any run where the noise of a reading
+            is no covariance. In a sequence the NaN of a belief that diverges goes on to its end, and one warning names
+            its cause. Readings are checked, or rejected, by ``torch_denkf.imperfect.RejectReadings`` in front of the
+            filter.
         prefix: name under which all stands that the filter writes, carries on or finds as noise: with ``"imu"`` the
             mean is ``("imu", "belief", "mean")``. Two filters of one environment or policy need one. ``None`` for none.
 

@@ -262,9 +262,13 @@ def _check_noise(what: str, noise: np.ndarray, size: int) -> None:
     square = noise.ndim == 2 and noise.shape[0] == noise.shape[1]
     if not (noise.ndim == 1 or square) or not 0 < len(noise) <= size:  # a tangent may have fewer numbers than a point
         raise ValueError(f"{what} of {list(noise.shape)}: give variances [O] or a covariance [O, O].")
-    least = np.linalg.eigvalsh(noise).min() if square else noise.min()
-    if not least > 0:
-        raise ValueError(f"{what} that is none: variances and covariances are positive; got {noise.tolist()}.")
+    least = np.linalg.eigvalsh(noise).min() if square else noise.min()  # it reads one triangle alone
+    scale = np.sqrt(np.outer(noise.diagonal(), noise.diagonal())) if least > 0 and square else 1.0
+    if not least > 0 or (square and not (abs(noise - noise.T) <= 1e-4 * scale).all()):
+        raise ValueError(
+            f"{what} that is none: variances are positive, a covariance is symmetric and positive definite; got "
+            f"{noise.tolist()}."
+        )
 
 
 def _stream(name: str, messages: list[tuple[float, np.ndarray, np.ndarray | None]]) -> _Stream:

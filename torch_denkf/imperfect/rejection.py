@@ -16,6 +16,7 @@ from torchrl.envs.transforms import Transform
 from torch_denkf._arguments import Checked, check_key
 from torch_denkf._checks import check_mask, check_number, flag_value
 from torch_denkf.diagnosis import entry_of
+from torch_denkf.functional.linalg import is_covariance
 from torch_denkf.functional.manifolds import Space, places_of
 from torch_denkf.submodel import Entries
 
@@ -221,7 +222,7 @@ class RejectReadings(Checked, Transform):
             return good, torch.where(good, noise, 1)
         eye = torch.eye(noise.shape[-1], dtype=noise.dtype, device=noise.device)
         good = good.flatten(-2).all(-1)[..., None, None]
-        good = good & _is_covariance(torch.where(good, noise, eye).detach())[..., None, None]
+        good = good & is_covariance(torch.where(good, noise, eye))[..., None, None]
         return good[..., 0].expand(noise.shape[:-1]), torch.where(good, noise, eye)
 
     def _messages(
@@ -289,17 +290,3 @@ def _whole_parts(space: Space, points: Tensor, tangents: Tensor | None) -> tuple
         dims = (place.space.point_dim, place.space.tangent_dim)
         parts.append((whole.expand(*whole.shape[:-1], dims[0]), whole.expand(*whole.shape[:-1], dims[1])))
     return torch.cat([point for point, _ in parts], -1), torch.cat([tangent for _, tangent in parts], -1)
-
-
-def _is_covariance(cov: Tensor) -> Tensor:
-    """Tells which finite matrices ``[*, O, O]`` are covariances up to rounding; their correlations are tested."""
-    cov = cov if cov.dtype == torch.float64 else cov.float()  # there is no factor in half precision
-    variance = cov.diagonal(dim1=-2, dim2=-1)
-    std = variance.clamp_min(0).sqrt()
-    std = torch.where(std > 0, std, 1)
-    correlation = cov / std.unsqueeze(-1) / std.unsqueeze(-2)
-    eye = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
-    rounding = 100 * cov.shape[-1] * torch.finfo(cov.dtype).eps
-    symmetric = ((correlation - correlation.mT).abs() <= rounding).flatten(-2).all(-1)
-    factored = torch.linalg.cholesky_ex(correlation + rounding * eye)[1] == 0
-    return (variance >= 0).all(-1) & symmetric & factored

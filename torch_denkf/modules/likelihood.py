@@ -28,7 +28,8 @@ _SMALLEST_LOG_LIKELIHOOD = -20.0
 class GaussianLikelihood(Update):
     r"""Log-density of the reading around each particle's prediction, :math:`\log N(\tilde y; h(x^i), R)`.
 
-    Dimensions that are not observed drop out; where nothing is observed it is zero for all particles.
+    Dimensions that are not observed, or whose variance is infinite, drop out; where nothing is observed it is zero for
+    all particles.
 
     Args:
         reading_space: in which the reading lives, such as ``Circle()`` for an angle; ``None`` for plain numbers.
@@ -97,9 +98,8 @@ class GaussianLikelihood(Update):
             reading, variance = torch.where(observed, reading, 0.0), torch.where(observed, variance, 1.0)
         residual = reading - predicted
         terms = -0.5 * (residual.square() / variance + variance.log() + math.log(2 * math.pi))
-        if observed is not None:
-            terms = torch.where(observed, terms, 0.0)
-        return terms.sum(-1)
+        shown = variance != torch.inf if observed is None else observed & (variance != torch.inf)
+        return torch.where(shown, terms, 0.0).sum(-1)
 
 
 class LearnedLikelihood(Update):

@@ -16,9 +16,9 @@ from torch_denkf import beliefs
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble, crps_gaussian, crps_weighted, energy_score
 from torch_denkf.functional.gaussian import gaussian_log_prob
+from torch_denkf.functional.linalg import as_covariance
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules import StochasticMLP
-from torch_denkf.modules.gaussian import as_covariance
 from torch_denkf.objectives._labels import Labels, Truth, check_row_mask, mean_of
 from torch_denkf.objectives.filter_loss import FilterLoss, Term
 
