@@ -104,14 +104,16 @@ def legged_filter(
     tangent = [n.tilt] * 3 + [n.velocity] * 3 + [0.0] * 3 + [n.gyro_bias] * 3 + [n.accelerometer_bias] * 3
     around: dict[str, Any] = {"state_key": ("legs", "start"), "space": space}
     std = torch.tensor([*tangent, *[_FAR] * 3 * count])
+    per_reading = n.gyro / dt**0.5 if isinstance(dt, (int, float)) else n.gyro * 10.0
+    velocity = BaseVelocity(kinematics.base, per_reading, ensemble=kind == "DEnKF", imu_key=imu_key)
     analysis = None
     if kind == "DEnKF":
-        initial = StartEnsemble(std, n.velocity, ensemble_size=ensemble_size, **around)
+        initial = StartEnsemble(std, n.velocity, velocity, ensemble_size=ensemble_size, **around)
         more: dict[str, Any] = {} if threshold is None else {"localisation": "significance", "threshold": threshold}
         analysis = partial(EnsembleAnalysis, "etkf", **more)
         transition = NoisyTransition(motion, process, space=process.space)
     else:
-        initial = StartMoments(std, n.velocity, **around)
+        initial = StartMoments(std, n.velocity, velocity, **around)
         transition = {"EKF": EKFTransition, "UKF": UKFTransition}[kind](motion, process, space=space)
     mask: dict[str, Any] = {"observed_key": ("legs", "observed")}
     sensors = {
@@ -124,7 +126,5 @@ def legged_filter(
         rates = FeetRates(space, imu_key=imu_key, moves_key=moves_key)
         sensors["rates"] = FusedSensor(rates, noise, observation_key=("legs", "rates"), **mask)
     fused = FusedFilter(transition, sensors, initial=initial, analysis=analysis)
-    per_reading = n.gyro / dt**0.5 if isinstance(dt, (int, float)) else n.gyro * 10.0
-    velocity = BaseVelocity(kinematics.base, per_reading, ensemble=kind == "DEnKF", imu_key=imu_key)
     modules = OrderedDict(legs=readings, **dict(named_modules_of(fused)), velocity=velocity)
     return Filter(modules, initial=initial, **options)
