@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torch_denkf import available, from_pretrained, save_pretrained
 from torch_denkf._registered import weights
 from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
+from torch_denkf.applications.legged.quadruped import quadruped
 from torch_denkf.applications.reacher import reacher
 from torch_denkf.applications.ur5.filter import ur5_table
 from torch_denkf.filters import DEnKF, KalmanFilter
@@ -52,6 +53,8 @@ def test_each_comes_with_its_checksum_and_a_card(name):
         assert heading in card
     model = from_pretrained(name)
     assert not model.training
+    for key, value in config["settings"].items():
+        assert getattr(model.settings, key) == (tuple(value) if isinstance(value, list) else value)
     assert {type(value) for value in config["settings"].values()} <= {bool, int, float, list, str, type(None)}
 
 
@@ -63,6 +66,10 @@ def test_what_is_saved_comes_back(tmp_path):
     assert again.settings == model.settings
     assert torch.equal(believe(model), believe(again))
     assert (tmp_path / "card.md").read_text() == "a card"
+    legs = quadruped(num_cells=(4,), slip=0.2)
+    again = from_pretrained(save_pretrained(legs, tmp_path / "legs"))
+    assert again.settings == legs.settings
+    assert (again.settings.slip, again.settings.dt) == (0.2, 0.01)
     arm = ur5_table(ensemble_size=8)
     arm.inflation = 1.25  # chosen after the training
     assert from_pretrained(save_pretrained(arm, tmp_path)).inflation == 1.25
@@ -88,7 +95,10 @@ def test_own_builders(tmp_path):
     save_pretrained(still(2), tmp_path, builder=still, settings={"size": 2})
     with pytest.raises(ValueError, match="is of a filter that 'still' builds"):
         from_pretrained(tmp_path)
-    assert isinstance(from_pretrained(tmp_path, builders={"still": still}), KalmanFilter)
+    again = from_pretrained(tmp_path, builders={"still": still})
+    assert isinstance(again, KalmanFilter)
+    assert again.settings.size == 2
+    save_pretrained(again, tmp_path / "again", builder=still, settings=vars(again.settings))
     with pytest.raises(TypeError, match="JSON"):
         save_pretrained(still(2), tmp_path / "none", builder=still, settings={"size": torch.ones(1)})
     assert not (tmp_path / "none").exists()

@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -146,7 +147,7 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
         builders: by name, functions of the settings that return an untrained model.
 
     Returns:
-        The model, on the CPU, in evaluation mode.
+        The model, on the CPU, in evaluation mode; where it has no ``settings``, those of the file.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -184,6 +185,8 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
     except RuntimeError as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{file} does not fit {CONFIG} beside it: {reason}") from error
+    if not hasattr(model, "settings"):
+        model.settings = SimpleNamespace(**config["settings"])  # type: ignore[assignment]
     return model.eval()
 
 

@@ -84,7 +84,8 @@ def differences(given: nn.Module, built: nn.Module) -> Iterator[str]:
 
 
 def _attributes(module: nn.Module) -> dict[str, Any]:
-    found = {name: value for name, value in vars(module).items() if name[0] != "_" and name not in _OF_A_RUN}
+    named = {name: value for name, value in vars(module).items() if name[0] != "_" and name not in _OF_A_RUN}
+    found = {name: value for name, value in named.items() if not isinstance(value, types.SimpleNamespace)}  # of a file
     return found | {name: getattr(module, name) for name in ("in_keys", "out_keys") if hasattr(module, name)}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from xml.etree import ElementTree
 
 import mujoco
@@ -37,6 +37,9 @@ class LeggedErrors:
         joint_offset: constant, rad.
         joint: white, rad.
         joint_rate: white, rad/s.
+
+    Raises:
+        ValueError: if a number is negative.
     """
 
     gyro: float = math.radians(0.005)
@@ -48,6 +51,10 @@ class LeggedErrors:
     joint_offset: float = math.radians(0.5)
     joint: float = math.radians(0.05)
     joint_rate: float = 0.02
+
+    def __post_init__(self):
+        for each in fields(self):
+            check_number(each.name, getattr(self, each.name), least=0)
 
 
 class LeggedEnv(EnvBase):
