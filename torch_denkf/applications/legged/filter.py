@@ -81,6 +81,7 @@ def legged_filter(
 
     Raises:
         KeyError: if the model lacks a name.
+        TypeError: on noises or contacts of another class.
         ValueError: on an unknown ``kind``, or ``contacts`` without ``rates_key``.
 
     Source:
@@ -89,6 +90,11 @@ def legged_filter(
     """
     if kind not in ("DEnKF", "EKF", "UKF"):
         raise ValueError(f'kind is "DEnKF", "EKF" or "UKF"; got {kind!r}.')
+    for name, value, wanted in (("noises", noises, LeggedNoises), ("contacts", contacts, LearnedContacts)):
+        if value is not None and not isinstance(value, wanted):
+            raise TypeError(f"{name} is of {wanted.__name__}, or None; got {value!r}"[:200])
+    if threshold is not None:
+        check_number("threshold", threshold, above=0)
     if contacts is not None and rates_key is None:
         raise ValueError("LearnedContacts is about the rates of the joints: give rates_key.")
     if isinstance(dt, (int, float)):
@@ -96,7 +102,7 @@ def legged_filter(
     n, kinematics = LeggedNoises() if noises is None else noises, LegKinematics(model, feet, imu, joints=joints)
     count, space = len(kinematics.feet), LeggedSpace(len(kinematics.feet))
     readings = LegReadings(
-        kinematics, imu_key=imu_key, joints_key=joints_key, rates_key=rates_key, contact_key=contact_key
+        kinematics, dt, imu_key=imu_key, joints_key=joints_key, rates_key=rates_key, contact_key=contact_key
     )
     slip_key, moves_key = (None, None) if contacts is None else (SLIP, MOVES)
     motion = LeggedMotion(count, dt, gravity=gravity, imu_key=imu_key, contact_key=contact_key, moves_key=moves_key)
