@@ -170,7 +170,7 @@ def _frames(steps: Steps, names: tuple) -> list[NestedKey]:
     """Returns the names of inputs that are neither noise nor beliefs."""
     structure = steps.structure
     others = {*structure.carry, *structure.belief}
-    return [name for name in names if name not in others and name[0] != "noise"]
+    return [name for name in names if name not in others and name[0] not in ("noise", "previous")]
 
 
 def _parameters(steps: Steps) -> dict[str, Tensor]:

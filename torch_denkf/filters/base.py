@@ -343,7 +343,7 @@ class Filter(Checked, TensorDictSequential):
         The first call of each kind (chunk, batch size, with or without gradients) compiles, later ones reuse that;
         copies and pickles of the filter compile again. Noise is drawn outside: a seed gives what it gives eagerly, up
         to rounding. Some calls stay eager: :meth:`predict`; ``step(without=...)``; in a policy, steps in which rows may
-        reset, and sequences of its data.
+        reset.
 
         Compilers have errors that nothing else shows. So the first call also runs eagerly, and where a reading is zero
         or missing both run again with numbers in it; a sequence with gradients is differentiated both ways, too. What
@@ -593,7 +593,7 @@ class Filter(Checked, TensorDictSequential):
         cuts = [detach_every is not None and t > 0 and t % detach_every == 0 for t in range(size[-1])]
         if gathered.stored:  # these have seen their frame
             steps = steps._replace(update_at_reset=False)
-        strategy = steps if self.compiled is None or gathered.resumed else self.compiled.of(self, steps)
+        strategy = steps if self.compiled is None else self.compiled.of(self, steps)
         with set_recurrent_mode(False):
             kept, one = tuple(key for key in keep if key in structure.step_keys), Call(torch.Size(size[:-1]))
             starts = gathered.begins, gathered.starts
