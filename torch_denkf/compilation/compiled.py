@@ -158,7 +158,7 @@ class BoundSteps(NamedTuple):
 
     def step(self, entries: Entries, call: Call) -> Entries:
         """Takes one step."""
-        noise = self.filter.missing_noise(entries, call.batch_size)
+        noise = self.filter.draws.missing(entries, call.batch_size)
         return self.compiled.step(self.steps, {**entries, **noise}, call.batch_size)
 
     def scan(self, *args: Any) -> tuple[Entries, Entries]:
