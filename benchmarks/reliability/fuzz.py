@@ -31,6 +31,8 @@ BORDERS = (
     "lerobot",
     "ur5",
     "recordings",
+    "logs",
+    "corners",
     "caches",
     "checkpoints",
     "packages",

@@ -70,32 +70,33 @@ class Reading(NamedTuple):
         model: module that predicts it, with an ``observe()`` method; ``None`` where there is none.
     """
 
-    samples: NestedKey
-    observed: NestedKey
-    noise: NestedKey
-    model: Any
+    samples: NestedKey = ("sensor", "ensemble")
+    observed: NestedKey = "observed"
+    noise: NestedKey = ("sensor", "noise")
+    model: Any = None
 
     @classmethod
-    def of(cls, filter: Filter, keys: Keys) -> Reading | None:
-        """Finds the reading of the sensor that ``keys`` name, or of the only one; ``None`` where it is not clear."""
+    def of(cls, filter: Filter, keys: Keys) -> Reading:
+        """Finds the reading of the sensor that ``keys`` name, or of the only one; no model where there are several."""
         found: dict[NestedKey, Update] = {}
+        default, observed = cls(), keys.observed
         for module in filter.update_modules:
             for part in in_role(module, Update):
                 found.update((key, part) for key in map(unravel_key, part.reading_keys[:1]) if key not in found)
-        names = [key for key in filter.structure.frame_keys if is_samples(key)] or [("sensor", "ensemble")]
+        names = [key for key in filter.structure.frame_keys if is_samples(key)] or [default.samples]
         if keys.sensor is not None:
             name = unravel_key(keys.sensor)
             names = [key for key in found if key[:-1] == ("sensor", name)] or [name]
-        names = [key for key in names if key in found] or names[:1]
-        parts = [found[key] for key in names if key in found] or list(found.values())
+        read = [key for key in names if key in found]
+        parts = [found[key] for key in read] or list(found.values())
         if len(parts) > 1:
-            return None
+            return default if observed is None else cls(names[0], observed)
         part, owners = parts[0] if parts else role(None, Update), filter.update_modules
         if len(found) > 1:
             owners = [part, *(module for module in owners if unravel_key(part.predicted_key) in writes(module))]
         model = next((part for module in owners for part in module.modules() if hasattr(part, "observe")), None)
-        noise = (*part.reading_keys[1:], ("sensor", "noise"))[0]
-        return cls(names[0], keys.observed or part.observed_key or "observed", unravel_key(noise), model)
+        noise = unravel_key((*part.reading_keys[1:], default.noise)[0])
+        return cls((read or names)[0], observed or part.observed_key or default.observed, noise, model)
 
 
 class Labels(NamedTuple):
@@ -207,22 +208,6 @@ class Truth:
             raise diagnosis().missing_entry(type(self.loss).__name__, [key], source.keys(True, True), cure)
         return value
 
-    @property
-    def reading(self) -> Reading:
-        """The reading that the loss scores.
-
-        Raises:
-            ValueError: if the filter has several sensors, and none is named.
-        """
-        if self.loss.reading is None:
-            structure = self.loss.filter.structure
-            there = [*filter(is_samples, structure.frame_keys)] or list(structure.readings)
-            raise ValueError(
-                f"The filter has several sensors, with {there}: name the one that is scored, set_keys(sensor=NAME or "
-                "its key), or set the weight of the term to 0."
-            )
-        return self.loss.reading
-
     @cached_property
     def counts(self) -> Tensor:
         """Marks the elements that the filter stepped to, ``[*B]``."""
@@ -239,7 +224,7 @@ class Truth:
 
     def visible(self) -> Labels:
         """Returns whether the sensor sees, ``[*B, 1]``, where that is known and there is a reading."""
-        values, mask = self.entry(self.keys.target_visible, given=True), self.out.get(self.reading.observed, None)
+        values, mask = self.entry(self.keys.target_visible, given=True), self.out.get(self.loss.reading.observed, None)
         values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
         labels = self._labels("visible", values, 1)
         return labels if mask is None else labels._replace(mask=labels.mask & mask.any(-1, keepdim=True))

@@ -127,7 +127,7 @@ class Noise(Term):
 
     def forward(self, out, truth):
         samples, labels = sensor_samples(truth)
-        noise = truth.entry(truth.keys.noise or truth.reading.noise, "R must follow from frames alone. ")
+        noise = truth.entry(truth.keys.noise or truth.loss.reading.noise, "R must follow from frames alone. ")
         error = labels.errors(samples).mean(-2)
         return score_gaussian(error, labels.mask, as_covariance(noise, error), "nll", labels.scale), labels.rows
 
@@ -153,11 +153,12 @@ class Observation(Term):
     of_frames = True
 
     def forward(self, out, truth):
-        model = truth.reading.model
+        model = truth.loss.reading.model
         if model is None:
             raise KeyError(
                 "loss_observation is of a model with an observe() method, and the filter has no observation model with "
-                "one. Set the weight observation=0."
+                "one, or one for each of several sensors: name one, set_keys(sensor=NAME). Or set the weight "
+                "observation=0."
             )
         state = truth.whole_state()
         observation = model.observe(state.values)
@@ -300,21 +301,21 @@ def sensor_samples(truth: Truth) -> tuple[Tensor, Labels]:
     Raises:
         KeyError: if there are no samples, or no true observation.
     """
-    keys, filter, data, reading = truth.keys, truth.loss.filter, truth.data, truth.reading
+    keys, filter, data, reading = truth.keys, truth.loss.filter, truth.data, truth.loss.reading
     target, model = data.get(keys.target_observation, None), reading.model
     if target is None:
         if model is None or learns(model):
-            why = (
-                "has no observation model with an observe() method" if model is None else "learns its observation model"
-            )
+            several = "has no observation model with an observe() method, or several sensors, of which none is named"
+            why = several if model is None else "learns its observation model"
             raise KeyError(
                 f"loss_sensor needs the true observation in {keys.target_observation!r}, because the filter {why}. Add "
-                "the entry, rename it with set_keys(target_observation=...), or set the weight sensor=0.0."
+                "the entry, or rename it with set_keys(target_observation=...); name a sensor, set_keys(sensor=...); "
+                "or set the weight sensor=0.0."
             )
         target = truth.observed_state(model.observe)
-    written = reading.samples in (*filter.structure.frame_keys, *filter.structure.step_keys)
-    cure = "" if written else "No module of the filter writes it: set the weight sensor=0.0. "
-    samples = truth.entry(reading.samples, cure)
+    written = [key for key in (*filter.structure.frame_keys, *filter.structure.step_keys) if beliefs.is_samples(key)]
+    cure = f"The filter writes the samples {written}: name one of several sensors, or set the weight sensor=0.0. "
+    samples = truth.entry(reading.samples, "" if reading.samples in written else cure)
     if samples.ndim == data.ndim + 1:
         samples = samples.unsqueeze(-2)
     labels = truth.observation(target, samples.shape[-1])

@@ -62,7 +62,7 @@ class ObservationLoss(FilterLoss):
         super().__init__(filter, [_terms.Observation()], score="mse", **options)
 
     def _trained(self):
-        return [] if self.reading is None or self.reading.model is None else [self.reading.model]
+        return [] if self.reading.model is None else [self.reading.model]
 
     def _needed(self):
         return [self.tensor_keys.state, self.tensor_keys.target_observation]
@@ -153,8 +153,8 @@ class SensorLoss(FilterLoss):
     def _placed(self):
         """The modules that read frames alone and lead to what is scored: the sensor; R and a head where they are."""
         keys, reading, placed = self.tensor_keys, self.reading, []
-        wanted = set() if reading is None else {reading.samples, reading.observed}
-        wanted |= {unravel_key(keys.noise or reading.noise)} if "noise" in self.weights and reading else set()
+        wanted = {reading.samples, reading.observed}
+        wanted |= {unravel_key(keys.noise or reading.noise)} if "noise" in self.weights else set()
         wanted |= {unravel_key(keys.visible)} if "visible" in self.weights else set()
         for place, module in reversed(self.filter.structure.frames):
             if not wanted.isdisjoint(map(unravel_key, module.out_keys)):
@@ -164,7 +164,7 @@ class SensorLoss(FilterLoss):
 
     def _needed(self):
         """Lists the inputs of the modules, and the true observation, or the state that it follows from."""
-        keys, model = self.tensor_keys, self.reading and self.reading.model
+        keys, model = self.tensor_keys, self.reading.model
         unknown = model is None or _terms.learns(model)
         needed = list(reads_of(self._trained())[0])
         if {"sensor", "noise"} & set(self.weights):

@@ -40,7 +40,7 @@ class LeggedErrors:
         joint_rate: white, rad/s.
 
     Raises:
-        ValueError: if a number is negative.
+        ValueError: if a number is negative or not finite.
     """
 
     gyro: float = math.radians(0.005)
@@ -99,7 +99,7 @@ class LeggedEnv(EnvBase):
         super().__init__(batch_size=[])
         self.errors = LeggedErrors() if errors is None else errors
         if not isinstance(self.errors, LeggedErrors):
-            raise TypeError(f"errors is of LeggedErrors, or None; got {errors!r}")
+            raise TypeError(f"errors must be LeggedErrors or None; got {errors!r}")
         kinematics = LegKinematics(model, feet, imu)
         self.dt, self.on, self.off, self.pushes = dt, on, off, pushes
         check_number("dt", dt, above=0)

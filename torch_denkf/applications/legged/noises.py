@@ -46,5 +46,5 @@ class LeggedNoises:
     accelerometer_bias: float = 0.1
 
     def __post_init__(self):
-        for each in fields(LeggedNoises):
+        for each in fields(self):
             check_number(each.name, getattr(self, each.name), least=0)

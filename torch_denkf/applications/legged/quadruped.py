@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any, Literal
 from xml.etree import ElementTree
 
@@ -73,36 +73,25 @@ def trot(
     return torch.tensor(found)
 
 
-@dataclass(frozen=True)
-class QuadrupedSettings(LeggedNoises):
-    """Sizes and constants of the filter that :func:`quadruped` builds, and its noises.
-
-    Attributes:
-        rows: K, that the contacts read.
-        num_cells: hidden layers of their networks.
-        dt: time step in seconds.
-        kind: the belief.
-    """
-
-    rows: int = 10
-    num_cells: tuple[int, ...] = (48, 48)
-    dt: float = 0.01
-    kind: Literal["DEnKF", "EKF", "UKF"] = "EKF"
-
-
-def quadruped(**settings: Any) -> Filter:
+def quadruped(
+    *,
+    rows: int = 10,
+    num_cells: Sequence[int] = (48, 48),
+    dt: float = 0.01,
+    kind: Literal["DEnKF", "EKF", "UKF"] = "EKF",
+    **noises: float,
+) -> Filter:
     """The filter of dm_control's quadruped with :class:`~torch_denkf.applications.legged.LearnedContacts`, untrained.
 
     ``from_pretrained("quadruped")`` is this filter, trained. It reads what ``last_rows(10, every=5)`` keeps.
 
     Args:
-        **settings: those of :class:`QuadrupedSettings`.
-
-    Raises:
-        TypeError: on a name that is no setting.
+        rows: K, that the contacts read.
+        num_cells: hidden layers of their networks.
+        dt: time step in seconds.
+        kind: the belief.
+        **noises: of :class:`~torch_denkf.applications.legged.LeggedNoises`.
     """
-    model, s = quadruped_env().model, QuadrupedSettings(**settings)
-    contacts = LearnedContacts(model, **QUADRUPED, rows=s.rows, rate=s.rate, num_cells=s.num_cells)
-    filter = legged_filter(model, **QUADRUPED, dt=s.dt, kind=s.kind, noises=s, contacts=contacts)
-    filter.settings, filter.builder = s, "quadruped"
-    return filter
+    model, known = quadruped_env().model, LeggedNoises(**noises)
+    contacts = LearnedContacts(model, **QUADRUPED, rows=rows, rate=known.rate, num_cells=num_cells)
+    return legged_filter(model, **QUADRUPED, dt=dt, kind=kind, noises=known, contacts=contacts)
