@@ -41,6 +41,7 @@ BORDERS = (
     "pretrained",
     "commands",
     "around",
+    "legged",
 )
 KINDS = ("clear", "right", "unclear", "silent", "hang", "crash")
 GOOD = KINDS[:2]
