@@ -21,7 +21,7 @@ from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, che
 from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
 from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
 from torch_denkf.functional.kernels.small_system import LARGEST, solve_written_out
-from torch_denkf.functional.linalg import cholesky, inverse_square_root_difference
+from torch_denkf.functional.linalg import Solver, inverse_square_root_difference
 
 Scheme = Literal["sensor", "perturbed", "etkf", "sakov"]
 Space = Literal["auto", "observation", "ensemble"]
@@ -236,11 +236,9 @@ def _observation_space(
     if torch.compiler.is_compiling() and gram.shape[-1] <= LARGEST:
         increment, square, log_det = solve_written_out(gram, cross, acted_on, mean_shift)
         return increment, transformed, square, log_det
-    factor = cholesky(gram + torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))  # of S, eq. 9
-    log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
-    whitened = torch.linalg.solve_triangular(factor, mean_shift.mT, upper=False)
-    increment = acted_on @ torch.cholesky_solve(cross, factor)  # by the gain K, eq. 11
-    return increment, transformed, whitened.square().sum(-2), log_det
+    solver = Solver(gram + torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))  # with S, eq. 9
+    increment = acted_on @ solver.solve(cross)  # by the gain K, eq. 11
+    return increment, transformed, solver.square(mean_shift.mT), solver.log_det()
 
 
 def _one_after_the_other(
