@@ -289,10 +289,10 @@ PARTS: dict[str, Callable[[str, tuple[str, ...], bool], Iterator[Case]]] = {
 LIMITS: dict[str, int] = {
     "equality": 45,
     "paper": 45,
-    "training": 25,
+    "training": 30,
     "robots": 30,
     "peers": 60,
     "environments": 60,
-    "analysis": 10,
+    "analysis": 20,
     "filters": 85,
 }
