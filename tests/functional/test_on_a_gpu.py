@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
+from tests.waits import NothingWaits
 from torch_denkf.functional import _ensemble_space, analyse
 from torch_denkf.functional.gaussian import solve_for_gain
 from torch_denkf.functional.inflation import random_rotation
@@ -16,17 +16,6 @@ from torch_denkf.functional.linalg import (
     semidefinite_solve,
     solve,
 )
-
-#: What waits for the device, or goes to MAGMA, which a CUDA graph cannot capture.
-WAITS = {"cholesky_solve", "cholesky_inverse", "linalg_qr", "linalg_inv_ex", "linalg_cholesky", "linalg_matrix_exp"}
-WAITS |= {"_linalg_eigh", "_linalg_svd", "linalg_lu_factor_ex", "_linalg_solve_ex", "_linalg_det", "_linalg_slogdet"}
-WAITS |= {"_local_scalar_dense", "nonzero", "is_nonzero", "masked_select", "equal"}
-
-
-class NothingWaits(TorchDispatchMode):
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        assert function.overloadpacket.__name__ not in WAITS, function
-        return function(*args, **(kwargs or {}))
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ from torchrl.modules.tensordict_module.rnn import recurrent_mode
 from torch_denkf._arguments import Checked, check_arguments
 from torch_denkf._checks import check_count
 from torch_denkf._registered import compiler, diagnosis, primers
-from torch_denkf._slices import as_rows, starts_of
+from torch_denkf._slices import as_rows, device_of, starts_of
 from torch_denkf.filters.finish import RUNS, Record, check_belief, own
 from torch_denkf.filters.gather import gather_rows, of_one_robot
 from torch_denkf.filters.noise import Drawn, draw_noise, recorded_draws
@@ -82,7 +82,8 @@ class Filter(Checked, TensorDictSequential):
             stays finite, with one warning; in the state's units squared. ``None`` for no ceiling.
         check_finite: whether a step raises where its new belief is not finite. In a sequence the NaN of a belief that
             diverges goes on to its end. Readings are checked, or rejected, by
-            ``torch_denkf.imperfect.RejectReadings`` in front of the filter.
+            ``torch_denkf.imperfect.RejectReadings`` in front of the filter. On a GPU nothing is looked at: each step
+            would wait for it.
         prefix: name under which all stands that the filter writes, carries on or finds as noise: with ``"imu"`` the
             mean is ``("imu", "belief", "mean")``. Two filters of one environment or policy need one. ``None`` for none.
 
@@ -451,7 +452,7 @@ class Filter(Checked, TensorDictSequential):
         tensordict = self.of_one_robot(tensordict)
         hidden = tensordict.copy()
         for key in {part.mask_key for part in in_role(self.module, Transition)} - {None}:
-            hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=tensordict.device))
+            hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=device_of(tensordict)))
         out = self.step(hidden, without=self.structure.readings)
         written = [key for key in self.out_keys if out.get(key, None) is not None]
         return tensordict.update(out.select(*written))
@@ -512,7 +513,7 @@ class Filter(Checked, TensorDictSequential):
         hidden, mask = dict(entries), role(self.initial, Initial).observed_key
         if without and mask is not None and not entries.keys() >= {*reads(self.initial)[0]}:
             hidden = {**self._nothing(call.batch_size), **entries}
-            hidden[mask] = torch.zeros(*call.batch_size, 1, dtype=torch.bool, device=tensordict.device)
+            hidden[mask] = torch.zeros(*call.batch_size, 1, dtype=torch.bool, device=device_of(tensordict))
         start = self.initial_belief(hidden, call)
         if self.update_at_reset:
             written.update(steps.begin(entries, call, start, bool(without)))
@@ -611,7 +612,7 @@ class Filter(Checked, TensorDictSequential):
         """``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
         size = tensordict.batch_size
         marks = starts_of(tensordict, self.init_key)
-        first = torch.zeros(size, dtype=torch.bool, device=tensordict.device)
+        first = torch.zeros(size, dtype=torch.bool, device=device_of(tensordict))
         first[..., 0] = True
         first = first if marks is None else first | marks.reshape(size)
         if any(tensordict.get(self.outer(previous_key(key)), None) is None for key in self.structure.carry):

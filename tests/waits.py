@@ -1,0 +1,45 @@
+"""What a step on a GPU must not do: wait for the device, copy to it, or call what no CUDA graph captures."""
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+#: Operators that look at numbers, or that torch computes by routines of MAGMA or on the host.
+WAITS = {"cholesky_solve", "cholesky_inverse", "linalg_qr", "linalg_inv_ex", "linalg_cholesky", "linalg_matrix_exp"}
+WAITS |= {"_linalg_eigh", "_linalg_svd", "linalg_lu_factor_ex", "_linalg_solve_ex", "_linalg_det", "_linalg_slogdet"}
+WAITS |= {"_local_scalar_dense", "nonzero", "is_nonzero", "masked_select", "equal", "_unique2"}
+#: Operators that launch nothing.
+VIEWS = {"view", "_unsafe_view", "expand", "t", "transpose", "permute", "slice", "select", "unsqueeze", "squeeze"}
+VIEWS |= {"detach", "alias", "as_strided", "split", "split_with_sizes", "unbind", "diagonal", "lift_fresh", "unfold"}
+VIEWS |= {"empty", "empty_like", "new_empty", "empty_strided", "new_empty_strided", "_reshape_alias", "is_same_size"}
+VIEWS |= {"scalar_tensor", "promote_types"}
+
+
+class NothingWaits(TorchDispatchMode):
+    """Raises where an operator waits for the device, and where one copies to a device."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        name = function.overloadpacket.__name__
+        assert name not in WAITS, f"{function} waits, or is not captured"
+        out = function(*args, **(kwargs or {}))
+        if name in ("_to_copy", "copy_", "index_put_") and isinstance(out, torch.Tensor) and out.device.type != "cpu":
+            moved = [value for value in args if isinstance(value, torch.Tensor) and value.device.type == "cpu"]
+            assert not any(value.ndim for value in moved), f"{function} copies {moved} to the device"
+        return out
+
+
+class Launches(TorchDispatchMode):
+    """Counts the operators that launch something on a GPU, by name."""
+
+    def __init__(self):
+        super().__init__()
+        self.counts = {}
+
+    @property
+    def total(self):
+        return sum(self.counts.values())
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        name = function.overloadpacket.__name__
+        if name not in VIEWS:
+            self.counts[name] = self.counts.get(name, 0) + 1
+        return function(*args, **(kwargs or {}))
