@@ -84,7 +84,10 @@ def test_smoothers(name, device):
 @deviced
 def test_filters_and_smoothers_on_spaces(float64, kind, device):
     data = on_meta(log(4), device)
-    for filter in (make_on_a_space(kind), *([] if kind in ("fused", "gated") else [FixedLag(make_on_a_space(kind), 2)])):
+    for filter in (
+        make_on_a_space(kind),
+        *([] if kind in ("fused", "gated") else [FixedLag(make_on_a_space(kind), 2)]),
+    ):
         filter.to("meta").sequence(data.copy())
         with NothingWaits(), torch.no_grad():
             assert_there(filter.sequence(data.copy()))
