@@ -21,6 +21,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.kernels.small_system import on_gpu
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean, weighted_median, weighted_var
@@ -158,6 +159,8 @@ class Ensemble(Belief):
         """Moves the members with their mean and variances; where nothing is clamped, not even by rounding."""
         out, factor, mean = super().limited(held, ceiling), self._factor(held, ceiling), held["mean"].unsqueeze(-2)
         ensemble, now = held["ensemble"], out["mean"].unsqueeze(-2)
+        if self.space is None and on_gpu(ensemble):  # in few launches; a factor of one leaves all digits
+            return {**out, "ensemble": torch.lerp(now, ensemble - (mean - now), factor.unsqueeze(-2))}
         if self.space is None:
             same = (factor.unsqueeze(-2) == 1) & (now == mean)
             moved = now + (ensemble - mean) * factor.unsqueeze(-2)

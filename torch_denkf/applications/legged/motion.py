@@ -218,7 +218,7 @@ class LeggedMotionNoise(SubModel):
     def compute(self, *entries):
         """Variances, or the covariance."""
         mean, (contact, *more) = (None, entries) if self.ensemble else (entries[0], entries[1:])
-        dt = self.slip.new_tensor(self.dt) if len(more) == self.learned else more[-1].to(self.slip.dtype)
+        dt = self.slip.new_full((), self.dt) if len(more) == self.learned else more[-1].to(self.slip.dtype)
         slip = more[0] * dt if self.learned else self.slip
         base = (self.base * dt**self.powers).expand(*contact.shape[:-1], 15)
         var = torch.cat([base, torch.where(contact, slip * dt, self.air).repeat_interleave(3, -1)], -1)

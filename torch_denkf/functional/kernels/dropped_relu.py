@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_denkf.functional.kernels.small_system import on_gpu
+
 __all__ = ["dropped_relu"]
 
 
@@ -49,6 +51,8 @@ class _DroppedReLU(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple:
         (output,) = ctx.saved_tensors
+        if on_gpu(output):
+            return torch.ops.aten.threshold_backward(gradient, output, 0) * ctx.kept, None, None
         return gradient * (output.sign() * ctx.kept), None, None
 
 

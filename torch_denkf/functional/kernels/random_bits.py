@@ -12,6 +12,8 @@ from math import prod
 
 import torch
 
+from torch_denkf.functional.kernels.small_system import on_gpu
+
 __all__ = ["dropout_factor", "random_bytes", "random_keep_mask", "random_signs", "representable_rate"]
 
 _INT64_MIN = -(2**63)
@@ -95,6 +97,8 @@ def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torc
     kept = 1 / (1 - rate)
     if draws.dtype == torch.bool:
         return draws.to(dtype) * kept
+    if on_gpu(draws):
+        return torch.where(draws >= round(256 * rate), draws.new_full((), kept, dtype=dtype), 0)
     # From byte to byte the line rises by 1024, more than twice the largest factor (256): at the first byte that is
     # kept it stands at twice the factor, at the one before below zero, whatever the rounding. So the ends are exact.
     line = draws.to(torch.promote_types(dtype, torch.float32))  # a copy, so in place from here

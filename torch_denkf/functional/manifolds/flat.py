@@ -152,7 +152,8 @@ class Flat(Space):
         if len(self.circular) == self.size:
             return of_circles(*values)
         if len(self._runs) > _RUNS:
-            turns = torch.tensor([index in self.circular for index in range(self.size)], device=values[0].device)
+            place = torch.arange(self.size, device=values[0].device)
+            turns = sum(((place == index) for index in self.circular[1:]), place == self.circular[0])
             both = zip(of_circles(*values), of_lines(*values), strict=True)
             return tuple(torch.where(turns, circles, lines) for circles, lines in both)
         runs = zip(*(value.split([count for _, count in self._runs], -1) for value in values), strict=True)
