@@ -73,6 +73,29 @@ def test_recorded_is_eager_forward_and_backward(float64, reruns, chunk):
         assert_same(graph.step(row.copy())["belief"].values(), eager.step(row.copy())["belief"].values())
 
 
+@pytest.mark.parametrize("resets", [False, True])
+def test_one_compiled_step_is_recorded_as_often_as_the_sequence_is_long(float64, reruns, resets):
+    torch._dynamo.reset()
+    torch._dynamo.utils.counters.clear()
+    eager, graph = pair()
+    graph.compile(mode="graph", backend="aot_eager")
+    frames = noisy_frames(eager, 2, 5)
+    if resets:
+        frames["is_init"] = torch.zeros(2, 5, 1, dtype=torch.bool)
+        frames["is_init"][1, 3] = True
+    (expected, theirs), (out, ours) = gradients(eager, frames), gradients(graph, frames)
+    assert_same([out[key] for key in graph.out_keys], [expected[key] for key in graph.out_keys])
+    assert_same(ours, theirs)
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == 1
+    ours, theirs = (model.sequence(frames.copy(), detach_every=2)["belief", "mean"] for model in (graph, eager))
+    assert_same(
+        *(torch.autograd.grad(mean.sum(), list(m.parameters())) for mean, m in ((ours, graph), (theirs, eager)))
+    )
+    row = expected[:, 2].detach()
+    with torch.no_grad():
+        assert_same(graph.step(row.copy())["belief"].values(), eager.step(row.copy())["belief"].values())
+
+
 @every_filter
 def test_every_filter_recorded_is_eager(float64, reruns, name):
     filter, frames = with_noise(name, 3, 5, width=2)

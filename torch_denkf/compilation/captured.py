@@ -5,9 +5,9 @@ from __future__ import annotations
 import warnings
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,8 @@ from torch_denkf._checks import check_count
 from torch_denkf.compilation.compared import placed, put_back, tensors
 from torch_denkf.compilation.compiled import CompiledSteps
 from torch_denkf.filters.scan import Steps
+from torch_denkf.filters.structure import Structure
+from torch_denkf.submodel import Call, Entries
 
 __all__ = ["CapturedSteps"]
 
@@ -61,7 +63,8 @@ class CudaRecorder:
                     finally:
                         torch.cuda.set_sync_debug_mode(before)
             torch.cuda.current_stream(self.device).wait_stream(self.stream)
-        return sorted({f"{w.filename}:{w.lineno}" for w in said if "synchroniz" in str(w.message)})
+        # Turning the mode on warns, too, once in a process.
+        return sorted({f"{w.filename}:{w.lineno}" for w in said if "called a synchronizing" in str(w.message)})
 
     def record(self, run: Callable) -> Callable:
         """Returns a function that replays what ``run`` launches, and returns the tensors that it returned."""
@@ -87,7 +90,7 @@ class CapturedSteps(CompiledSteps):
 
     Args:
         chunk: steps of a sequence in one graph; ``None`` for all. What is left over is a graph, too.
-        options: ``mode="graph"``; with others of ``torch.compile``, what it compiles is recorded.
+        options: ``mode="graph"``; with others of ``torch.compile``, it compiles one step, and graphs hold that.
     """
 
     made, maker = "recorded", "CUDA's graphs"
@@ -107,7 +110,7 @@ class CapturedSteps(CompiledSteps):
     def _length(self, left: int) -> int:
         return min(self.chunk or left, left)
 
-    def _made(self, function: Callable, steps: Steps, device: torch.device) -> Callable:
+    def _made(self, make: partial, steps: Steps, device: torch.device) -> Callable:
         if device.type != "cuda" and self.recorder is CudaRecorder:
             if not self._said:
                 self._said = True
@@ -116,15 +119,76 @@ class CapturedSteps(CompiledSteps):
                     "filter.compile() compiles for a processor.",
                     stacklevel=2,
                 )
-            return function
-        if self._compiler_options():
-            function = super()._made(function, steps, device)
-        structure = steps.structure
+            return make()
+        options, structure = self._compiler_options(), steps.structure
+        function = make() if options is None else make.func(StepByStep(Unchecked(1, options), steps), *make.args[1:])
         placed_modules = (*structure.modules, *structure.posterior)
         return Captured(function, [module for _, module in placed_modules], partial(self.recorder, device))
 
     def _checked(self, device: torch.device) -> bool:
         return device.type == "cuda" or self.recorder is not CudaRecorder
+
+
+class Unchecked(CompiledSteps):
+    """Compiled steps whose results are compared elsewhere."""
+
+    def _checked(self, device: torch.device) -> bool:
+        return False
+
+
+class StepByStep(NamedTuple):
+    """One compiled step, called in a loop: a recording needs no longer function, whose compiling takes minutes.
+
+    Attributes:
+        compiled: the function.
+        steps: eager steps.
+    """
+
+    compiled: CompiledSteps
+    steps: Steps
+
+    @property
+    def structure(self) -> Structure:
+        """Returns the filter's."""
+        return self.steps.structure
+
+    def step(self, entries: Entries, call: Call) -> Entries:
+        """Takes one step."""
+        with _backward_again():
+            return self.compiled.step(self.steps, entries, call.batch_size)
+
+    def scan(self, carry, inputs, call: Call, resets, starts, cuts, keep) -> tuple[Entries, Entries]:
+        """Takes one step after the other, all of one kind: where one may reset rows, each may."""
+        time, outputs = len(call.batch_size), []
+        for t, cut in enumerate(cuts):
+            carry = {key: _of_one_kind(value.detach() if cut else value) for key, value in carry.items()}
+            reset, start = resets, starts
+            if resets is not None:
+                may = t < resets.shape[time]
+                reset, start = resets.narrow(time, t if may else 0, 1), _at(starts, time, t if may else 0)
+                reset = reset if may else torch.zeros_like(reset)
+            now = _at(inputs, time, t)
+            with _backward_again():
+                carry, out = self.compiled.scan(self.steps, carry, now, call, reset, start, (False,), keep)
+            outputs.append(out)
+        return carry, {key: torch.cat([out[key] for out in outputs], time) for key in keep}
+
+
+def _of_one_kind(value: Tensor) -> Tensor:
+    """Lays a belief out as any step's, with a gradient as any step's: torch.compile compiles again for another."""
+    free = torch.is_grad_enabled() and value.is_floating_point() and not value.requires_grad
+    return (value.detach().requires_grad_() if free else value).contiguous()
+
+
+def _at(entries: Entries, time: int, t: int) -> Entries:
+    return {key: value.narrow(time, t, 1) for key, value in entries.items()}
+
+
+def _backward_again() -> AbstractContextManager:
+    """Keeps what a compiled backward pass reads: warm runs and the recording read it, one after the other."""
+    import torch._functorch.config as config
+
+    return config.patch(donated_buffer=False)
 
 
 class Captured:

@@ -98,7 +98,7 @@ class CompiledSteps:
         """Returns the number of steps in the next graph of a sequence."""
         return self.chunk if left >= self.chunk else 1
 
-    def _call(self, kind: tuple, steps: Steps, make: Callable, inputs: tuple, names: tuple, writes: tuple) -> tuple:
+    def _call(self, kind: tuple, steps: Steps, make: partial, inputs: tuple, names: tuple, writes: tuple) -> tuple:
         """Runs the compiled function of a kind; on a miss, compiles it and compares it with the eager one.
 
         Args:
@@ -116,7 +116,7 @@ class CompiledSteps:
         device = some.device
         kind = (*kind, steps.structure.modules, steps.update_at_reset, device)
         if kind not in self._functions:
-            self._functions[kind] = self._made(make(), steps, device), set()
+            self._functions[kind] = self._made(make, steps, device), set()
         function, compared = self._functions[kind]
         mode = torch.is_grad_enabled(), some.dtype  # torch.compile compiles again for each
         if mode not in compared and self._checked(device) and has_values(some):
@@ -138,8 +138,9 @@ class CompiledSteps:
         out = function(*inputs)
         return placed(out, (value.clone() for value in tensors(out))) if self._overwrites(device) else out
 
-    def _made(self, function: Callable, steps: Steps, device: torch.device) -> Callable:
+    def _made(self, make: partial, steps: Steps, device: torch.device) -> Callable:
         """Compiles a function of these steps."""
+        function = make()
         if self._by_inductor():
             clear_damaged_libraries()
         # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
