@@ -9,7 +9,6 @@ from tests.filters.test_contract import FILTERS, every_filter, readings
 from tests.waits import NothingWaits
 from torch_denkf.functional.kernels import small_system
 
-#: Of the contract's filters, those that say what they read, so that it may be missing.
 deviced = pytest.mark.parametrize("device", ["meta", None], ids=["device", "no device"])
 
 
@@ -59,16 +58,14 @@ WAYS = {
 
 
 @every_filter
-@pytest.mark.parametrize("way", WAYS)
 @deviced
-def test_each_way_to_run_stays_on_the_device_and_waits_for_nothing(name, way, device):
+def test_each_way_to_run_stays_on_the_device_and_waits_for_nothing(name, device):
     filter, frames, start = filtered(name, device)
-    if way in ("predict", "policy"):  # what has a belief of its own beside the carry
-        start = start.clone()
-    with torch.set_grad_enabled(way == "training"):
-        WAYS[way](filter, frames, start)  # what is looked up once
-        with NothingWaits():
-            assert_there(WAYS[way](filter, frames, start))
+    for way, run in WAYS.items():
+        with torch.set_grad_enabled(way == "training"):
+            run(filter, frames, start)  # what is looked up once
+            with NothingWaits():
+                assert_there(run(filter, frames, start))
 
 
 @every_filter
