@@ -338,7 +338,7 @@ class Filter(Checked, TensorDictSequential):
         actions = {key: self.outer(previous_key(key)) for key in self.structure.controls}
         return primers().LastAction(actions, primers=found)
 
-    def compile(self, *, chunk: int = 4, **options) -> Filter:
+    def compile(self, *, chunk: int | None = None, **options) -> Filter:
         """From now on runs steps, and sequences in chunks of steps, through ``torch.compile``.
 
         The first call of each kind (chunk, batch size, with or without gradients) compiles, later ones reuse that;
@@ -350,9 +350,15 @@ class Filter(Checked, TensorDictSequential):
         or missing both run again with numbers in it; a sequence with gradients is differentiated both ways, too. What
         differs by more than rounding raises.
 
+        On a GPU an eager step waits for its launches. ``mode="graph"`` compiles nothing: it records what the eager
+        steps launch, and their backward pass, in CUDA graphs, in about the time of a few eager calls. There a number
+        that is no tensor, such as an inflation, stays the one of the recording; on a processor it warns, and runs
+        eagerly.
+
         Args:
-            chunk: steps of a sequence in one compiled graph. What is left over after whole chunks runs step by step. A
-                small chunk compiles sooner, a large one runs faster. 0 goes back to eager.
+            chunk: steps of a sequence in one compiled graph, 4 by default. What is left over after whole chunks runs
+                step by step. A small chunk compiles sooner, a large one runs faster. 0 goes back to eager. With
+                ``mode="graph"`` by default all steps are in one.
             **options: of ``torch.compile``. Without any, inductor on a processor writes what calls its kernels in C++,
                 too, makes fewer calls, and saves fewer tensors for the backward pass, which takes longer to compile and
                 about 40 % less to run; ``backend="inductor"`` alone leaves that out. On a GPU
@@ -366,8 +372,7 @@ class Filter(Checked, TensorDictSequential):
                 wrong.
             ValueError: if ``chunk`` is negative.
         """
-        check_count("chunk", chunk, least=0, cure="It is a number of steps, or 0 for none")
-        self.compiled = compiler().CompiledSteps(chunk, options) if chunk else None
+        self.compiled = None if chunk == 0 else compiler().strategy(chunk, options)
         return self
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

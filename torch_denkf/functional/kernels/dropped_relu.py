@@ -41,7 +41,8 @@ class _DroppedReLU(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor, factor: Tensor, kept: float) -> Tensor:
-        return (x * factor).relu_()
+        # Traced, nothing is changed in place: of tensors on CUDA the saved result lost its gradient (torch 2.11).
+        return (x * factor).relu() if torch.compiler.is_compiling() else (x * factor).relu_()
 
     @staticmethod
     def setup_context(ctx, inputs: tuple, output: Tensor) -> None:
