@@ -23,6 +23,9 @@ class NothingWaits(TorchDispatchMode):
         name = function.overloadpacket.__name__
         there = any(isinstance(value, torch.Tensor) and value.device.type in small_system.GPUS for value in args)
         assert not there or name not in WAITS, f"{function} waits, or is not captured"
+        if there and name in ("index", "index_put_", "_index_put_impl_", "index_put"):
+            numbers = [value for value in args[1] if value is not None and value.device.type == "cpu"]
+            assert args[0].device.type == "cpu" or not numbers, f"{function} copies {numbers} to the device"
         out = function(*args, **(kwargs or {}))
         if name in ("_to_copy", "copy_", "index_put_") and isinstance(out, torch.Tensor) and out.device.type != "cpu":
             moved = [value for value in args if isinstance(value, torch.Tensor) and value.device.type == "cpu"]

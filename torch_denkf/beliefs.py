@@ -117,7 +117,9 @@ class Belief:
         return out
 
     def _factor(self, held: Mapping[str, Tensor], ceiling: float) -> Tensor:
-        return (held["var"] / ceiling).clamp(min=1).rsqrt()
+        # On a GPU, where each step computes it, it is a constant to the gradient: that through it took ten launches.
+        var = held["var"].detach() if on_gpu(held["var"]) else held["var"]
+        return (var / ceiling).clamp(min=1).rsqrt()
 
     def _within_reach(self, mean: Tensor, ceiling: float) -> Tensor:
         farthest = _FARTHEST * sqrt(ceiling)

@@ -11,6 +11,7 @@ from tensordict.utils import expand_as_right
 from torch import Tensor
 
 from torch_denkf.filters.structure import RESUMES, Placed, Structure, previous_key, takes_reading
+from torch_denkf.functional.kernels.shared_gradients import sharing
 from torch_denkf.running import is_sequence, named_modules_of, reads, run_module
 from torch_denkf.submodel import Call, Entries, Transition, Update, role
 
@@ -122,6 +123,7 @@ class Steps(NamedTuple):
         every = torch.ones(*call.batch_size, 1, dtype=torch.bool, device=next(iter(start.values())).device)
         return self.step(entries, call, frames=False, reset=every, start=start, forecast=forecast, partial=partial)
 
+    @sharing
     def scan(
         self,
         carry: Entries,

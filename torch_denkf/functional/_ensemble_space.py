@@ -46,7 +46,7 @@ def solve_ensemble_space(gram: Tensor, right: Tensor, *, square_root: bool) -> t
     size = gram.shape[-1]
     free = gram.detach().diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)  # c
     gram = gram + (free / size).unsqueeze(-1)
-    solver = Solver(gram + torch.eye(size, dtype=gram.dtype, device=gram.device))
+    solver = Solver(gram, ridge=1)
     log_det = solver.log_det() - free.log1p()
     return solver.solve(right).mT, inverse_square_root(gram) if square_root else None, log_det
 

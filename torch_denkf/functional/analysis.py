@@ -236,7 +236,7 @@ def _observation_space(
     if torch.compiler.is_compiling() and gram.shape[-1] <= LARGEST:
         increment, square, log_det = solve_written_out(gram, cross, acted_on, mean_shift)
         return increment, transformed, square, log_det
-    solver = Solver(gram + torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))  # with S, eq. 9
+    solver = Solver(gram, ridge=1)  # with S, eq. 9
     increment = acted_on @ solver.solve(cross)  # by the gain K, eq. 11
     return increment, transformed, solver.square(mean_shift.mT), solver.log_det()
 

@@ -115,14 +115,17 @@ class Solver:
 
     Args:
         matrix: M, ``[*B, N, N]``.
+        ridge: is added to the diagonal.
     """
 
-    def __init__(self, matrix: Tensor):
+    def __init__(self, matrix: Tensor, ridge: float = 0):
         self.inverse = self.factor = None
-        if not on_gpu(matrix):
-            self.factor = cholesky(matrix)
+        if on_gpu(matrix):
+            self.inverse, self.log = (_Inverse.apply if _differentiated() else inverse_of)(matrix, ridge)
         else:
-            self.inverse, self.log = _Inverse.apply(matrix) if _differentiated() else inverse_of(matrix)
+            if ridge:
+                matrix = matrix + ridge * torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+            self.factor = cholesky(matrix)
 
     def solve(self, right: Tensor) -> Tensor:
         """Returns M⁻¹ Y, ``[*B, N, K]``."""
@@ -165,17 +168,17 @@ class _Inverse(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(matrix: Tensor) -> tuple[Tensor, Tensor]:
-        return inverse_of(matrix)
+    def forward(matrix: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
+        return inverse_of(matrix, ridge)
 
     @staticmethod
     def setup_context(ctx, inputs, output) -> None:
         ctx.save_for_backward(output[0])
 
     @staticmethod
-    def backward(ctx, gradient: Tensor, of_log: Tensor) -> Tensor:
+    def backward(ctx, gradient: Tensor, of_log: Tensor) -> tuple[Tensor, None]:
         (inverse,) = ctx.saved_tensors
-        return inverse * of_log.unsqueeze(-1) - inverse @ gradient @ inverse
+        return inverse * of_log.unsqueeze(-1) - inverse @ gradient @ inverse, None
 
 
 def _correlation(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -26,6 +26,7 @@ from torch.nn import functional as F
 from torch_denkf._checks import check_choice, check_count, check_number
 from torch_denkf.functional.kernels.dropped_relu import dropped_relu
 from torch_denkf.functional.kernels.random_bits import dropout_factor, random_bytes, random_signs, representable_rate
+from torch_denkf.functional.kernels.shared_gradients import shared, shares
 
 __all__ = ["FlipoutLinear", "StochasticMLP", "deterministic"]
 
@@ -232,6 +233,8 @@ class StochasticMLP(nn.Module):
             run = list(zip(self.layers, (*factors, None), strict=True))
         else:
             run = list(zip(self.layers, repeat(None)))
+        if shares():
+            run = [(shared(layer), factor) for layer, factor in run]
         hidden, recorded = x, torch.is_grad_enabled()
         for layer, factor in run[:-1]:
             hidden = layer(hidden)

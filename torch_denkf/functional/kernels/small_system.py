@@ -26,13 +26,14 @@ def on_gpu(tensor: Tensor) -> bool:
     return tensor.device.type in GPUS
 
 
-def inverse_of(matrix: Tensor) -> tuple[Tensor, Tensor]:
+def inverse_of(matrix: Tensor, ridge: float = 0) -> tuple[Tensor, Tensor]:
     """The inverse of a symmetric M, N x N, and log det M, in few launches and without a look at the numbers.
 
     Up to :data:`LARGEST` rows of M and of the identity are eliminated one after the other; larger ones are factored.
 
     Args:
         matrix: M, ``[*B, N, N]``, with both triangles.
+        ridge: is added to the diagonal.
 
     Returns:
         M⁻¹, ``[*B, N, N]``, and log det M, ``[*B, 1]``. NaN where M is not positive definite.
@@ -45,6 +46,7 @@ def inverse_of(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """
     size = matrix.shape[-1]
     identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    matrix = torch.add(matrix, identity, alpha=ridge) if ridge else matrix
     if not 0 < size <= LARGEST:
         factor, info = torch.linalg.cholesky_ex(matrix)
         factor = torch.where((info == 0)[..., None, None], factor, torch.nan)
