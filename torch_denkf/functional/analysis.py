@@ -154,7 +154,8 @@ def _in_few_launches(
     forecast: Tensor, predicted: Tensor, samples: Tensor, noise: Tensor, observed: Tensor | None
 ) -> Analysis:
     """Updates by samples of the reading, for a GPU: one mean, one difference and one product of all there is."""
-    (size, dim), count = predicted.shape[-2:], predicted.shape[-1]
+    size, dim = predicted.shape[-2:]
+    count: int | Tensor = dim
     if observed is not None:
         members = observed.unsqueeze(-2)
         predicted, samples = torch.where(members, predicted, 0), torch.where(members, samples, 0)
@@ -166,7 +167,7 @@ def _in_few_launches(
     solver = Solver(gram + ((size - 1) * noise).diag_embed())  # (E - 1) S, eq. 9
     ensemble = forecast + shift @ solver.solve(cross)  # eqs. 11 and 12
     if observed is not None:
-        ensemble = torch.where((count > 0).unsqueeze(-1), ensemble, forecast)
+        ensemble = torch.where(observed.any(-1)[..., None, None], ensemble, forecast)
     innovation = shift.mean(-2)
     log_det = solver.log_det() - dim * math.log(size - 1)
     return Analysis(ensemble, innovation, *scores(solver.square(innovation.unsqueeze(-1)), log_det, 0, count, size))

@@ -54,14 +54,17 @@ def shares() -> bool:
 
 def shared(layer: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     """Returns a linear layer whose gradient the steps share; any other layer as it is."""
-    plain = type(layer) is nn.Linear and layer.bias is not None and layer.weight.requires_grad
-    if not plain or not layer.bias.requires_grad or layer._forward_hooks or layer._forward_pre_hooks:
+    if not isinstance(layer, nn.Linear) or type(layer) is not nn.Linear or _STATE.layers is None:
+        return layer
+    trained = layer.weight.requires_grad and layer.bias is not None and layer.bias.requires_grad
+    if not trained or layer._forward_hooks or layer._forward_pre_hooks:
         return layer
     if layer not in _STATE.layers:
         kept = _Kept()
         _STATE.layers[layer] = _Gather.apply(layer.weight, layer.bias, kept), kept
     token, kept = _STATE.layers[layer]
-    return lambda x: _Product.apply(x, layer.weight.detach(), layer.bias.detach(), token, kept)
+    weight, bias = layer.weight.detach(), layer.bias.detach()
+    return lambda x: _Product.apply(x, weight, bias, token, kept)
 
 
 class _Kept:
