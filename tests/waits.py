@@ -1,6 +1,7 @@
 """What a step on a GPU must not do: wait for the device, copy to it, or call what no CUDA graph captures."""
 
 import torch
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torch_denkf.functional.kernels import small_system
@@ -16,8 +17,28 @@ VIEWS |= {"empty", "empty_like", "new_empty", "empty_strided", "new_empty_stride
 VIEWS |= {"scalar_tensor", "promote_types"}
 
 
+class _NoLists(TorchFunctionMode):
+    """Raises where a list picks components: torch copies it to the device, and waits, before any operator is called."""
+
+    def __torch_function__(self, function, types, args=(), kwargs=None):
+        if function in (torch.Tensor.__getitem__, torch.Tensor.__setitem__):
+            places = args[1] if isinstance(args[1], tuple) else (args[1],)
+            lists = [place for place in places if isinstance(place, list)]
+            assert not lists or args[0].device.type == "cpu", f"{lists} is copied to the device"
+        return function(*args, **(kwargs or {}))
+
+
 class NothingWaits(TorchDispatchMode):
     """Raises where an operator waits for a device among ``small_system.GPUS``, and where one copies to a device."""
+
+    def __enter__(self):
+        self.lists = _NoLists()
+        self.lists.__enter__()
+        return super().__enter__()
+
+    def __exit__(self, *error):
+        self.lists.__exit__(*error)
+        return super().__exit__(*error)
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         name = function.overloadpacket.__name__

@@ -50,9 +50,10 @@ class LegReadings(SubModel):
         for key, size, value in zip(self.in_keys, sizes, (imu, joints, contact, rates), strict=False):
             if value.shape[-1:] != (size,):
                 raise ValueError(f"{key!r} of this robot is [*B, {size}]; got {list(value.shape)}.")
-        feet = self.module(joints.to(self.module.base.dtype))
-        out = feet.flatten(-2), contact.repeat_interleave(3, -1), self._start(imu[..., 3:].to(feet.dtype), feet)
-        return out if rates is None else (*out, self.module.velocities(joints, rates).flatten(-2))
+        joints = joints.to(kinematics.base.dtype)
+        feet, *moves = [kinematics(joints)] if rates is None else kinematics.moving(joints, rates.to(joints.dtype))
+        begin = self._start(imu[..., 3:].to(feet.dtype), feet)
+        return feet.flatten(-2), contact.repeat_interleave(3, -1), begin, *(value.flatten(-2) for value in moves)
 
     def _start(self, force: Tensor, feet: Tensor) -> Tensor:
         sensor = self.module.base
