@@ -117,9 +117,7 @@ class Belief:
         return out
 
     def _factor(self, held: Mapping[str, Tensor], ceiling: float) -> Tensor:
-        # On a GPU, where each step computes it, it is a constant to the gradient: that through it took ten launches.
-        var = held["var"].detach() if on_gpu(held["var"]) else held["var"]
-        return (var / ceiling).clamp(min=1).rsqrt()
+        return (held["var"] / ceiling).clamp(min=1).rsqrt()
 
     def _within_reach(self, mean: Tensor, ceiling: float) -> Tensor:
         farthest = _FARTHEST * sqrt(ceiling)
@@ -159,10 +157,14 @@ class Ensemble(Belief):
 
     def limited(self, held, ceiling):
         """Moves the members with their mean and variances; where nothing is clamped, not even by rounding."""
+        if self.space is None and "cov" not in held and on_gpu(held["mean"]):
+            # In few launches: a factor of one leaves all digits. It is a constant to the gradient.
+            factor = (held["var"].detach() / ceiling).clamp_(min=1).rsqrt_().unsqueeze(-2)
+            now = self._within_reach(held["mean"], ceiling)
+            moved = torch.lerp(now.unsqueeze(-2), held["ensemble"] - (held["mean"] - now).unsqueeze(-2), factor)
+            return {"mean": now, "var": held["var"].clamp(max=ceiling), "ensemble": moved}
         out, factor, mean = super().limited(held, ceiling), self._factor(held, ceiling), held["mean"].unsqueeze(-2)
         ensemble, now = held["ensemble"], out["mean"].unsqueeze(-2)
-        if self.space is None and on_gpu(ensemble):  # in few launches; a factor of one leaves all digits
-            return {**out, "ensemble": torch.lerp(now, ensemble - (mean - now), factor.unsqueeze(-2))}
         if self.space is None:
             same = (factor.unsqueeze(-2) == 1) & (now == mean)
             moved = now + (ensemble - mean) * factor.unsqueeze(-2)

@@ -16,4 +16,5 @@ from torch_denkf.compilation.libraries import clear_full_cache as clear_full_cac
 from torch_denkf.compilation.options import need_compiler as need_compiler
 from torch_denkf.compilation.options import options_for_processors as options_for_processors
 from torch_denkf.compilation.options import worth_checking as worth_checking
+from torch_denkf.compilation.shared_gradients import sharing as sharing
 from torch_denkf.compilation.tracing import trace_below_autograd as trace_below_autograd

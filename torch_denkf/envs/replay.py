@@ -89,6 +89,8 @@ class ReplayEnv(RowsEnv):
         (torch.Size([2, 9, 2]), True)
     """
 
+    _turn: Tensor
+
     def __init__(
         self,
         data: EpisodeReplay,
@@ -154,7 +156,7 @@ class ReplayEnv(RowsEnv):
 
     def _set_seed(self, seed: int | None) -> None:
         super()._set_seed(seed)
-        self._turn = 0
+        self._turn = torch.tensor(0, device=self.device)
 
     def _row(self, row: Tensor) -> TensorDict:
         rows = self.data[row.reshape(-1).to(getattr(self.data, "device", None) or "cpu")].reshape(self.batch_size)

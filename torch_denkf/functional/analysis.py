@@ -20,7 +20,7 @@ from torch import Tensor
 from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape, check_shapes
 from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
 from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
-from torch_denkf.functional.kernels.small_system import LARGEST, solve_written_out
+from torch_denkf.functional.kernels.small_system import LARGEST, on_gpu, solve_written_out
 from torch_denkf.functional.linalg import Solver, inverse_square_root_difference
 
 Scheme = Literal["sensor", "perturbed", "etkf", "sakov"]
@@ -124,6 +124,8 @@ def analyse(
         tiled = partial(analyse_in_tiles, scheme=scheme, columns=columns, rotation=rotation)
         return Analysis(*tiled(*given, observed=observed, perturbation=perturbation))
 
+    if on_gpu(forecast) and scheme == "sensor" and in_observation_space and taper is None and significance is None:
+        return _in_few_launches(*given, observed)
     samples = observation if observation.ndim == forecast.ndim else observation.unsqueeze(-2)
     reading = whiten(predicted, samples, noise, observed)  # eqs. 6 to 8
     mean = forecast.mean(-2, keepdim=True)
@@ -146,6 +148,29 @@ def analyse(
         ensemble = torch.where((count > 0).unsqueeze(-1), ensemble, forecast)
     log_noise = reading.noise.log().sum(-1, keepdim=True)
     return Analysis(ensemble, reading.innovation.squeeze(-2), *scores(square, log_det, log_noise, count, size))
+
+
+def _in_few_launches(
+    forecast: Tensor, predicted: Tensor, samples: Tensor, noise: Tensor, observed: Tensor | None
+) -> Analysis:
+    """Updates by samples of the reading, for a GPU: one mean, one difference and one product of all there is."""
+    size, dim = predicted.shape[-2:]
+    count: int | Tensor = dim
+    if observed is not None:
+        members = observed.unsqueeze(-2)
+        predicted, samples = torch.where(members, predicted, 0), torch.where(members, samples, 0)
+        noise, count = torch.where(observed, noise, 1), observed.expand(noise.shape).sum(-1, keepdim=True)
+    shift = samples - predicted
+    joint = torch.cat([predicted, forecast], -1)
+    anomalies = joint - joint.mean(-2, keepdim=True)
+    gram, cross = (anomalies[..., :dim].mT @ anomalies).split([dim, forecast.shape[-1]], -1)
+    solver = Solver(gram + ((size - 1) * noise).diag_embed())  # (E - 1) S, eq. 9
+    ensemble = forecast + shift @ solver.solve(cross)  # eqs. 11 and 12
+    if observed is not None:
+        ensemble = torch.where(observed.any(-1)[..., None, None], ensemble, forecast)
+    innovation = shift.mean(-2)
+    log_det = solver.log_det() - dim * math.log(size - 1)
+    return Analysis(ensemble, innovation, *scores(solver.square(innovation.unsqueeze(-1)), log_det, 0, count, size))
 
 
 def check_analysis_arguments(

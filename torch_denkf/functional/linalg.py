@@ -119,29 +119,28 @@ class Solver:
     """
 
     def __init__(self, matrix: Tensor, ridge: float = 0):
-        self.inverse = self.factor = None
-        if on_gpu(matrix):
-            self.inverse, self.log = (_Inverse.apply if _differentiated() else inverse_of)(matrix, ridge)
-        else:
-            if ridge:
-                matrix = matrix + ridge * torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-            self.factor = cholesky(matrix)
+        self.direct = on_gpu(matrix)
+        if self.direct:
+            found: tuple[Tensor, Tensor] = (_Inverse.apply if _differentiated() else inverse_of)(matrix, ridge)
+            self.inverse, self.log = found
+            return
+        if ridge:
+            matrix = matrix + ridge * torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+        self.factor = cholesky(matrix)
 
     def solve(self, right: Tensor) -> Tensor:
         """Returns M⁻¹ Y, ``[*B, N, K]``."""
-        return torch.cholesky_solve(right, self.factor) if self.inverse is None else self.inverse @ right
+        return self.inverse @ right if self.direct else torch.cholesky_solve(right, self.factor)
 
     def square(self, vector: Tensor) -> Tensor:
         """Returns rᵀ M⁻¹ r, ``[*B, 1]``, for r ``[*B, N, 1]``."""
-        if self.inverse is not None:
+        if self.direct:
             return (vector.mT @ (self.inverse @ vector)).squeeze(-1)
         return torch.linalg.solve_triangular(self.factor, vector, upper=False).square().sum(-2)
 
     def log_det(self) -> Tensor:
         """Returns log det M, ``[*B, 1]``."""
-        if self.inverse is not None:
-            return self.log
-        return 2 * self.factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+        return self.log if self.direct else 2 * self.factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
 
 
 def divide(left: Tensor, matrix: Tensor) -> Tensor:

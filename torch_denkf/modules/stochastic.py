@@ -26,9 +26,12 @@ from torch.nn import functional as F
 from torch_denkf._checks import check_choice, check_count, check_number
 from torch_denkf.functional.kernels.dropped_relu import dropped_relu
 from torch_denkf.functional.kernels.random_bits import dropout_factor, random_bytes, random_signs, representable_rate
-from torch_denkf.functional.kernels.shared_gradients import shared, shares
 
 __all__ = ["FlipoutLinear", "StochasticMLP", "deterministic"]
+
+
+#: Replaces linear layers, where the steps of a sequence share their gradients.
+LAYERS: list[Callable] = []
 
 
 class FlipoutLinear(nn.Module):
@@ -233,8 +236,8 @@ class StochasticMLP(nn.Module):
             run = list(zip(self.layers, (*factors, None), strict=True))
         else:
             run = list(zip(self.layers, repeat(None)))
-        if shares():
-            run = [(shared(layer), factor) for layer, factor in run]
+        if LAYERS and not torch.compiler.is_compiling():
+            run = [(LAYERS[0](layer), factor) for layer, factor in run]
         hidden, recorded = x, torch.is_grad_enabled()
         for layer, factor in run[:-1]:
             hidden = layer(hidden)

@@ -98,7 +98,7 @@ def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torc
     if draws.dtype == torch.bool:
         return draws.to(dtype) * kept
     if on_gpu(draws):
-        return torch.where(draws >= round(256 * rate), draws.new_full((), kept, dtype=dtype), 0)
+        return torch.where(draws >= round(256 * rate), torch.tensor(kept, dtype=dtype), 0)
     # From byte to byte the line rises by 1024, more than twice the largest factor (256): at the first byte that is
     # kept it stands at twice the factor, at the one before below zero, whatever the rounding. So the ends are exact.
     line = draws.to(torch.promote_types(dtype, torch.float32))  # a copy, so in place from here

@@ -7,17 +7,16 @@ what is to be multiplied, and the layer multiplies what all steps kept.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import wraps
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from threading import local
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torch_denkf.functional.kernels.small_system import on_gpu
+from torch_denkf.modules.stochastic import LAYERS
 
-__all__ = ["shared", "shares", "sharing"]
+__all__ = ["shared", "sharing"]
 
 #: Elements that a layer keeps of its gradients before it multiplies them: 128 MiB in single precision.
 LARGEST_KEPT = 2**25
@@ -30,38 +29,33 @@ class _State(local):
 _STATE = _State()
 
 
-def sharing(scan: Callable) -> Callable:
-    """Decorates a function that takes steps, ``scan(self, carry, ...)``: on a GPU, their layers share gradients."""
-
-    @wraps(scan)
-    def shared_scan(self, carry: dict, *args: Any) -> Any:
-        if torch.compiler.is_compiling() or not torch.is_grad_enabled() or not any(map(on_gpu, carry.values())):
-            return scan(self, carry, *args)
-        before, _STATE.layers = _STATE.layers, {}
-        try:
-            return scan(self, carry, *args)
-        finally:
-            _STATE.layers = before
-
-    return shared_scan
-
-
-def shares() -> bool:
-    """Tells whether steps share the gradients of their layers."""
-    active = not torch.compiler.is_compiling() and _STATE.layers is not None and torch.is_grad_enabled()
-    return active and not torch._C._are_functorch_transforms_active()
+@contextmanager
+def sharing() -> Iterator[None]:
+    """Lets the steps that are taken inside share the gradients of their layers."""
+    if shared not in LAYERS:
+        LAYERS.append(shared)
+    before, _STATE.layers = _STATE.layers, {}
+    try:
+        yield
+    finally:
+        _STATE.layers = before
 
 
 def shared(layer: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     """Returns a linear layer whose gradient the steps share; any other layer as it is."""
-    plain = type(layer) is nn.Linear and layer.bias is not None and layer.weight.requires_grad
-    if not plain or not layer.bias.requires_grad or layer._forward_hooks or layer._forward_pre_hooks:
+    if not isinstance(layer, nn.Linear) or type(layer) is not nn.Linear or _STATE.layers is None:
+        return layer
+    if not torch.is_grad_enabled() or torch._C._are_functorch_transforms_active():
+        return layer
+    trained = layer.weight.requires_grad and layer.bias is not None and layer.bias.requires_grad
+    if not trained or layer._forward_hooks or layer._forward_pre_hooks:
         return layer
     if layer not in _STATE.layers:
         kept = _Kept()
         _STATE.layers[layer] = _Gather.apply(layer.weight, layer.bias, kept), kept
     token, kept = _STATE.layers[layer]
-    return lambda x: _Product.apply(x, layer.weight.detach(), layer.bias.detach(), token, kept)
+    weight, bias = layer.weight.detach(), layer.bias.detach()
+    return lambda x: _Product.apply(x, weight, bias, token, kept)
 
 
 class _Kept:
