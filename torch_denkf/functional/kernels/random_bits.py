@@ -95,10 +95,10 @@ def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torc
         tensor([0.0000, 0.0000, 1.3333, 1.3333])
     """
     kept = 1 / (1 - rate)
+    if draws.dtype != torch.bool and on_gpu(draws):
+        draws = draws >= round(256 * rate)
     if draws.dtype == torch.bool:
         return draws.to(dtype) * kept
-    if on_gpu(draws):
-        return torch.where(draws >= round(256 * rate), torch.tensor(kept, dtype=dtype), 0)
     # From byte to byte the line rises by 1024, more than twice the largest factor (256): at the first byte that is
     # kept it stands at twice the factor, at the one before below zero, whatever the rounding. So the ends are exact.
     line = draws.to(torch.promote_types(dtype, torch.float32))  # a copy, so in place from here
