@@ -15,7 +15,7 @@ import torch
 WAYS: dict[str, dict[str, Any]] = {
     "eager": {"chunk": 0},
     "graph": {"mode": "graph"},
-    "compiled": {"chunk": 4, "backend": "inductor"},
+    "compiled": {"mode": "graph", "backend": "inductor"},
 }
 
 

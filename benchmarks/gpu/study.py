@@ -26,7 +26,7 @@ class Gpu:
 
     out: Path | None = None  # folder for gpu.jsonl, gpu.json and gpu.md
     parts: some_of(PARTS) = tuple(PARTS)  # type: ignore[valid-type]  # which parts, in this order
-    ways: some_of(WAYS) = ("eager", "graph")  # type: ignore[valid-type]  # "compiled" takes minutes
+    ways: some_of(WAYS) = ("eager", "graph")  # type: ignore[valid-type]  # "compiled": a minute a row
     device: Literal["cuda", "cpu"] = "cuda"
     seconds: float = 0.3  # for which a case is timed
     limit: float = 360.0  # seconds in all

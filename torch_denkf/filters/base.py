@@ -353,7 +353,7 @@ class Filter(Checked, TensorDictSequential):
         On a GPU an eager step waits for its launches. ``mode="graph"`` compiles nothing: it records what the eager
         steps launch, and their backward pass, in CUDA graphs, in about the time of a few eager calls. There a number
         that is no tensor, such as an inflation, stays the one of the recording; on a processor it warns, and runs
-        eagerly.
+        eagerly. With further options, such as ``backend="inductor"``, one step is compiled, and the graphs hold that.
 
         Args:
             chunk: steps of a sequence in one compiled graph, 4 by default. What is left over after whole chunks runs
