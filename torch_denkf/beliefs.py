@@ -150,8 +150,9 @@ class Ensemble(Belief):
     def derived(self, name, *carried):
         """Computes mean, variances and covariance of the sample."""
         (ensemble,) = carried
-        if self.space is not None and name in _SUMMARIES:
-            return moments_on(self.space, ensemble)[_SUMMARIES.index(name)]
+        if self.space is not None:
+            mean = self.space.mean(ensemble).unsqueeze(-2)
+            ensemble = mean if name == "mean" else self.space.minus(ensemble, mean)
         sample = {"mean": ensemble_mean, "var": ensemble_var, "cov": ensemble_cov}.get(name)
         return None if sample is None else sample(ensemble)
 

@@ -181,7 +181,7 @@ class BoundSteps(NamedTuple):
 
     def step(self, entries: Entries, call: Call) -> Entries:
         """Takes one step."""
-        noise = self.filter.missing_noise(entries, call.batch_size)
+        noise = self.filter.draws.missing(entries, call.batch_size)
         return self.compiled.step(self.steps, {**entries, **noise}, call.batch_size)
 
     def scan(self, *args: Any) -> tuple[Entries, Entries]:
@@ -193,7 +193,7 @@ def _frames(steps: Steps, names: tuple) -> list[NestedKey]:
     """Returns the names of inputs that are neither noise nor beliefs."""
     structure = steps.structure
     others = {*structure.carry, *structure.belief}
-    return [name for name in names if name not in others and name[0] != "noise"]
+    return [name for name in names if name not in others and name[0] not in ("noise", "previous")]
 
 
 def _parameters(steps: Steps) -> dict[str, Tensor]:

@@ -104,7 +104,7 @@ class Steps(NamedTuple):
         written.update(forecast)
         written.update(self.run(structure.posterior, entries, call, partial))
         for key, parts in structure.totals.items():
-            if not partial or written.keys() >= {*parts}:
+            if written.keys() >= {*parts}:
                 written[key] = sum((written[part] for part in parts[1:]), written[parts[0]])
         if partial and not written.keys() >= {*structure.carry}:
             raise KeyError(

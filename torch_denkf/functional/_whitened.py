@@ -67,9 +67,7 @@ def shift(scheme: str, reading: Whitened, observed: Tensor | None, perturbation:
     return reading.mean_shift - reading.normalised + draws
 
 
-def scores(
-    square: Tensor, log_det: Tensor, log_noise: Tensor | float, count: int | Tensor, size: int
-) -> tuple[Tensor, Tensor]:
+def scores(square: Tensor, log_det: Tensor, log_noise: Tensor, count: int | Tensor, size: int) -> tuple[Tensor, Tensor]:
     """The normalised innovation squared and the log-likelihood of the innovation, ``[*B, 1]``.
 
     Args:

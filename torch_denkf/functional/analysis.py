@@ -169,8 +169,9 @@ def _in_few_launches(
     if observed is not None:
         ensemble = torch.where(observed.any(-1)[..., None, None], ensemble, forecast)
     innovation = shift.mean(-2)
-    log_det = solver.log_det() - dim * math.log(size - 1)
-    return Analysis(ensemble, innovation, *scores(solver.square(innovation.unsqueeze(-1)), log_det, 0, count, size))
+    nis = (size - 1) * solver.square(innovation.unsqueeze(-1))
+    constant = count * math.log(2 * math.pi) - dim * math.log(size - 1)
+    return Analysis(ensemble, innovation, nis, -0.5 * (nis + solver.log_det() + constant))
 
 
 def check_analysis_arguments(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_mask, check_one_dtype, check_shape, check_shapes
 from torch_denkf.functional.kernels.small_system import LARGEST, gain_written_out
-from torch_denkf.functional.linalg import Solver
+from torch_denkf.functional.linalg import Solver, as_covariance
 
 
 class GaussianUpdate(NamedTuple):
@@ -95,7 +95,8 @@ def kalman_update(
             its observation and noise may then be anything, NaN too. None: everything is observed.
 
     Returns:
-        A :class:`GaussianUpdate`; all NaN for those batch elements whose S is not positive definite.
+        A :class:`GaussianUpdate`; all NaN for those batch elements whose S is not positive definite, or with a
+            negative variance in R.
 
     Raises:
         ValueError: if the shapes do not fit.
@@ -110,7 +111,7 @@ def kalman_update(
     _check_update(mean, cov, observation, observation_matrix, noise)
     batch, state_dim, dim = mean.shape[:-1], mean.shape[-1], observation.shape[-1]
     if noise.ndim == mean.ndim:
-        noise = noise.diag_embed()
+        noise = as_covariance(noise, mean)
     identity = torch.eye(dim, dtype=mean.dtype, device=mean.device)
     count: int | Tensor = dim
     if observed is not None:

@@ -180,6 +180,52 @@ class _Inverse(torch.autograd.Function):
         return inverse * of_log.unsqueeze(-1) - inverse @ gradient @ inverse, None
 
 
+def is_covariance(cov: Tensor) -> Tensor:
+    """Tells which matrices are covariances up to rounding: symmetric and positive semi-definite, without NaN.
+
+    Rounding is relative to the variances, so that metres and milliradians count alike. Nothing is differentiated.
+
+    Args:
+        cov: ``[*B, N, N]``.
+
+    Returns:
+        Boolean, ``[*B]``.
+
+    Examples:
+        >>> import torch
+        >>> is_covariance(torch.tensor([[[1.0, 0.5], [0.5, 1.0]], [[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]]]))
+        tensor([ True, False, False])
+    """
+    cov = cov.detach() if cov.dtype == torch.float64 else cov.detach().float()  # there is no factor in half precision
+    variance, rounding = cov.diagonal(dim1=-2, dim2=-1), 100 * cov.shape[-1] * torch.finfo(cov.dtype).eps
+    largest = rounding**2 * (variance.unsqueeze(-1) * variance.unsqueeze(-2))
+    symmetric = ((cov - cov.mT).square() <= largest).flatten(-2).all(-1)
+    # A variance of zero is one, but beside a covariance, which the factor's next row divides by it.
+    ridge = rounding * variance + torch.finfo(cov.dtype).tiny
+    return symmetric & cholesky(cov + ridge.diag_embed())[..., -1, -1].isfinite()
+
+
+def as_covariance(noise: Tensor, mean: Tensor) -> Tensor:
+    """Returns the covariance of a noise: of variances, or as it is; NaN where it is none.
+
+    Args:
+        noise: variances ``[*B, N]``, of which a negative one becomes NaN, or covariances ``[*B, N, N]``.
+        mean: ``[*B, S]``, which tells them apart.
+
+    Returns:
+        ``[*B, N, N]``.
+
+    Examples:
+        >>> import torch
+        >>> as_covariance(torch.tensor([4.0, -1.0]), torch.zeros(2))
+        tensor([[4., 0.],
+                [0., nan]])
+    """
+    if noise.ndim == mean.ndim:
+        return torch.where(noise < 0, torch.nan, noise).diag_embed()
+    return torch.where(is_covariance(noise)[..., None, None], noise, torch.nan)
+
+
 def _correlation(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Correlations with a ridge, standard deviations, and their inverses, 0 where there is no variance."""
     dim = cov.shape[-1]

@@ -28,8 +28,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_values
-from torch_denkf.beliefs import is_samples
-from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.beliefs import Ensemble, Particles, is_samples
 from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.modules.around import AroundInitial, Wrapper
 from torch_denkf.modules.process_noise import as_process_noise
@@ -392,8 +391,9 @@ class BiasedBelief(AroundInitial):
             ensemble = written[names["ensemble"]]
             noise = cast(Tensor, self._noise(entries, [ensemble], call._replace(sample=True)))
             ensemble = torch.cat([ensemble, std.to(ensemble.dtype) * noise.to(ensemble.dtype)], -1)
-            mean = ensemble_mean(ensemble)
-            now = {"ensemble": ensemble, "mean": mean, "var": ensemble_var(ensemble, mean)}
+            kind = Particles() if "log_weight" in names else Ensemble()
+            now = {"ensemble": ensemble, **{name: written[key] for name, key in names.items() if name == "log_weight"}}
+            now |= {name: cast(Tensor, kind.derived(name, *now.values())) for name in ("mean", "var")}
         else:
             mean, cov = (written[names[name]] for name in ("mean", "cov"))
             std, count = std.to(mean.dtype), len(std)

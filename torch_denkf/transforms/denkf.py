@@ -185,7 +185,11 @@ class DEnKFTransform(Checked, Transform):
                 for key in lacking:
                     start.set(self.filter.outer(key), torch.zeros_like(template[key]))
         given = {key: tensordict.get(key, None) for key in self.filter.carry_keys} if tensordict is not None else {}
-        if given and all(value is not None for value in given.values()):
+        lacking = [key for key, value in given.items() if value is None]
+        if lacking and len(lacking) < len(given) and not self._dropped_keys:
+            cure = "env.reset() takes a whole belief, or nothing of it."
+            raise diagnosis().missing_entry(type(self).__name__, lacking, tensordict.keys(True, True), cure)
+        if given and not lacking:
             mask = self._reset_mask(tensordict)
             for key, value in given.items():
                 start.set(key, value.clone() if mask is None else where_rows(mask, start.get(key), value))
@@ -258,10 +262,12 @@ class DEnKFTransform(Checked, Transform):
         """Adds the belief and the diagnostics.
 
         Raises:
-            ValueError: if the environment emits an entry of such a name already, or resets groups of agents alone.
+            ValueError: if the environment emits an entry of such a name already, or resets groups of agents alone; or
+                if a transform behind this one writes over the belief that the filter goes on with.
         """
         keys = [key for key in self._keep if key not in self._dropped_keys]
         refuse_resets_of_groups(self.parent.reset_keys, self.out_keys)
+        diagnosis().check_behind(self, [self._names[key] for key in self.filter.structure.carry])
         taken = [name for name in self.out_keys if name in observation_spec.keys(True, True)]
         if taken:
             raise ValueError(

@@ -65,7 +65,7 @@ class Flat(Space):
         return self
 
     @property
-    def parts(self) -> tuple[Space, ...]:
+    def parts(self) -> tuple[Space, ...]:  # type: ignore[override]
         """The lines that stand side by side, and each circle."""
         return tuple(
             part for turns, count in self._runs for part in ([Circle()] * count if turns else [Euclidean(count)])
@@ -161,8 +161,11 @@ class Flat(Space):
         parts = [(of_circles if turns else of_lines)(*own) for (turns, _), own in zip(self._runs, runs, strict=True)]
         return tuple(torch.cat(own, -1) for own in zip(*parts, strict=True))
 
-    def _whole(self, known):
-        return known, known
+    def told(self, observed):
+        """The mask itself: numbers are hidden one by one."""
+        return observed, observed
+
+    _whole = told
 
 
 class Euclidean(Flat):
