@@ -22,6 +22,7 @@ from torch_denkf.diagnosis.reasons import (
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.finish import Record
 from torch_denkf.filters.structure import Structure, previous_key
+from torch_denkf.functional.kernels.small_system import on_gpu
 
 __all__ = ["WrongNoise"]
 
@@ -45,7 +46,7 @@ class WrongNoise(Once):
         Raises:
             ValueError: that names the entry and the row.
         """
-        if not filter.check_finite:
+        if not filter.check_finite or any(map(on_gpu, record.written.values())):  # to look would wait for the device
             return
         structure, dims = filter.structure, len(record.batch_size)
         if self._known[0] is not structure:

@@ -28,7 +28,7 @@ from torchrl.modules.tensordict_module.rnn import recurrent_mode
 from torch_denkf._arguments import Checked, check_arguments
 from torch_denkf._checks import check_count
 from torch_denkf._registered import compiler, diagnosis, primers
-from torch_denkf._slices import as_rows, starts_of
+from torch_denkf._slices import as_rows, device_of, starts_of
 from torch_denkf.filters.finish import RUNS, Record, check_belief, own
 from torch_denkf.filters.gather import gather_rows, of_one_robot
 from torch_denkf.filters.noise import Draws
@@ -82,7 +82,7 @@ class Filter(Checked, TensorDictSequential):
         check_finite: whether a step raises where its new belief is not finite, and any run where the noise of a reading
             is no covariance. In a sequence the NaN of a belief that diverges goes on to its end, and one warning names
             its cause. Readings are checked, or rejected, by ``torch_denkf.imperfect.RejectReadings`` in front of the
-            filter.
+            filter. On a GPU nothing is looked at: each step would wait for it.
         prefix: name under which all stands that the filter writes, carries on or finds as noise: with ``"imu"`` the
             mean is ``("imu", "belief", "mean")``. Two filters of one environment or policy need one. ``None`` for none.
 
@@ -333,7 +333,7 @@ class Filter(Checked, TensorDictSequential):
         actions = {key: self.outer(previous_key(key)) for key in self.structure.controls}
         return primers().LastAction(actions, primers=found)
 
-    def compile(self, *, chunk: int = 4, **options) -> Filter:
+    def compile(self, *, chunk: int | None = None, **options) -> Filter:
         """From now on runs steps, and sequences in chunks of steps, through ``torch.compile``.
 
         The first call of each kind (chunk, batch size, with or without gradients) compiles, later ones reuse that;
@@ -345,9 +345,15 @@ class Filter(Checked, TensorDictSequential):
         or missing both run again with numbers in it; a sequence with gradients is differentiated both ways, too. What
         differs by more than rounding raises.
 
+        On a GPU an eager step waits for its launches. ``mode="graph"`` compiles nothing: it records what the eager
+        steps launch, and their backward pass, in CUDA graphs, in about the time of a few eager calls. There a number
+        that is no tensor, such as an inflation, stays the one of the recording; on a processor it warns, and runs
+        eagerly. With further options, such as ``backend="inductor"``, one step is compiled, and the graphs hold that.
+
         Args:
-            chunk: steps of a sequence in one compiled graph. What is left over after whole chunks runs step by step. A
-                small chunk compiles sooner, a large one runs faster. 0 goes back to eager.
+            chunk: steps of a sequence in one compiled graph, 4 by default. What is left over after whole chunks runs
+                step by step. A small chunk compiles sooner, a large one runs faster. 0 goes back to eager. With
+                ``mode="graph"`` by default all steps are in one.
             **options: of ``torch.compile``. Without any, inductor on a processor writes what calls its kernels in C++,
                 too, makes fewer calls, and saves fewer tensors for the backward pass, which takes longer to compile and
                 about 40 % less to run; ``backend="inductor"`` alone leaves that out. On a GPU
@@ -361,8 +367,7 @@ class Filter(Checked, TensorDictSequential):
                 wrong.
             ValueError: if ``chunk`` is negative.
         """
-        check_count("chunk", chunk, least=0, cure="It is a number of steps, or 0 for none")
-        self.compiled = compiler().CompiledSteps(chunk, options) if chunk else None
+        self.compiled = None if chunk == 0 else compiler().strategy(chunk, options)
         return self
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -442,7 +447,7 @@ class Filter(Checked, TensorDictSequential):
         tensordict = self.of_one_robot(tensordict)
         hidden = tensordict.copy()
         for key in {part.mask_key for part in in_role(self.module, Transition)} - {None}:
-            hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=tensordict.device))
+            hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=device_of(tensordict)))
         out = self.step(hidden, without=self.structure.readings)
         written = [key for key in self.out_keys if out.get(key, None) is not None]
         return tensordict.update(out.select(*written))
@@ -503,7 +508,7 @@ class Filter(Checked, TensorDictSequential):
         hidden, mask = dict(entries), role(self.initial, Initial).observed_key
         if without and mask is not None and not entries.keys() >= {*reads(self.initial)[0]}:
             hidden = {**self.draws.nothing(call.batch_size), **entries}
-            hidden[mask] = torch.zeros(*call.batch_size, 1, dtype=torch.bool, device=tensordict.device)
+            hidden[mask] = torch.zeros(*call.batch_size, 1, dtype=torch.bool, device=device_of(tensordict))
         start = self.initial_belief(hidden, call)
         if self.update_at_reset:
             written.update(steps.begin(entries, call, start, bool(without)))
@@ -602,7 +607,7 @@ class Filter(Checked, TensorDictSequential):
         """``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
         size = tensordict.batch_size
         marks = starts_of(tensordict, self.init_key)
-        first = torch.zeros(size, dtype=torch.bool, device=tensordict.device)
+        first = torch.zeros(size, dtype=torch.bool, device=device_of(tensordict))
         first[..., 0] = True
         first = first if marks is None else first | marks.reshape(size)
         if any(tensordict.get(self.outer(previous_key(key)), None) is None for key in self.structure.carry):

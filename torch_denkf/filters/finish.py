@@ -12,6 +12,7 @@ from torch import Tensor
 from torch_denkf._checks import flag_value
 from torch_denkf._registered import diagnosis
 from torch_denkf.filters.structure import Structure
+from torch_denkf.functional.kernels.small_system import on_gpu
 from torch_denkf.submodel import Entries
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def check_belief(structure: Structure, entries: Entries, written: Entries) -> No
     finite = None
     for key, kind in structure.carried:
         for value in (written[key], entries.get(key)):  # a particle that is not finite may have been resampled away
-            if value is None or not value.is_floating_point():
+            if value is None or not value.is_floating_point() or on_gpu(value):  # to look would wait for the device
                 continue
             sound = value.isfinite().all() if kind is None else kind.finite(key[-1], value)
             finite = sound if finite is None else finite & sound

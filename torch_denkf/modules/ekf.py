@@ -68,7 +68,7 @@ class EKFTransition(GaussianTransition):
         if self.stop_jacobian_gradient:
             jacobian = jacobian.detach()
         moved = jacobian @ cov @ jacobian.mT
-        link = (torch.eye(cov.shape[-1]).to(cov), cov, jacobian) if wanted else None
+        link = (torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device), cov, jacobian) if wanted else None
         return forecast, (moved + moved.mT) / 2, link
 
 

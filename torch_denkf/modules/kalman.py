@@ -185,7 +185,7 @@ class LinearTransition(Transition):
             written = run_module(noise, {**entries, self.out_keys[0]: forecast}, call.part("noise"))
             constant = as_covariance(written[unravel_key(noise.out_keys[0])], mean)
             forecast_cov = forecast_cov + constant
-        link = torch.eye(len(self.matrix)).to(cov), cov, self.matrix, constant
+        link = torch.eye(len(self.matrix), dtype=cov.dtype, device=cov.device), cov, self.matrix, constant
         return {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}, link
 
 

@@ -30,6 +30,10 @@ from torch_denkf.functional.kernels.random_bits import dropout_factor, random_by
 __all__ = ["FlipoutLinear", "StochasticMLP", "deterministic"]
 
 
+#: Replaces linear layers, where the steps of a sequence share their gradients.
+LAYERS: list[Callable] = []
+
+
 class FlipoutLinear(nn.Module):
     r"""A linear layer with Gaussian weights, sampled by flipout.
 
@@ -232,6 +236,8 @@ class StochasticMLP(nn.Module):
             run = list(zip(self.layers, (*factors, None), strict=True))
         else:
             run = list(zip(self.layers, repeat(None)))
+        if LAYERS and not torch.compiler.is_compiling():
+            run = [(LAYERS[0](layer), factor) for layer, factor in run]
         hidden, recorded = x, torch.is_grad_enabled()
         for layer, factor in run[:-1]:
             hidden = layer(hidden)

@@ -236,6 +236,11 @@ class FilterLoss(Checked, LossModule):
         self.terms = nn.ModuleList(_checked_terms(terms))
         self._choose_terms()
 
+    def register_buffer(self, name: str, tensor: Tensor | None, persistent: bool = True) -> None:
+        """Keeps a constant, on the filter's device."""
+        like = self.filter.like()
+        super().register_buffer(name, tensor if tensor is None or like is None else tensor.to(like.device), persistent)
+
     def _check_entries(self, name: str, value: Tensor) -> None:
         """Raises a ``ValueError`` unless a value has one entry for each of ``dims``, where these are given."""
         if self.dims is not None and value.numel() != len(self.dims):

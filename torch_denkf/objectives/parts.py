@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
 
 from torch_denkf._arguments import check_key
-from torch_denkf._checks import check_count, check_values
+from torch_denkf._checks import check_count, check_values, flag_value
 from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record
 from torch_denkf.filters.structure import previous_key
@@ -369,7 +369,7 @@ def _belief_at(truth: Tensor, belief: str, spread: Tensor, members: int | None, 
     if members is None:
         return {(belief, "mean"): truth, (belief, "cov"): std.square().diag_embed()}
     ensemble = truth.unsqueeze(-2).expand(*truth.shape[:-1], members, truth.shape[-1])
-    if spread.any():
+    if flag_value(spread.any()) is not False:
         away = std.unsqueeze(-2) * torch.randn_like(ensemble[..., :1].expand(*ensemble.shape[:-1], size))
         ensemble = ensemble + away if space is None else space.plus(ensemble, away)
     return {

@@ -14,6 +14,7 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
+from torch_denkf.functional.linalg import divide
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing.rts import left_open, smoothing_gain
 from torch_denkf.modules.around import Wrapper
@@ -174,6 +175,6 @@ class LaggedMoments(SubModel):
         else:
             past_mean, turn = self.space.plus(past_mean, shift), self.space.right_jacobian(shift)
             past_cov = turn @ past_cov @ turn.mT
-            past_gain = turn @ past_gain @ torch.linalg.inv(self.space.right_jacobian(learned)).unsqueeze(-3)
+            past_gain = divide(turn @ past_gain, self.space.right_jacobian(learned).unsqueeze(-3))
         age = (age + 1).clamp(max=past_mean.shape[-2])
         return past_mean, past_cov, past_gain, *_oldest(cov, past_mean, past_cov, past_gain), age

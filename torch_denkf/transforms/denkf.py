@@ -60,8 +60,9 @@ class DEnKFTransform(Checked, Transform):
             collectors leave out of their data. Only outside a ``SerialEnv`` or ``ParallelEnv``.
         no_grad: whether environment steps record no graph (training recomputes the sequence). A graph through a
             rollout grows with every step, so this is on by default.
-        check_finite: whether a belief that is not finite raises; costs a synchronisation a step. Where an environment
-            emits readings that are not finite, put ``torch_denkf.imperfect.RejectReadings`` in front.
+        check_finite: whether a belief that is not finite raises; on a GPU, which a step would wait for, none does.
+            Where an environment emits readings that are not finite, put ``torch_denkf.imperfect.RejectReadings`` in
+            front.
         packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step` (native code:
             load only what you would execute). At B=1 it is ten times as fast as the filter itself. It has the
             parameters of its export, is for environments of the batch size of the export, and not for use inside a

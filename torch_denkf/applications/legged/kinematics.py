@@ -89,13 +89,21 @@ class LegKinematics(nn.Module):
 
     def velocities(self, positions: Tensor, rates: Tensor) -> Tensor:
         """Velocities ``[*, F, 3]`` in m/s as seen from the base, by angles and rates ``[*, J]``."""
-        return (self.jacobian(positions) * rates[..., self.column].unsqueeze(-1)).sum(-2)
+        return self.moving(positions, rates)[1]
+
+    def moving(self, positions: Tensor, rates: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns positions and velocities, which take one way along the legs."""
+        end, jacobian = self._with_jacobian(positions)
+        return end, (jacobian * rates[..., self.column].unsqueeze(-1)).sum(-2)
 
     def jacobian(self, positions: Tensor) -> Tensor:
         """Derivatives ``[*, F, K, 3]`` of the positions by the K joints of each foot, zero where it has fewer."""
+        return self._with_jacobian(positions)[1]
+
+    def _with_jacobian(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         end, axes, slides, places = self._along(positions)
         lever = end.unsqueeze(-2) - places
-        return torch.linalg.cross(axes, lever) + slides
+        return end, torch.linalg.cross(axes, lever) + slides
 
     def _along(self, positions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The feet, and of each joint its axis of turn, its direction of slide, and its place."""

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_number
 from torch_denkf.applications.legged.kinematics import LegKinematics
+from torch_denkf.functional.kernels.small_system import on_gpu
 from torch_denkf.functional.manifolds import SO3, Space, quaternion_product, rotate
 from torch_denkf.modules import SubModel
 from torch_denkf.motions.time_step import keys_of_dt
@@ -56,13 +57,13 @@ class LegReadings(SubModel):
         for key, size, value in zip(self.in_keys, sizes, values, strict=False):
             if value.shape != (*imu.shape[:-1], size):
                 raise ValueError(f"{key!r} of this robot is [*B, {size}]; got {list(value.shape)}.")
-        if self.steps:
+        if self.steps and not on_gpu(joints):
             check_number(repr(self.steps[0]), others[0], above=0, cure="It is the time step in seconds")
         rates = others[-1].to(kinematics.base.dtype) if len(others) > len(self.steps) else None
         joints = joints.to(kinematics.base.dtype)
-        feet = self.module(joints)
-        out = feet.flatten(-2), contact.repeat_interleave(3, -1), self._start(imu[..., 3:].to(feet.dtype), feet)
-        return out if rates is None else (*out, self.module.velocities(joints, rates).flatten(-2))
+        feet, *moves = [kinematics(joints)] if rates is None else kinematics.moving(joints, rates)
+        begin = self._start(imu[..., 3:].to(feet.dtype), feet)
+        return feet.flatten(-2), contact.repeat_interleave(3, -1), begin, *(value.flatten(-2) for value in moves)
 
     def _start(self, force: Tensor, feet: Tensor) -> Tensor:
         sensor = self.module.base

@@ -43,8 +43,8 @@ def base_velocity_of_moments(mean: Tensor, cov: Tensor, gyro: Tensor, sensor: Te
     axes = rotation_matrix(sensor[:4])
     seen = axes @ rotation_matrix(mean[..., :4]).mT  # the velocity turns with the orientation, so none comes by that
     part = torch.cat([seen, (-skew(sensor[4:]) @ axes).expand_as(seen)], -1)  # by velocity, gyro's bias
-    rows = [3, 4, 5, 9, 10, 11]
-    var = (part @ cov[..., rows, :][..., rows] * part).sum(-1)
+    rows = torch.cat([cov[..., 3:6, :], cov[..., 9:12, :]], -2)
+    var = (part @ torch.cat([rows[..., 3:6], rows[..., 9:12]], -1) * part).sum(-1)
     return base_velocity(mean, gyro, sensor), var
 
 

@@ -12,6 +12,8 @@ from math import prod
 
 import torch
 
+from torch_denkf.functional.kernels.small_system import on_gpu
+
 __all__ = ["dropout_factor", "random_bytes", "random_keep_mask", "random_signs", "representable_rate"]
 
 _INT64_MIN = -(2**63)
@@ -93,6 +95,8 @@ def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torc
         tensor([0.0000, 0.0000, 1.3333, 1.3333])
     """
     kept = 1 / (1 - rate)
+    if draws.dtype != torch.bool and on_gpu(draws):
+        draws = draws >= round(256 * rate)
     if draws.dtype == torch.bool:
         return draws.to(dtype) * kept
     # From byte to byte the line rises by 1024, more than twice the largest factor (256): at the first byte that is

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_count, check_shape
-from torch_denkf.functional.linalg import semidefinite_solve
+from torch_denkf.functional.linalg import divide, semidefinite_solve
 from torch_denkf.functional.manifolds import Space
 
 
@@ -117,7 +117,7 @@ def rts_step(
         out = rest + gain @ smoothed_cov @ gain.mT
         return mean + shift.squeeze(-1), (out + out.mT) / 2
     learned = space.minus(smoothed_mean, forecast_mean)
-    back = gain @ torch.linalg.inv(space.right_jacobian(learned))  # from the tangents at the smoothed mean
+    back = divide(gain, space.right_jacobian(learned))  # from the tangents at the smoothed mean
     step = (gain @ learned.unsqueeze(-1)).squeeze(-1)
     turn = space.right_jacobian(step)  # to the tangents at the new mean
     out = turn @ (rest + back @ smoothed_cov @ back.mT) @ turn.mT
