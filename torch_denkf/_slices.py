@@ -6,7 +6,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-__all__ = ["as_rows", "starts_of"]
+__all__ = ["as_rows", "device_of", "starts_of"]
 
 #: What marks the last element of an episode.
 _ENDS = ("done", "truncated")
@@ -35,6 +35,12 @@ def starts_of(tensordict: TensorDictBase, init_key: NestedKey, *, step: bool = F
     time = tensordict.ndim - 1
     after = torch.cat([torch.zeros_like(done.narrow(time, 0, 1)), done.narrow(time, 0, done.shape[time] - 1)], time)
     return after if is_init is None else is_init | after
+
+
+def device_of(tensordict: TensorDictBase) -> torch.device | None:
+    """Returns the device of a tensordict, or that of what is in it, where it has none of its own."""
+    found = (value.device for value in tensordict.values(True, True) if isinstance(value, Tensor))
+    return tensordict.device or next(found, None)
 
 
 def as_rows(tensordict: TensorDictBase, new: Tensor | None) -> tuple[TensorDictBase, Tensor | None]:

@@ -21,6 +21,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.kernels.small_system import on_gpu
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean, weighted_median, weighted_var
@@ -149,13 +150,20 @@ class Ensemble(Belief):
     def derived(self, name, *carried):
         """Computes mean, variances and covariance of the sample."""
         (ensemble,) = carried
-        if self.space is not None and name in _SUMMARIES:
-            return moments_on(self.space, ensemble)[_SUMMARIES.index(name)]
+        if self.space is not None:
+            mean = self.space.mean(ensemble).unsqueeze(-2)
+            ensemble = mean if name == "mean" else self.space.minus(ensemble, mean)
         sample = {"mean": ensemble_mean, "var": ensemble_var, "cov": ensemble_cov}.get(name)
         return None if sample is None else sample(ensemble)
 
     def limited(self, held, ceiling):
         """Moves the members with their mean and variances; where nothing is clamped, not even by rounding."""
+        if self.space is None and "cov" not in held and on_gpu(held["mean"]):
+            # In few launches: a factor of one leaves all digits. It is a constant to the gradient.
+            factor = (held["var"].detach() / ceiling).clamp_(min=1).rsqrt_().unsqueeze(-2)
+            now = self._within_reach(held["mean"], ceiling)
+            moved = torch.lerp(now.unsqueeze(-2), held["ensemble"] - (held["mean"] - now).unsqueeze(-2), factor)
+            return {"mean": now, "var": held["var"].clamp(max=ceiling), "ensemble": moved}
         out, factor, mean = super().limited(held, ceiling), self._factor(held, ceiling), held["mean"].unsqueeze(-2)
         ensemble, now = held["ensemble"], out["mean"].unsqueeze(-2)
         if self.space is None:

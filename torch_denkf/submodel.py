@@ -329,7 +329,7 @@ class Initial(SubModel):
     observed_key: NestedKey | None = None
 
     def derived(self, carried: Entries) -> Entries:
-        """Returns further entries of the belief that follow from those that are carried on, by key."""
+        """Returns further entries of the belief, by key, that follow from those that are carried on and from others."""
         return {}
 
 

@@ -26,17 +26,22 @@ BORDERS = (
     "filters_made",
     "sub_models",
     "filters_fed",
+    "spaces",
+    "noises",
     "smoothers",
     "kitti",
     "lerobot",
     "ur5",
     "recordings",
+    "logs",
+    "corners",
     "caches",
     "checkpoints",
     "packages",
     "pretrained",
     "commands",
     "around",
+    "legged",
 )
 KINDS = ("clear", "right", "unclear", "silent", "hang", "crash")
 GOOD = KINDS[:2]

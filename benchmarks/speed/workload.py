@@ -90,6 +90,7 @@ def make_gaussian_filter(kind: str) -> EKF | UKF:
         "process_noise": noise,
         "initial": MomentPrior(torch.zeros(STATE), torch.eye(STATE)),
         "update_at_reset": True,
+        "observation_key": ("sensor", "ensemble"),
     }
     return EKF(*models, **start) if kind == "EKF" else UKF(*models, **POINTS, **start)
 

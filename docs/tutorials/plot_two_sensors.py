@@ -121,12 +121,11 @@ fused = Filter(
 # ``"target_observation"``; ``noise`` also teaches ``DiagonalNoise`` how far off the samples' mean is. Then
 # ``DEnKFLoss`` runs the whole filter over windows of 20 steps, and scores its ensembles against the true states. The
 # score is the *continuous ranked probability score* (CRPS): it is small where the ensemble is near the truth and as
-# wide as it is wrong. ``nll`` adds a little of the likelihood of the readings, which teaches the noise. ``set_keys``
-# tells a loss which samples are the learned sensor's, and which mask belongs to them.
+# wide as it is wrong. ``nll`` adds a little of the likelihood of the readings, which teaches the noise. A loss finds
+# the samples of the learned sensor, and the mask and noise that its update reads; with several learned sensors
+# ``set_keys(sensor="camera")`` names one.
 
 alone, together = SensorLoss(fused, noise=0.1), DEnKFLoss(fused, nll=0.1)
-alone.set_keys(sensor=("camera", "ensemble"), observed="camera_seen", noise=("camera", "noise"))
-together.set_keys(sensor=("camera", "ensemble"), observed="camera_seen")
 pictures = train[train["camera_seen"][..., 0]]
 
 

@@ -21,7 +21,7 @@ from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.applications.car.odometry.training import train_car_filter
 from torch_denkf.applications.reacher import reacher
 from torch_denkf.data import Episode, EpisodeReplay
-from torch_denkf.deployment.folder import WEIGHTS, load_folder, save_folder
+from torch_denkf.deployment.folder import WEIGHTS, described, load_folder, save_folder
 from torch_denkf.envs import ReplayEnv
 from torch_denkf.modules import LearnedTransition, NoisyTransition
 from torch_denkf.modules.noise import MemberGain
@@ -185,7 +185,7 @@ def test_weights_of_another_kind(tmp_path, name, change):
     save_folder(broken, tmp_path, builder="line", settings={})
     save_file(weights, tmp_path / WEIGHTS)
     config = (tmp_path / "config.json").read_text()
-    described = {**json.loads(config), "sha256": hashlib.sha256((tmp_path / WEIGHTS).read_bytes()).hexdigest()}
-    (tmp_path / "config.json").write_text(json.dumps(described))
+    again = {**json.loads(config), "sha256": hashlib.sha256((tmp_path / WEIGHTS).read_bytes()).hexdigest()}
+    (tmp_path / "config.json").write_text(described(again))
     with pytest.raises(ValueError, match=rf"{WEIGHTS} holds NaN, infinity or whole numbers in \['{name}'\]"):
         load_folder(tmp_path, {"line": build})

@@ -142,6 +142,27 @@ def test_predictions_and_steps_without_a_reading_stay_eager(float64):
                 assert belief[key].equal(expected[key])
 
 
+def test_a_policys_data_go_on_from_what_is_stored(float64):
+    """Slices that begin in the middle, an episode that begins inside of one, and a first belief that is all zero."""
+    filter = linear_kalman()
+    data = TensorDict({"observation": torch.randn(2, 3, 2), "is_init": torch.zeros(2, 3, 1, dtype=torch.bool)}, [2, 3])
+    data["is_init"][0, 1] = True
+    mean, cov = torch.randn(2, 3, 2), 0.5 * torch.eye(2).expand(2, 3, 2, 2)
+    known = torch.ones(2, 3, 1, dtype=torch.bool)
+    known[0, :2] = False
+    mean[0, 0] = 0
+    data["previous"] = TensorDict({"belief": {"mean": mean, "cov": cov.clone()}, "known": known}, [2, 3])
+    eager = filter.sequence(data.copy())
+    filter.compile(chunk=1, backend="eager")
+    compiled = filter.sequence(data.copy())
+    assert [kind[0] for kind in filter.compiled._functions] == ["chunk"]
+    assert_close(compiled, eager, filter.out_keys, torch.float64)
+    step = filter.compile(chunk=0).step(
+        TensorDict({"observation": data["observation"][1, 0], "belief": {"mean": mean[1, 0], "cov": cov[1, 0]}})
+    )
+    assert_close(eager[1, 0], step, filter.belief_keys, torch.float64)
+
+
 def test_a_stochastic_analysis_of_a_users_own_compiles(float64):
     """And gives what the library's own gives for the same seed, compiled or not."""
     frames, outs = TensorDict({"observation": torch.randn(3, 5, 2)}, [3, 5]), []

@@ -13,7 +13,7 @@ from torch import nn
 
 from tests.deployment.killed_saves import line, save
 from torch_denkf.deployment import folder as module
-from torch_denkf.deployment.folder import load_folder, save_folder
+from torch_denkf.deployment.folder import described, load_folder, save_folder
 
 ROOT = Path(__file__).parents[2]
 FILES = ["config.json", "weights.safetensors"]
@@ -69,6 +69,45 @@ def test_a_description_does_not_lead_out_of_the_folder(tmp_path):
     config = json.loads((tmp_path / "here/config.json").read_text())
     (tmp_path / "here/weights-").mkdir()
     for sha256 in ("/../../there", 3, None):
-        (tmp_path / "here/config.json").write_text(json.dumps({**config, "sha256": sha256}))
+        (tmp_path / "here/config.json").write_text(described({**config, "sha256": sha256}))
         with pytest.raises(ValueError, match=r"here/weights\.safetensors is damaged, or not the file"):
             load_folder(tmp_path / "here", {"line": line})
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_a_description_with_a_flipped_bit_is_told_of(tmp_path, share):
+    """Each bit of it counts, of numbers, names and the record alike; white space does not."""
+    save(tmp_path, 2)
+    file = tmp_path / "config.json"
+    text = file.read_text()
+    numbers = [place for place, letter in enumerate(text) if letter.isdigit() or letter == "."]
+    place = numbers[int(share * len(numbers))]
+    flipped = text[:place] + chr(ord(text[place]) ^ 1) + text[place + 1 :]
+    file.write_text(flipped)
+    with pytest.raises(
+        ValueError, match=r"config\.json (is damaged, or was changed by hand|is not JSON|does not describe)"
+    ):
+        load_folder(tmp_path, {"line": line})
+    file.write_text(json.dumps(json.loads(text)))
+    assert load_folder(tmp_path, {"line": line}).in_features == 2
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda config: config["settings"].update(size=3),
+        lambda config: config["training"].update(seed=1),
+        lambda config: config["versions"].update(torch="1.0"),
+        lambda config: config.update(note="better"),
+        lambda config: config.pop("versions"),
+        lambda config: config.pop("checksum"),
+        lambda config: config.update(checksum=3),
+    ],
+)
+def test_a_description_that_was_changed_is_told_of(tmp_path, change):
+    save(tmp_path, 2)
+    config = json.loads((tmp_path / "config.json").read_text())
+    change(config)
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match=r"config\.json is damaged, or was changed by hand"):
+        load_folder(tmp_path, {"line": line})

@@ -9,11 +9,12 @@ from torch import nn
 
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
+from torch_denkf.monitoring import Gated
 
 STEP, NOISE, STEPS = 0.3, 0.1, 80
 
 
-def walk_filter(process_noise, **options):
+def walk_filter(process_noise, members=32, **options):
     """Of two walks, both of which are read."""
     return DEnKF(
         LearnedTransition(nn.Identity(), residual=False),
@@ -22,7 +23,7 @@ def walk_filter(process_noise, **options):
         ConstantNoise([NOISE, NOISE], in_key="reading"),
         EnsembleAnalysis("etkf", observation_key="reading"),
         process_noise=process_noise,
-        initial=GaussianPrior([0.0, 0.0], [0.1, 0.1], ensemble_size=32),
+        initial=GaussianPrior([0.0, 0.0], [0.1, 0.1], ensemble_size=members),
         **options,
     )
 
@@ -54,6 +55,35 @@ def test_names_the_reading_and_the_component_that_is_held_too_firmly(component):
     assert "'reading' at place 'analysis'" in text
     assert f"Number {component} tells most of component {component} of the state" in text
     assert 'localisation="significance"' in text
+
+
+@pytest.mark.parametrize("members", [32, 256])
+def test_outliers_are_named_as_a_cause_and_few_members_where_they_are_few(members):
+    """A jump that the motion holds for impossible: 256 members are as far off, and gating is the cure."""
+    data = TensorDict({"reading": torch.zeros(1, STEPS, 2)}, [1, STEPS])
+    data["reading"][:, 5:] = 1e3
+    (text,) = said(walk_filter([1e-3, 1e-3], members), data)
+    assert "An outlier, or a jump, may have taken the belief away: put a gate around the filter, Gated(filter)" in text
+    assert ("few members" in text) == (members == 32)
+    gated = Gated(walk_filter([1e-3, 1e-3], members), 2, patience=10)
+    assert (gated.sequence(data)["belief", "mean"][0, -1] - 1e3).abs().max() < 1.0
+
+
+@pytest.mark.parametrize(("distance", "warned"), [(2.0, False), (6.0, True)])
+def test_the_distance_is_that_of_one_component(distance, warned):
+    """Nine components at two standard deviations are six together."""
+    filter = DEnKF(
+        LearnedTransition(nn.Identity(), residual=False),
+        None,
+        Select([0] * 9),
+        ConstantNoise([1.0] * 9, in_key="reading"),
+        EnsembleAnalysis("etkf", observation_key="reading"),
+        process_noise=1e-4,
+        initial=GaussianPrior([0.0], [1e-4], ensemble_size=8),
+    )
+    torch.manual_seed(0)
+    reading = distance * (2.0 * (torch.rand(1, STEPS, 9) > 0.5) - 1)
+    assert bool(said(filter, TensorDict({"reading": reading}, [1, STEPS]))) == warned
 
 
 def test_is_said_once():

@@ -29,6 +29,7 @@ from torch_denkf.modules import (
     MomentPrior,
     Select,
     SubModel,
+    UKFTransition,
 )
 from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
@@ -534,3 +535,55 @@ def test_what_does_not_fit_is_refused():
         FusedFilter(Turning(), {"pose": sensor}, initial=around, process_noise=[0.1] * 7)
     with pytest.raises(TypeError, match="EKFAnalysis is on a space"):
         make("EKF", visibility=Visibility(3, encoding_key="pose"))
+
+
+# --------------------------------------------------------------------------------------------- several in one update
+
+
+class Both(SubModel):
+    """Reads the orientation and the bias."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
+
+    def compute(self, state):
+        return state
+
+
+def in_one(kind, lag=None, **options):
+    """A joint update of a pose and of numbers; and one update of both, side by side."""
+    around = AroundState(STD, ensemble_size=E, state_key="start", space=SPACE)
+    initial = GaussianAround(STD, state_key="start", space=SPACE) if kind in ("EKF", "UKF") else around
+    sensors = {
+        "pose": FusedSensor(Orientation(), R, reading_space=SO3()),
+        "bias": FusedSensor(Select([4, 5, 6]), [0.2] * 3),
+    }
+    q = ConstantNoise(Q, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    motion = UKFTransition(Turning(), q, space=SPACE) if kind == "UKF" else Turning()
+    noise = {} if kind == "UKF" else {"process_noise": Q}
+    joint = FusedFilter(motion, sensors, initial=initial, joint=True, lag=lag, **noise, **options)
+    whole = {"EKF": EKF, "UKF": UKF}.get(kind, DEnKF)
+    parts = [Turning(), None, Both(), ConstantNoise([*R, *[0.2] * 3], in_key="both")]
+    if whole is DEnKF:
+        parts.append(EnsembleAnalysis("etkf", space=SPACE, reading_space=SPACE, observation_key="both"))
+        return joint, DEnKF(*parts, initial=initial, process_noise=Q)
+    return joint, whole(*parts, initial=initial, process_noise=Q, observation_key="both", reading_space=SPACE)
+
+
+@pytest.mark.parametrize("lag", [None, 2])
+@pytest.mark.parametrize("kind", ["EKF", "UKF", "DEnKF"])
+def test_a_pose_and_numbers_in_one_update(kind, lag):
+    joint, whole = in_one(kind, lag)
+    data = log(hidden=False)
+    data["bias"] = data["state"][..., 4:] + 0.2 * torch.randn(B, T, 3)
+    data["both"] = torch.cat([data["pose"], data["bias"]], -1)
+    data["observed"] = torch.ones(B, T, 6, dtype=torch.bool)
+    data["pose_observed"] = torch.rand(B, T, 1) < 0.7
+    data["observed"][..., :3] = data["pose_observed"]
+    data["pose"] = torch.where(data["pose_observed"], data["pose"], torch.nan)
+    data = with_noise(whole, data)
+    out, expected = joint.sequence(data.clone()), whole.sequence(data.clone())
+    assert SPACE.minus(out[MEAN], expected[MEAN]).abs().max() < 1e-9
+    assert (out[VAR] - expected[VAR]).abs().max() < 1e-9
+    for name in ("nis", "log_likelihood"):
+        torch.testing.assert_close(out["info", name], expected["info", name], rtol=0, atol=1e-8)

@@ -184,3 +184,15 @@ def test_wrong_calls_are_refused():
         LearnedLikelihood(4, 4, **learned)
     with pytest.raises(ValueError, match="with a observation_key"):
         LearnedLikelihood(4, 1, reading_space=Circle())
+
+
+def test_a_space_made_in_a_compiled_function_is_the_one_made_outside():
+    """As where a filter's reading has no space of its own."""
+
+    def turned(x):
+        return Flat(x.shape[-1], circular=[1, 2]).plus(x, Euclidean(x.shape[-1]).plus(x, x))
+
+    x = torch.tensor([1.0, 2.0, -3.0])
+    torch._dynamo.reset()
+    torch.testing.assert_close(torch.compile(turned, fullgraph=True, backend="eager")(x), turned(x))
+    assert Flat(4, circular=[1, 2])._runs == ((False, 1), (True, 2), (False, 1))

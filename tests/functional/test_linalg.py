@@ -3,10 +3,13 @@
 import pytest
 import torch
 
+from tests.functional.checks import assert_compiled_is_eager
 from torch_denkf.functional.linalg import (
+    as_covariance,
     cholesky,
     inverse_square_root,
     inverse_square_root_difference,
+    is_covariance,
     semidefinite_root,
     semidefinite_solve,
 )
@@ -111,3 +114,47 @@ def test_what_is_solved_keeps_its_dtype_under_another_default(float64):
     solution = semidefinite_solve(cov, torch.eye(2, dtype=torch.float32))
     expected = torch.tensor([[2.0, -1.0], [-1.0, 4.0]], dtype=torch.float32) / 7  # the inverse by hand
     torch.testing.assert_close(solution, expected, rtol=0, atol=1e-5)  # the ridge is 2.4e-6
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 8])
+def test_a_covariance_is_told_by_its_correlations(float64, size):
+    """Oracle: eigenvalues of the correlations; units that differ by 1e6 do not matter."""
+    torch.manual_seed(0)
+    root = torch.randn(200, size, size)
+    units = 10 ** (6 * torch.rand(200, size) - 3)
+    shift = torch.linspace(-0.5, 0.5, 200)[:, None, None] * torch.eye(size)
+    cov = units.unsqueeze(-1) * (root @ root.mT / size + shift) * units.unsqueeze(-2)
+    variance = cov.diagonal(dim1=-2, dim2=-1)
+    scale = variance.abs().rsqrt()
+    least = torch.linalg.eigvalsh(scale.unsqueeze(-1) * cov * scale.unsqueeze(-2))[:, 0]
+    expected = (least > 0) & (variance > 0).all(-1)
+    assert 20 < expected.sum() < 190 or size == 1
+    assert is_covariance(cov).equal(expected)
+    assert_compiled_is_eager(is_covariance, cov)
+
+
+def test_what_is_no_covariance_is_nan_and_only_that_row():
+    one = torch.tensor([[1.0, 0.5], [0.5, 1.0]])
+    wrong = [
+        [[1.0, 0.5], [0.4, 1.0]],
+        [[1.0, 2.0], [2.0, 1.0]],
+        [[1.0, 0.9, -0.9], [0.9, 1.0, 0.9], [-0.9, 0.9, 1.0]],
+        [[0.0, 0.1], [0.1, 1.0]],
+        [[-1.0, 0.0], [0.0, 1.0]],
+        [[torch.nan, 0.0], [0.0, 1.0]],
+        [[torch.inf, 0.0], [0.0, 1.0]],
+    ]
+    for each in map(torch.tensor, wrong):
+        sound = one if len(each) == 2 else torch.eye(3)
+        both = as_covariance(torch.stack([sound, each]), torch.zeros(2, len(each)))
+        assert both[0].equal(sound)
+        assert both[1].isnan().all()
+    zero = torch.zeros(2, 2)
+    assert as_covariance(zero, torch.zeros(2)).equal(zero)
+    singular = torch.ones(2, 2).requires_grad_()
+    out = as_covariance(singular, torch.zeros(2))
+    assert out.equal(torch.ones(2, 2))
+    assert torch.autograd.grad(out.sum(), singular)[0].equal(torch.ones(2, 2))
+    variances = as_covariance(torch.tensor([[4.0, 0.0], [-1.0, 2.0]]), torch.zeros(2, 2))
+    assert variances[0].equal(torch.diag(torch.tensor([4.0, 0.0])))
+    assert variances[1].diagonal().isnan().tolist() == [True, False]

@@ -18,6 +18,7 @@ from torch_denkf.functional.manifolds import (
     SO3,
     Circle,
     Euclidean,
+    Flat,
     Opposite,
     Product,
     Repeated,
@@ -500,3 +501,54 @@ def test_precision_stays(space):
     values += [space.right_jacobian(tangent), space.adjoint(point), space.neutral(point)]
     values += [space.basis(point), space.dual_basis(point)]
     assert {value.dtype for value in values} == {torch.float32}
+
+
+@pytest.mark.parametrize("space", [SO3(), SE3(), SE23(), Turned(3), Repeated(SO3(), 2), Opposite(SE3())])
+def test_the_signs_of_quaternions_do_not_move_a_point_near_the_mean(space):
+    """A quaternion and its negative are one rotation: the mean of the numbers takes them on one side."""
+    points = space.plus(space.exp(torch.randn(space.tangent_dim)), 0.2 * torch.randn(9, space.tangent_dim))
+    expected, size = space.near(points), 4
+    flipped = points.clone()
+    for begin in range(0, 8 if isinstance(space, Repeated) else 4, size):
+        flipped[1::2, begin : begin + size] *= -1
+    assert space.distance(space.near(flipped), expected) < 1e-6
+    assert space.distance(space.near(flipped), space.mean(points)) < 0.1
+
+
+def test_headings_on_both_sides_of_pi_have_a_point_near_their_mean():
+    points = torch.tensor([[3.1, 1.0, 0.0], [-3.1, 3.0, 0.0], [3.0, 2.0, 0.0]])
+    assert SE2().near(points)[0].item() == pytest.approx((3.1 + (2 * math.pi - 3.1) + 3.0) / 3)
+
+
+@pytest.mark.parametrize("space", [SO3(), SE3(), SE23(), Opposite(SE3()), Opposite(SE23())])
+def test_the_length_of_a_readings_quaternion_does_not_matter(space):
+    expected, reading = (space.exp(torch.randn(space.tangent_dim)) for _ in range(2))
+    longer = torch.cat([1.5 * reading[:4], reading[4:]])
+    torch.testing.assert_close(space.innovation(longer, expected), space.innovation(reading, expected))
+
+
+@pytest.mark.parametrize("space", [SO3(), SE2(), SE3(), Circle(), Repeated(SO3(), 2), Euclidean(1) * Circle()])
+def test_flags_and_scalars_are_no_points(space):
+    point = space.exp(torch.zeros(space.tangent_dim))
+    flags = torch.ones(space.point_dim, dtype=torch.bool)
+    for call in (space.minus, space.innovation):
+        with pytest.raises(ValueError, match=r"has shape \[\d\] of flags; a point of"):
+            call(flags, point)
+    if space.point_dim > 1:
+        with pytest.raises(ValueError, match=r"reading has shape \[1\]; a point of"):
+            space.innovation(point[:1], point)
+
+
+@pytest.mark.parametrize("space", [SO3(), SE2(), SE3(), Opposite(SE3()), Product(SE2(), Euclidean(2)), Flat(3, [1])])
+def test_a_mask_is_narrowed_to_whole_rotations_and_vectors(space):
+    """Where a mask hides one number, none that it mixes with is told; what is told does not depend on it."""
+    for hidden in range(space.tangent_dim):
+        observed = torch.arange(space.tangent_dim) != hidden
+        points, tangents = space.told(observed)
+        assert not (tangents & ~observed).any()
+        assert space.told(tangents)[1].equal(tangents)
+        expected, reading = space.exp(torch.randn(space.tangent_dim)), space.exp(torch.randn(space.tangent_dim))
+        other = torch.where(points, reading, space.exp(torch.randn(space.tangent_dim)))
+        found = [space.innovation(one, expected, observed)[tangents] for one in (reading, other)]
+        assert found[0].equal(found[1])
+    assert space.told(torch.tensor([False]))[1].equal(torch.tensor([False]))

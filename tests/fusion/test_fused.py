@@ -552,7 +552,7 @@ def test_covariances_of_readings_side_by_side(float64):
     assert_close(outs[0]["belief", "mean"], outs[1]["belief", "mean"], rtol=0, atol=1e-10)
 
 
-def with_lasting_errors(members=None, *, joint=False, delay=0):
+def with_lasting_errors(members=None, *, joint=False, delay=0, kind=None):
     """Two sensors of the linear system, each with lasting errors, around one that has none."""
     F, Q, H, R = linear_system()
     sensors = {
@@ -569,6 +569,11 @@ def with_lasting_errors(members=None, *, joint=False, delay=0):
         noise, initial = known_noise(), MomentPrior(torch.tensor([1.0, -1.0]), cov)
     else:
         noise, initial = Q.diagonal().sqrt(), GaussianPrior([1.0, -1.0], cov.diagonal().sqrt(), ensemble_size=members)
+    if kind == "Kalman":
+        return FusedFilter(LinearTransition(F, Q), sensors, initial=initial, joint=joint)
+    if kind is not None:
+        motion = {"EKF": EKFTransition, "UKF": UKFTransition}[kind](NoisyLinear(F), noise)
+        return FusedFilter(motion, sensors, initial=initial, joint=joint)
     return FusedFilter(NoisyLinear(F), sensors, initial=initial, process_noise=noise, joint=joint)
 
 
@@ -603,12 +608,43 @@ def lasting_readings():
 
 @pytest.mark.parametrize("joint", [False, True])
 @pytest.mark.parametrize("delay", [0, DELAY])
-def test_errors_that_last_are_those_of_a_kalman_filter_that_holds_them(float64, joint, delay):
+@pytest.mark.parametrize("kind", [None, *KINDS])
+def test_errors_that_last_are_those_of_a_kalman_filter_that_holds_them(float64, kind, joint, delay):
     frames, late = lasting_readings(), torch.full((T,), delay)
     mean, cov = lasting_errors_in_numpy(arrived(frames, late, T - 1), linear_system()[1])
-    out = with_lasting_errors(joint=joint, delay=delay).sequence(arriving(frames, late))["belief"][:, -1]
+    out = with_lasting_errors(joint=joint, delay=delay, kind=kind).sequence(arriving(frames, late))["belief"][:, -1]
     assert_close(out["mean"], mean, rtol=0, atol=1e-9)
     assert_close(out["cov"], cov, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_what_an_error_and_a_linear_motion_learn(float64, noise):
+    """F, B and Q of the user's own transition, and size and time of the error: gradients by finite differences."""
+    F, Q, H, R = linear_system()
+    error = FadingBias([0.8, 0.6], 6.0)
+    motion = LinearTransition(F, known_noise() if noise else Q, control=torch.tensor([[0.3], [1.0]]), trainable=True)
+    sensors = {"a": FusedSensor(LinearObservation(H), R.sqrt(), sensor_error=error)}
+    filter = FusedFilter(motion, sensors, initial=MomentPrior(torch.zeros(2), torch.eye(2)))
+    frames = TensorDict({"a": torch.randn(2, 6, 2), "action": torch.randn(2, 6, 1)}, [2, 6])
+    whole = KalmanFilter(
+        F,
+        H,
+        process_noise_cov=Q,
+        noise=R.sqrt(),
+        mean=torch.zeros(2),
+        cov=torch.eye(2),
+        sensor_error=error,
+        control=motion.control.detach(),
+        observation_key="a",
+    )
+    expected = whole.sequence(frames.copy())
+    out = filter.sequence(frames.copy())
+    for key in BELIEF:
+        assert_close(out[key], expected[key], rtol=0, atol=1e-10)
+    assert {motion.matrix, motion.control} <= set(filter.parameters())
+    for parameter in (motion.matrix, motion.control, error.log_std, error.log_time):
+        loss = lambda: filter.sequence(frames.copy())["belief", "mean"].square().sum()  # noqa: E731
+        directional_check(loss, [parameter])
 
 
 def test_errors_that_last_in_an_ensemble(float64):
@@ -670,8 +706,10 @@ def test_what_is_refused():
     with pytest.raises(TypeError, match="carries a past already"):
         FixedLag(FusedFilter(LinearTransition(F, Q), one, initial=moments, lag=3), 2)
     lasting = {"a": FusedSensor(LinearObservation(H), R, sensor_error=FadingBias([1.0] * 2, 5.0))}
-    with pytest.raises(ValueError, match="needs a transition of ensembles"):
-        FusedFilter(LinearTransition(F, Q), lasting, initial=moments)
+    with pytest.raises(ValueError, match="writes an ensemble"):
+        FusedFilter(LinearTransition(F, Q), lasting, initial=members)
+    with pytest.raises(ValueError, match="process noise already"):
+        FusedFilter(LinearTransition(F, Q), lasting, initial=moments, process_noise=0.1)
     with pytest.raises(ValueError, match="need process_noise"):
         FusedFilter(NoisyLinear(F), lasting, initial=moments)
     with pytest.raises(TypeError, match="is a FadingBias, or None; got float"):

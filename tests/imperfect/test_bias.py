@@ -5,9 +5,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter
+from torch_denkf.baselines import BackpropKF, IEnKS
+from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter, ParticleFilter
 from torch_denkf.imperfect import FadingBias
-from torch_denkf.imperfect.bias import BiasedNoise, BiasedObservation, BiasedTransition
+from torch_denkf.imperfect.bias import BiasedBelief, BiasedNoise, BiasedObservation, BiasedTransition
 from torch_denkf.modules import (
     CholeskyNoise,
     ConstantNoise,
@@ -219,6 +220,59 @@ def test_the_option_of_an_ensemble_comes_close_to_it(own):
     std = cov.diagonal(dim1=1, dim2=2).sqrt()
     assert ((out["belief", "mean"] - mean).abs() / std).max() < 0.08  # members say it to 0.7 % a step
     assert (out["belief", "var"].sqrt() / std - 1).abs().max() < 0.05
+
+
+def test_the_option_of_particles_comes_close_to_it():
+    torch.manual_seed(0)
+    given = unit()
+    particles = ParticleFilter(
+        motion(),
+        None,
+        Select([0]),
+        noise=ConstantNoise(torch.tensor([R], dtype=torch.double), in_key="reading"),
+        initial=GaussianPrior(given["mean"], given["std"], ensemble_size=50000),
+        process_noise=torch.tensor([0.0, Q], dtype=torch.double),
+        sensor_error=known_bias(),
+        observation_key="reading",
+    )
+    out, mean, cov = beside_the_oracle(particles)
+    std = cov.diagonal(dim1=1, dim2=2).sqrt()
+    assert ((out["belief", "mean"] - mean).abs() / std).max() < 0.1
+    assert (out["belief", "var"].sqrt() / std - 1).abs().max() < 0.1
+    with pytest.raises(ValueError, match="ResampledTransition holds its motion"):
+        ParticleFilter(
+            particles["transition"],
+            None,
+            Select([0]),
+            initial=particles.initial,
+            sensor_error=known_bias(),
+            observation_key="reading",
+        )
+
+
+def test_the_option_of_an_iterated_smoother_is_its_parts():
+    bias, moves, q, reads, r = parts()
+    initial = GaussianPrior(**unit(), ensemble_size=6)
+    rest = {"observation_key": "reading", "noise": r}
+    by_hand = IEnKS(moves, None, reads, process_noise=q, initial=BiasedBelief(initial, bias), **rest)
+    plain = torch.tensor([0.0, Q], dtype=torch.double)
+    option = IEnKS(motion(), None, Select([0]), process_noise=plain, initial=initial, sensor_error=bias, **rest)
+    td = by_hand.draw_noise(TensorDict({"reading": torch.randn(2, 5, 1, dtype=torch.double)}, [2, 5]))
+    for key in ("ensemble", "mean", "var"):
+        torch.testing.assert_close(
+            option.sequence(td.clone())["belief", key], by_hand.sequence(td.clone())["belief", key]
+        )
+    with pytest.raises(TypeError, match="BackpropKF takes no sensor_error"):
+        BackpropKF(
+            torch.eye(2),
+            None,
+            torch.eye(1, 2),
+            ConstantNoise([R], in_key="reading"),
+            process_noise_cov=torch.eye(2),
+            initial=MomentPrior(torch.zeros(2), torch.eye(2)),
+            sensor_error=known_bias(),
+            observation_key="reading",
+        )
 
 
 def test_steps_are_the_sequence_and_all_learns():

@@ -16,7 +16,7 @@ from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.transforms.envs_for_tests import base_env, forked_env, toy_base_env, toy_filter
 from torch_denkf import DEnKF, DEnKFTransform, FusedFilter, FusedSensor, RejectReadings
-from torch_denkf.functional.manifolds import SE2, SO3, Circle, Euclidean, Product
+from torch_denkf.functional.manifolds import SE2, SE3, SO3, Circle, Euclidean, Product
 from torch_denkf.modules import EKFAnalysis, LinearTransition, MomentPrior, Select
 
 NAN, INF = torch.nan, torch.inf
@@ -112,6 +112,27 @@ def test_a_pose_is_rejected_as_a_whole():
     out = RejectReadings({"pose": "seen"}, spaces={"pose": SE2()})(of("pose", [0.5, NAN, 20.0], [1.0, 2.0, 3.0]))
     assert out["pose"].tolist() == [[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]
     assert out["seen"].tolist() == [[False] * 3, [True] * 3]
+
+
+def test_a_quaternion_of_zeros_is_no_rotation():
+    space = Product(Euclidean(1), SE3())
+    point = torch.tensor([5.0, 1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0]).expand(2, 8).clone()
+    point[1, 1:5] = 0
+    td = TensorDict({"pose": point}, [2])
+    out = RejectReadings({"pose": "seen"}, spaces={"pose": space})(td.copy())
+    assert out["seen"].tolist() == [[True] * 7, [True] + [False] * 6]
+    assert out["pose"].tolist() == [point[0].tolist(), [5.0, 1.0, *[0.0] * 6]]
+    with pytest.raises(ValueError, match=r"'pose' at \[1\] is no point of .*SE3.*: \[5.0, 0.0, .*'seen'"):
+        RejectReadings({"pose": "seen"}, spaces={"pose": space}, on_bad="raise")(td)
+    whole = TensorDict({"pose": torch.tensor([[1, 0, 0, 0], [0, 0, 0, 0]])}, [2])  # integers
+    assert RejectReadings({"pose": "seen"}, spaces={"pose": SO3()})(whole)["seen"].any(-1).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("shape", [(3, 1), (3, 4), (3,), (3, 2, 2)])
+def test_a_reading_of_another_size_than_its_space_is_refused(shape):
+    td = TensorDict({"pose": torch.ones(shape)}, [3])
+    with pytest.raises(ValueError, match=r"'pose' has shape .*; a point of SE2\(\) is \[\*, 3\]"):
+        RejectReadings({"pose": "seen"}, spaces={"pose": SE2()})(td)
 
 
 def test_parts_of_a_product_are_rejected_one_by_one():

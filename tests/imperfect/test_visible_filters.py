@@ -191,9 +191,9 @@ def test_smoothers_run_behind_it(float64):
         assert_close(out["smoothed", "mean"][:, -1], out["belief", "mean"][:, -1])
 
 
-def test_a_gate_does_not_go_around_it():
+def test_a_gate_does_not_go_around_it_for_particles():
     with pytest.raises(TypeError, match="no analysis that a gate goes around"):
-        Gated(heeds(linear_kalman()), 2)
+        Gated(heeds(bootstrap(50)), 2)
 
 
 # ------------------------------------------------------------------------------------------------- filters with a head

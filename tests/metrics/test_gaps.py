@@ -58,10 +58,18 @@ def test_a_dimension_without_any_label_has_no_number():
         assert value[1].isnan()
 
 
-def test_a_belief_that_is_nan_is_not_left_out():
+@pytest.mark.parametrize("metric", [name for name in METRICS if name not in ("spread", "error")])  # these are of bins
+def test_a_belief_that_is_nan_is_not_left_out(metric):
     ensemble, _, gaps, known = problem()
-    ensemble[tuple(known[..., 0].nonzero()[0].tolist())] = torch.nan
-    assert METRICS["rmse"](ensemble, gaps)[0].isnan()
+    where = tuple((known[..., 0] & ~known[..., 1]).nonzero()[0].tolist())
+    ensemble[where] = torch.nan
+    assert METRICS[metric](ensemble, gaps).isnan().tolist() == [True, False]
+
+
+def test_a_variance_that_is_nan_is_no_interval():
+    mean, truth = torch.zeros(4, 2), torch.zeros(4, 2)
+    variance = torch.tensor([[1.0, 1.0]] * 3 + [[torch.nan, 1.0]])
+    assert interval_coverage(mean, variance, truth).nan_to_num(-1).tolist() == [-1.0, 1.0]
 
 
 def test_what_needs_whole_rows_says_so():

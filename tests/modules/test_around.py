@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from tests.filters.factories import linear_denkf, linear_system
+from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.imperfect import Visible
 from torch_denkf.modules import Around, EKFAnalysis, EnsembleAnalysis, KalmanAnalysis, LinearObservation, Update
 from torch_denkf.monitoring import GatedAnalysis
@@ -100,6 +101,18 @@ def test_a_scaled_innovation_is_a_scaled_shift_of_the_mean():
     before = td["forecast", "ensemble"].mean(-2)
     shift = whole["belief", "mean"] - before
     torch.testing.assert_close(half["belief", "mean"] - before, 0.5 * shift)
+
+
+def test_entries_that_are_aligned_go_through_the_wrapper_all_the_same():
+    """What aligns in front of a wrapper, and hands on what it made, gets what the wrapper makes, and not the inside."""
+    around = ScaledInnovation(EnsembleAnalysis("etkf", reading_space=Euclidean(1) * Circle()), 0.5)
+    td = frame()
+    td["forecast", "observation"][..., 1] += torch.pi
+    call, entries = Call(td.batch_size), dict(td.items(True, True))
+    expected, found = around.on_entries(entries, call), around.on_aligned(around.aligned(entries), call)
+    for key, value in expected.items():
+        torch.testing.assert_close(found[key], value, equal_nan=True)
+    assert not found["belief", "mean"].equal(around.run_inside(entries, call)["belief", "mean"])
 
 
 @pytest.mark.parametrize("name", ["lagged", "visible, lagged"])

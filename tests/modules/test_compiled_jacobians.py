@@ -82,7 +82,7 @@ def observations():
             2,
             SEEN,
         ),
-        "joined": (JoinedObservation(two, predicted_key=predicted, observed_key=SEEN), 3, SEEN),
+        "joined": (JoinedObservation(two, [None] * 2, predicted_key=predicted, observed_key=SEEN), 3, SEEN),
         "of a user": (LearnedObservation(bent), S, "observed"),
     }
 

@@ -7,12 +7,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.filters.factories import linear_denkf, linear_kalman
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_kalman
 from tests.filters.gaussian_for_tests import linear_filter
 from torch_denkf import DEnKFTransform, LinearGaussianEnv
 from torch_denkf.baselines import LSTMFilter
 from torch_denkf.filters import KalmanFilter
-from torch_denkf.modules import EnsembleAnalysis, KalmanAnalysis
+from torch_denkf.imperfect import Visible
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, KalmanAnalysis, LinearObservation
 from torch_denkf.monitoring import Gated, GatedAnalysis, InnovationMonitor, Monitored, MonitoredSensor
 from torch_denkf.monitoring._calibration import chi_square_table
 from torch_denkf.monitoring.chi_square import chi_square_quantile
@@ -123,6 +124,71 @@ def test_a_gate_that_shut_itself_out_opens_again():
     assert opens["gate", "factor"].isinf().sum() == 10
     assert opens["belief", "mean"][-1].item() == pytest.approx(100.0, abs=5.0)
     assert opens["belief", "mean"][5:15].abs().max() < 1.0
+
+
+@pytest.mark.parametrize("jump", [10.0, 100.0])
+@pytest.mark.parametrize("response", RESPONSES)
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_each_response_comes_back_after_a_jump(kind, response, jump):
+    """The motion holds it for impossible; once the gate has opened, the belief is the mean of what was read since."""
+    steps, patience = 100, 20
+    one = torch.eye(1, dtype=torch.float64)
+    if kind == "Kalman":
+        filter = KalmanFilter(
+            one, one, process_noise_cov=1e-8 * one, noise_cov=0.09 * one, mean=torch.zeros(1).double(), cov=0.01 * one
+        )
+    else:
+        members = torch.tensor([[-1.0], [0.0], [1.0]]).double() * 0.1
+        filter = (
+            linear_denkf("etkf")
+            .double()
+            .with_modules(
+                initial=FixedEnsemble(members),
+                transition=NoisyLinear(one),
+                observation=LinearObservation(one),
+                noise=ConstantNoise(0.3 * torch.ones(1).double(), in_key="observation"),
+            )
+        )
+    torch.manual_seed(0)
+    reading = jump + 0.3 * torch.randn(steps, 1, dtype=torch.float64)
+    out = Gated(filter, 1, response=response, patience=patience).sequence(TensorDict({"observation": reading}, [steps]))
+    opened = int((out["gate", "shut"].flatten().diff() < 0).nonzero()[0]) + 1
+    assert opened == patience + 1
+    since = reading[opened:].mean()
+    assert out["belief", "mean"][-1].item() == pytest.approx(since.item(), abs=0.02)
+    assert out["belief", "var"][-1].item() == pytest.approx(0.09 / (steps - opened), rel=0.05)
+    assert out["belief", "mean"][patience // 2].abs() < jump / 2
+
+
+@pytest.mark.parametrize("name", ["Kalman", "EKF", "etkf", "perturbed"])
+@pytest.mark.parametrize("response", RESPONSES)
+def test_a_gate_around_an_update_that_heeds_whether_the_sensor_sees(name, response):
+    """A sensor that surely sees is one without Visible, and an inert gate is no gate."""
+    filter, td = FILTERS[name]().double(), data(steps=8)
+    heeds = filter.with_modules(analysis=Visible(filter["analysis"], visible_key="visible"))
+    options = {"response": response, "rate": 0.3, "patience": 2}
+    sees = td.clone().set("visible", torch.ones(3, 8, 1, dtype=torch.float64))
+    expected, out = run(Gated(filter, DIM, **options), td), run(Gated(heeds, DIM, **options), sees)
+    for key in (("belief", "mean"), ("belief", "var"), ("gate", "factor"), ("gate", "shut")):
+        torch.testing.assert_close(out[key], expected[key])
+    assert (expected["gate", "factor"] > 1).any()
+    unsure = td.clone().set("visible", torch.rand(3, 8, 1, dtype=torch.float64))
+    plain, inert = run(heeds, unsure), run(Gated(heeds, DIM, response=response, rate=0.0), unsure)
+    assert all(torch.equal(plain[key], inert[key]) for key in heeds.out_keys)
+
+
+def test_a_hidden_sensor_does_not_open_the_gate():
+    one = torch.eye(1, dtype=torch.float64)
+    analysis = Visible(KalmanAnalysis(one, 0.09 * one), visible_key="visible")
+    filter = still(0.01, 0.09).with_modules(analysis=analysis)
+    reading = torch.full((60, 1), 20.0, dtype=torch.float64)
+    td = TensorDict({"observation": reading, "visible": torch.full_like(reading, 1e-3)}, [60])
+    out = Gated(filter, 1, patience=5).sequence(td)
+    assert out["gate", "shut"].max() == 0
+    assert out["belief", "mean"].abs().max() < 0.1
+    assert out["belief", "var"].max() < 0.02
+    seen = Gated(filter, 1, patience=5).sequence(td.set("visible", torch.full_like(reading, 0.9)))
+    assert seen["belief", "mean"][-1].item() == pytest.approx(20.0, abs=0.1)
 
 
 @pytest.mark.parametrize("kind", ["Kalman", "etkf", "etkf by component"])

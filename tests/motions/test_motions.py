@@ -10,6 +10,7 @@ from torch.testing import assert_close
 from tests.motions.steps_for_tests import MOTIONS, frame, random_points, step
 from torch_denkf.functional.manifolds import SE2, SE3, SO3
 from torch_denkf.motions import AttitudeMotion, ConstantTwist, InertialMotion, PlanarMotion
+from torch_denkf.motions.motion import integrated, walked
 
 every_motion = pytest.mark.parametrize("make", MOTIONS.values(), ids=MOTIONS)
 
@@ -195,6 +196,16 @@ def test_noise_added_step_by_step_is_that_of_the_sensors(float64, make):
     end = start if make is InertialMotion else step(make(steps * dt), start.unsqueeze(0))[0]
     spread = [space.minus(members, end).square().mean(0).sqrt() for members in (added, drawn)]
     assert_close(spread[0], spread[1], rtol=0.12, atol=1e-9)  # each is known to 1.6 %; what is neglected falls with dt
+
+
+def test_noises_of_a_step_are_those_of_a_walk_and_of_its_integral():
+    """Variances of n small steps of a walk, and of where it stands in the middle of each, times their length."""
+    n, dt, density = 4000, 0.5, [0.3, 2.0]
+    small = dt / n
+    left = dt - small * (torch.arange(n, dtype=torch.float64) + 0.5)  # of a step's length, behind each small step
+    for each, walk, integral in zip(density, walked(density, dt), integrated(density, dt), strict=True):
+        assert walk == pytest.approx(each * (n * small) ** 0.5)
+        assert integral == pytest.approx(each * (small * left.square().sum().item()) ** 0.5, rel=1e-6)
 
 
 def _level(motion):

@@ -152,3 +152,13 @@ def test_states_of_another_size_are_refused(make):
 def test_what_makes_no_sense_is_refused(make, words):
     with pytest.raises((TypeError, ValueError), match=words):
         make()
+
+
+@pytest.mark.parametrize("space", [Product(SO3(), SE2()), Product(Euclidean(1), SE23(), SE2())])
+def test_a_part_begins_behind_the_points_of_those_before_it(space):
+    """A rotation in front has four numbers, and three directions."""
+    state = random_points(space, 5, 4)
+    pose = state[..., -3:]
+    assert observe(PoseOf(space, part=len(space.parts) - 1), state).equal(pose)
+    expected = observe(PositionInBody(SE2(), [3.0, 4.0]), pose)
+    assert observe(PositionInBody(space, [3.0, 4.0], part=len(space.parts) - 1), state).equal(expected)

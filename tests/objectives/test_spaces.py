@@ -14,7 +14,7 @@ from torch.distributions import MultivariateNormal
 from tests.filters.factories import FixedEnsemble, toy_denkf
 from tests.functional.checks import assert_refused
 from torch_denkf.filters import EKF, DEnKF, ParticleFilter
-from torch_denkf.functional.manifolds import SE2, SE3, SE23, SO3, Circle, Euclidean, Product
+from torch_denkf.functional.manifolds import SE2, SE3, SE23, SO3, Circle, Euclidean, Opposite, Product, Repeated
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select, SubModel
 from torch_denkf.objectives import DEnKFLoss, FilterLoss, GaussianLoss, MixtureLoss, TransitionLoss
 from torch_denkf.objectives._labels import Labels
@@ -231,6 +231,23 @@ def test_labels_are_of_whole_parts():
             value("members, mse", less, space=space, state_scale=scale)[:, 1:],
             value("members, mse", data, space=space, dims=scored, state_scale=scale)[:, 1:],
         )
+
+
+@pytest.mark.parametrize(
+    ("space", "parts"),
+    [
+        (Opposite(Product(SE2(), Euclidean(2))), Product(Opposite(SE2()), Euclidean(2))),
+        (Repeated(SE2(), 2), Product(SE2(), SE2())),
+        (Opposite(Repeated(SO3(), 2)), Product(Opposite(SO3()), Opposite(SO3()))),
+    ],
+)
+def test_labels_of_a_part_count_in_every_way_to_write_a_product(space, parts):
+    data = for_kind("members", beliefs(parts, parts.exp(torch.randn(parts.tangent_dim))))
+    data["state"] = data["state"][..., : parts.parts[0].point_dim]
+    data["state"][0, 0, 0] = torch.nan
+    expected = value("members, mse", data, space=parts)[0]
+    assert expected[0, 0] == 0 < expected[0, 1:].min()
+    torch.testing.assert_close(value("members, mse", data, space=space)[0], expected)
 
 
 @pytest.mark.parametrize("name", LOSSES)

@@ -4,6 +4,7 @@ import hashlib
 import inspect
 import json
 import shutil
+from dataclasses import asdict, is_dataclass
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from torch_denkf._registered import weights
 from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
 from torch_denkf.applications.reacher import reacher
 from torch_denkf.applications.ur5.filter import ur5_table
+from torch_denkf.deployment.folder import described
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.modules import (
     ConstantNoise,
@@ -53,6 +55,26 @@ def test_each_comes_with_its_checksum_and_a_card(name):
     model = from_pretrained(name)
     assert not model.training
     assert {type(value) for value in config["settings"].values()} <= {bool, int, float, list, str, type(None)}
+
+
+@pytest.mark.parametrize("name", available())
+def test_settings_are_those_of_the_description(name, tmp_path):
+    """Of all that come with the library, and of a filter whose builder is the user's."""
+    described = json.loads((weights()[name] / "config.json").read_text())["settings"]
+    settings = from_pretrained(name).settings
+    found = asdict(settings) if is_dataclass(settings) else dict(settings)
+    assert json.loads(json.dumps(found)) | described == json.loads(json.dumps(found))
+    again = from_pretrained(save_pretrained(from_pretrained(name), tmp_path))
+    assert again.settings == settings
+
+
+def test_settings_of_a_builder_of_ones_own(tmp_path):
+    def still(size):
+        eye = torch.eye(size)
+        return KalmanFilter(eye, eye, process_noise_cov=eye, noise_cov=eye, mean=torch.zeros(size), cov=eye)
+
+    save_pretrained(still(2), tmp_path, builder=still, settings={"size": 2})
+    assert from_pretrained(tmp_path, builders={"still": still}).settings == {"size": 2}
 
 
 def test_what_is_saved_comes_back(tmp_path):
@@ -176,11 +198,11 @@ def test_mistakes_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"weights\.safetensors is damaged, .*its SHA-256 is [0-9a-f]{64}, expected"):
         from_pretrained(folder)
     weights.write_bytes(good)
-    config.write_text(json.dumps({**json.loads(text), "sha256": 64 * "0"}))
+    config.write_text(described({**json.loads(text), "sha256": 64 * "0"}))
     with pytest.raises(ValueError, match=f"expected {64 * '0'}; restore both from a copy"):
         from_pretrained(folder)
     weights.write_bytes(b"nothing")
-    config.write_text(json.dumps({**json.loads(text), "sha256": hashlib.sha256(b"nothing").hexdigest()}))
+    config.write_text(described({**json.loads(text), "sha256": hashlib.sha256(b"nothing").hexdigest()}))
     with pytest.raises(ValueError, match=r"weights\.safetensors cannot be read"):
         from_pretrained(folder)
     weights.unlink()

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch.testing import assert_close
 
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
@@ -83,6 +84,33 @@ def test_backward_weights_are_bayes_rule_on_a_chain(float64):
     cut = backward_smooth(log_weights, densities, follows=torch.tensor([False, True, False]))
     assert_close(cut[1:], log_weights[1:], rtol=0, atol=0)
     assert_close(cut[0].exp(), two.sum(1), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("read", ["belief", "forecast"])
+def test_noise_that_depends_on_the_mean_reads_that_of_the_weighted_particles(float64, read):
+    """Q is the square of the mean; backward by hand, from weights that are far from even."""
+    F, _, H, R = linear_system()
+    square = TensorDictModule(torch.square, [(read, "mean")], [("forecast", "noise")])
+    filter = ParticleFilter(
+        NoisyTransition(NoisyLinear(F), square),
+        None,
+        LinearObservation(H),
+        GaussianLikelihood(observation_key="observation"),
+        noise=ConstantNoise(0.3 * R.sqrt(), in_key="observation"),
+        initial=GaussianPrior(MEAN, torch.tensor(COV).sqrt(), ensemble_size=6),
+        resampling=None,
+    )
+    torch.manual_seed(0)
+    out = ParticleSmoother(filter, 1)(drive(1, 3, missing=0.0, resets=False)[0])
+    particles, weights = out["belief", "ensemble"], out["belief", "log_weight"]
+    mean = (weights[1].exp().unsqueeze(-1) * particles[1]).sum(0)
+    assert ((mean - particles[1].mean(0)).abs() > 0.1).all()
+    cov = torch.diag((mean if read == "belief" else F @ mean).square())
+    moves = torch.stack(
+        [gaussian_log_prob(particles[2], (x @ F.mT).expand(6, 2), cov.expand(6, 2, 2)) for x in particles[1]]
+    )
+    expected = backward_weights(weights[1], moves, weights[2])
+    assert_close(out["smoothed", "log_weight"][1], expected)
 
 
 def test_gradients_are_those_of_finite_differences(float64):

@@ -1,14 +1,21 @@
 """RTS against one dense solve over all states; the UKF and the EKF are exact on a linear system."""
 
+from functools import partial
+
 import pytest
 import torch
+from tensordict import TensorDict
 from torch.testing import assert_close
 
-from tests.filters.factories import linear_kalman, linear_system
+from tests.filters.factories import NoisyLinear, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check, learned_filter, learned_frames, linear_filter
 from tests.functional.checks import assert_compiled_is_eager
 from tests.smoothers.joint import drive, joint_beliefs
+from torch_denkf import EKF, UKF, KalmanFilter
+from torch_denkf.functional.manifolds import SE2
 from torch_denkf.functional.smoothing.rts import rts_smooth
+from torch_denkf.modules import ConstantNoise, LinearObservation, MappedNoise, MomentPrior
+from torch_denkf.motions import ConstantTwist, PoseOf
 from torch_denkf.smoothers import FixedLag, RTSSmoother
 
 FILTERS = ["Kalman", "EKF", "UKF", "BackpropKF"]
@@ -104,3 +111,51 @@ def test_any_batch_and_precision(batch):
     exact = RTSSmoother(linear_kalman().double())(frames)
     assert_close(out["smoothed", "mean"].double(), exact["smoothed", "mean"], rtol=0, atol=1e-5)
     assert_close(out["smoothed", "cov"].double(), exact["smoothed", "cov"], rtol=0, atol=1e-5)
+
+
+def unsure(name, dtype):
+    """A vehicle that knows its place to 1000 m, and reads it to 0.1 m; on a space its heading, too, to a few turns."""
+    dt, like = 0.1, {"dtype": dtype}
+    if name == "SE2":
+        motion = ConstantTwist(SE2(), dt, twist_noise=[0.05, 0.1, 0.1])
+        space, reading = motion.space, PoseOf(motion.space)
+        cov = torch.diag(torch.tensor([0.25, 1e6, 1e6, 0.01, 1.0, 1.0], **like))
+        prior = MomentPrior(torch.zeros(6, **like), cov, space=space)
+        noise = ConstantNoise(torch.tensor([0.01, 0.1, 0.1], **like), in_key="observation")
+        options = {"observation_key": "observation", "reading_space": reading.reading_space}
+        return EKF(motion, None, reading, noise, process_noise=motion.process_noise, initial=prior, **options)
+    F = torch.eye(4, **like) + dt * torch.diag(torch.tensor([1.0, 0.0, 1.0], **like), 1)
+    walk = 0.01 * torch.tensor([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], **like)
+    Q, H = torch.block_diag(walk, walk), torch.eye(4, **like)[[0, 2]]
+    cov = torch.diag(torch.tensor([1e6, 100.0, 1e6, 100.0], **like))
+    if name == "Kalman":
+        return KalmanFilter(F, H, process_noise_cov=Q, noise=[0.1, 0.1], mean=torch.zeros(4, **like), cov=cov)
+    unit = ConstantNoise(torch.ones(4, **like), in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    q, r = MappedNoise(unit, torch.linalg.cholesky(Q)), ConstantNoise([0.1, 0.1], in_key="observation")
+    prior = MomentPrior(torch.zeros(4, **like), cov)
+    options = {"process_noise": q, "initial": prior, "observation_key": "observation"}
+    filter = {"EKF": EKF, "UKF": UKF}[name](NoisyLinear(F), None, LinearObservation(H), r, **options)
+    return filter.to(dtype)
+
+
+@pytest.mark.parametrize("smoother", [RTSSmoother, partial(RTSSmoother, lag=5), partial(FixedLag, lag=5)])
+@pytest.mark.parametrize("name", ["Kalman", "EKF", "UKF", "SE2"])
+def test_a_start_that_is_far_less_sure_than_the_readings_stays_positive(name, smoother):
+    time = 0.1 * torch.arange(30, dtype=torch.double)
+    torch.manual_seed(0)
+    place = torch.stack([700 + 3 * time, -400 - 2 * time], -1) + 0.1 * torch.randn(30, 2, dtype=torch.double)
+    readings = torch.cat([torch.full((30, 1), 0.3), place], -1) if name == "SE2" else place
+    found = {}
+    for dtype in (torch.double, torch.float):
+        torch.set_default_dtype(dtype)
+        try:
+            out = smoother(unsure(name, dtype)).sequence(TensorDict({"observation": readings.to(dtype)}, [30]))
+        finally:
+            torch.set_default_dtype(torch.float)
+        found[dtype] = out["smoothed", "mean"].double(), out["smoothed", "cov"].double()
+    (mean, cov), (rounded, rounded_cov) = found.values()
+    std = cov.diagonal(dim1=-2, dim2=-1).sqrt()
+    scale = std.unsqueeze(-1) * std.unsqueeze(-2)
+    assert (torch.linalg.eigvalsh(rounded_cov / scale) > 0).all()
+    assert_close(rounded_cov / scale, cov / scale, rtol=0, atol=0.05)
+    assert ((rounded - mean).abs() < 0.05 * std).all()

@@ -9,14 +9,19 @@ from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import (
+    ClipTransform,
     Compose,
+    DoubleToFloat,
+    ObservationNorm,
     RenameTransform,
     SerialEnv,
     TransformedEnv,
+    UnsqueezeTransform,
+    VecNormV2,
     check_env_specs,
 )
 
-from tests.filters.factories import assert_equal, linear_system
+from tests.filters.factories import assert_equal, linear_kalman, linear_system
 from tests.transforms import envs_for_tests as envs
 from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.filters import KalmanFilter
@@ -268,3 +273,61 @@ def test_a_function_that_writes_an_entry_does_not_declare_it():
         env.set_seed(0)
         rollouts.append(env.rollout(5)["next"])
     assert_equal(*rollouts, [("belief", "mean"), ("belief", "cov")], atol=1e-6)
+
+
+# ----------------------------------------------------------------------------------- transforms that come behind it
+
+MEAN, NORM = ("belief", "mean"), {"loc": 0.0, "scale": 10.0}
+
+
+def env_with(filter, *behind, **options):
+    env = TransformedEnv(envs.base_env(batch_size=[3]), DEnKFTransform(filter, **options))
+    for transform in behind:
+        env.append_transform(transform)
+    env.set_seed(0)
+    torch.manual_seed(0)
+    return env
+
+
+@pytest.mark.parametrize(
+    ("make", "key"),
+    [
+        (lambda: ObservationNorm(in_keys=[MEAN], **NORM), MEAN),
+        (lambda: ClipTransform(in_keys=[MEAN], low=-0.01, high=0.01), MEAN),
+        (lambda: VecNormV2(in_keys=["observation", ("belief", "cov")]), ("belief", "cov")),
+        (lambda: Compose(DoubleToFloat(), UnsqueezeTransform(dim=-1, in_keys=[MEAN])), MEAN),
+        (lambda: RenameTransform(["observation"], [MEAN]), MEAN),
+    ],
+)
+def test_a_transform_that_writes_over_the_carry_is_named(float64, make, key):
+    env = env_with(linear_kalman(), make())
+    with pytest.raises(
+        ValueError, match=r"(ObservationNorm|Clip|VecNorm|Unsqueeze|Rename).* writes over .*out_keys="
+    ) as e:
+        env.rollout(2)
+    assert repr(key) in str(e.value)
+
+
+def test_transforms_that_leave_the_carry_alone(float64):
+    plain = env_with(linear_kalman()).rollout(5)
+    normed = env_with(linear_kalman(), ObservationNorm(in_keys=[MEAN], out_keys=["policy"], **NORM)).rollout(5)
+    assert_equal(normed["next"], plain["next"], [MEAN, ("belief", "cov")])
+    torch.testing.assert_close(normed["next", "policy"], 10 * plain["next", "belief", "mean"])
+    # In front of the filter, or over a mean that an ensemble does not carry.
+    first = TransformedEnv(envs.base_env(batch_size=[3]), ObservationNorm(in_keys=["observation"], **NORM))
+    first.append_transform(DEnKFTransform(linear_kalman()))
+    first.rollout(2)
+    plain = env_with(envs.random_filter()).rollout(5)
+    normed = env_with(envs.random_filter(), ObservationNorm(in_keys=[MEAN], **NORM)).rollout(5)
+    assert normed["belief", "ensemble"].equal(plain["belief", "ensemble"])
+    torch.testing.assert_close(normed["next", "belief", "mean"], 10 * plain["next", "belief", "mean"])
+
+
+@pytest.mark.parametrize("given", ["mean", "cov"])
+def test_a_part_of_a_belief_given_to_reset_is_refused(float64, given):
+    env = env_with(linear_kalman())
+    start = env.reset()
+    lacking = ({"mean", "cov"} - {given}).pop()
+    with pytest.raises(KeyError, match=rf"reads \('belief', '{lacking}'\), which is missing.*a whole belief"):
+        env.reset(start.select(("belief", given)))
+    assert env.reset(start.set(MEAN, start[MEAN] + 1))[MEAN].equal(start[MEAN])

@@ -76,6 +76,8 @@ class BackpropKF(Filter):
         inflation: float = 1.0,
         **options: Unpack[ReadingOptions],
     ):
+        if options.get("sensor_error") is not None:
+            raise TypeError("BackpropKF takes no sensor_error: KalmanFilter and EKF do.")
         a, c = as_floating(transition, "transition"), as_floating(observation, "observation")
         check_square("transition", a)
         check_shape("observation", c, (len(c) if c.ndim else 0, len(a)), "[O, S]")

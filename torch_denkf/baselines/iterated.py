@@ -33,8 +33,8 @@ class IEnKS(Filter):
         rotate: random mean-preserving rotation of them.
         process_noise: Q of the motion: standard deviations ``[S]`` (a number for all), or a module that writes Q, see
             :mod:`torch_denkf.modules.process_noise`. ``None``: the motion is exact.
-        **options: ``reading_space``, ``observation_key``, ``observed_key`` and what every filter takes, see
-            :class:`~torch_denkf.filters.parts.ReadingOptions`; neither ``update_at_reset`` nor ``visibility``.
+        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``sensor_error`` and what every filter
+            takes, see :class:`~torch_denkf.filters.parts.ReadingOptions`; no ``update_at_reset``, no ``visibility``.
 
     Raises:
         ValueError: if a model draws noise of its own, it is not clear where the reading is, or ``update_at_reset`` is
@@ -82,7 +82,7 @@ class IEnKS(Filter):
         transition = parts.moving()
         analysis = IteratedAnalysis(
             transition,
-            observation,
+            parts.observation,
             iterations=iterations,
             inflation=inflation,
             rotate=rotate,
@@ -90,4 +90,4 @@ class IEnKS(Filter):
             **parts.reading(),
         )
         modules = parts.in_order(transition=transition, analysis=analysis)
-        super().__init__(modules, initial=with_smoothed(initial), **parts.options)
+        super().__init__(modules, initial=with_smoothed(parts.initial), **parts.options)

@@ -18,9 +18,10 @@ from torch_denkf.functional.smoothing.iterated import iterated_smoothing
 from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.gaussian import further_keys
 from torch_denkf.modules.motion_noise import NoisyTransition
+from torch_denkf.modules.spaces import mean_reading, told
 from torch_denkf.running import check_module, random_parts, run_module
 from torch_denkf.smoothers.past import moments_of
-from torch_denkf.submodel import Call, Entries, Update, flat_noise
+from torch_denkf.submodel import Call, Entries, Initial, Update, flat_noise, role
 
 __all__ = ["IteratedAnalysis", "with_smoothed"]
 
@@ -44,12 +45,22 @@ def with_smoothed(
         >>> start(TensorDict({}))["smoothed", "age"]
         tensor([0])
     """
-    return AugmentedBelief(initial, [(smoothed_prefix, name) for name in _SMOOTHED], partial(_twice, belief_prefix))
+    keys: list[NestedKey] = [(smoothed_prefix, name) for name in _SMOOTHED]
+    follow = partial(_twice, belief_prefix, tuple(keys), role(initial, Initial).space)
+    return AugmentedBelief(initial, [], _nothing, follow_keys=keys, follow=follow)
 
 
-def _twice(prefix: str, belief: Entries, batch_size: torch.Size) -> list[torch.Tensor]:
-    same = [belief[prefix, name] for name in _SMOOTHED[:3]]
-    return [*same, torch.zeros(*batch_size, 1, dtype=torch.int64, device=same[0].device)]
+def _nothing(belief: Entries, batch_size: torch.Size) -> list[torch.Tensor]:
+    return []
+
+
+def _twice(prefix: str, keys: Sequence[NestedKey], space: Space | None, belief: Entries) -> list[torch.Tensor]:
+    if all(key in belief for key in keys):  # stored with it
+        return [belief[key] for key in keys]
+    ensemble, names = belief[prefix, "ensemble"], [(prefix, "mean"), (prefix, "var")]
+    known = all(key in belief for key in names)
+    moments = [belief[key] for key in names] if known else moments_of(ensemble, None, space)
+    return [ensemble, *moments, torch.zeros_like(ensemble[..., 0, :1], dtype=torch.int64)]
 
 
 class IteratedAnalysis(Update):
@@ -144,11 +155,12 @@ class IteratedAnalysis(Update):
         """The belief, the smoothed belief, and the diagnostics."""
         ensemble, reading, variance = (self.required(entries, key) for key in self.in_keys[:3])
         space, on = self.space, self.reading_space
+        observed = told(on, entries.get(self.observed_key))
         if reading.ndim == ensemble.ndim:
-            reading = reading.mean(-2) if on is None else on.mean(reading)
+            reading = mean_reading(on, reading, observed)
         center = ensemble[..., :1, :] if space is None else space.mean(ensemble).unsqueeze(-2)
         start = ensemble if space is None else space.minus(ensemble, center)
-        observed, dim = entries.get(self.observed_key), start.shape[-1]
+        dim = start.shape[-1]
         noise = self._motion_noise(entries, start, call)
         whole = torch.cat([start, *noise.values()], -1)
 

@@ -7,6 +7,8 @@ little. The passes make no result right that is wrong without them. They are use
 were tested with; with others inductor runs as it is.
 """
 
+from torch_denkf.compilation.captured import CapturedSteps as CapturedSteps
+from torch_denkf.compilation.captured import strategy as strategy
 from torch_denkf.compilation.compared import refuse_other_numbers as refuse_other_numbers
 from torch_denkf.compilation.compiled import CompiledSteps as CompiledSteps
 from torch_denkf.compilation.libraries import clear_damaged_libraries as clear_damaged_libraries
@@ -14,4 +16,5 @@ from torch_denkf.compilation.libraries import clear_full_cache as clear_full_cac
 from torch_denkf.compilation.options import need_compiler as need_compiler
 from torch_denkf.compilation.options import options_for_processors as options_for_processors
 from torch_denkf.compilation.options import worth_checking as worth_checking
+from torch_denkf.compilation.shared_gradients import sharing as sharing
 from torch_denkf.compilation.tracing import trace_below_autograd as trace_below_autograd

@@ -10,7 +10,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-__all__ = ["placed", "refuse_other_numbers", "tensors"]
+__all__ = ["placed", "put_back", "refuse_other_numbers", "tensors"]
 
 #: Roundings by which two orders of the same sums may differ: of the largest number in a column, and in an entry.
 _OF_COLUMN, _OF_ENTRY = 1000, 10
@@ -78,7 +78,7 @@ def refuse_other_numbers(
         try:
             return _results(function, inputs, values, by, list(trained.values()), seed)
         finally:
-            _put_back(kept)
+            put_back(kept)
 
     same = all(one is other for one, other in zip(given, telling, strict=True))
     finite = all(bool(value.isfinite().all()) for value in given)  # of NaN times zero a compiler may make zero
@@ -105,7 +105,7 @@ def refuse_other_numbers(
             )
 
 
-def _put_back(kept: Sequence[tuple[Tensor, Tensor]]) -> None:
+def put_back(kept: Sequence[tuple[Tensor, Tensor]]) -> None:
     """Gives tensors their values back; those that have not changed are not written, as a graph may hold them."""
     with torch.no_grad():
         for value, before in kept:

@@ -38,13 +38,25 @@ class CompiledSteps:
         options: of ``torch.compile``; on a processor, if there are none, the passes of ``torch_denkf.compilation``.
     """
 
-    def __init__(self, chunk: int, options: Mapping[str, Any]):
-        if chunk < 0:
-            raise ValueError(f"chunk is a number of steps, or 0 for none; got {chunk}.")
-        if options.get("backend", "inductor") == "inductor":
-            need_compiler()
+    made, maker = "compiled", "torch's compiler"
+    cure = (
+        'Use filter.compile(backend="aot_eager"), which leaves the compiler of kernels out, or none, '
+        "filter.compile(chunk=0); and please report the filter."
+    )
+
+    def __init__(self, chunk: int | None, options: Mapping[str, Any]):
         self.chunk, self.options = chunk, dict(options)
+        if self._by_inductor():
+            need_compiler()
         self._functions: dict[tuple, tuple[Callable, set]] = {}
+
+    def _compiler_options(self) -> dict[str, Any] | None:
+        """Returns what ``torch.compile`` is asked for; ``None`` where it is not asked."""
+        return self.options
+
+    def _by_inductor(self) -> bool:
+        options = self._compiler_options()
+        return options is not None and options.get("backend", "inductor") == "inductor"
 
     def __getstate__(self) -> dict:
         return {"chunk": self.chunk, "options": self.options, "_functions": {}}
@@ -66,7 +78,7 @@ class CompiledSteps:
         keys, start_keys = tuple(inputs), tuple(starts)
         carry, outputs, begin = tuple(carry.values()), [], 0
         while begin < count:
-            length = self.chunk if count - begin >= self.chunk else 1
+            length = self._length(count - begin)
             here = tuple(cuts[begin : begin + length])
             now = tuple(inputs[key].narrow(time, begin, length) for key in keys)
             marked = max(0, min(length, resets.shape[time] - begin))
@@ -79,11 +91,14 @@ class CompiledSteps:
             carry, values = self._call(kind, steps, make, given, names, writes)
             outputs.append(values)
             begin += length
-        columns = zip(*outputs, strict=True)
-        written = {key: torch.cat(values, time) for key, values in zip(keep, columns, strict=True)}
-        return dict(zip(steps.structure.carry, carry, strict=True)), written
+        whole = outputs[0] if len(outputs) == 1 else [torch.cat(parts, time) for parts in zip(*outputs, strict=True)]
+        return dict(zip(steps.structure.carry, carry, strict=True)), dict(zip(keep, whole, strict=True))
 
-    def _call(self, kind: tuple, steps: Steps, make: Callable, inputs: tuple, names: tuple, writes: tuple) -> tuple:
+    def _length(self, left: int) -> int:
+        """Returns the number of steps in the next graph of a sequence."""
+        return self.chunk if left >= self.chunk else 1
+
+    def _call(self, kind: tuple, steps: Steps, make: partial, inputs: tuple, names: tuple, writes: tuple) -> tuple:
         """Runs the compiled function of a kind; on a miss, compiles it and compares it with the eager one.
 
         Args:
@@ -101,17 +116,10 @@ class CompiledSteps:
         device = some.device
         kind = (*kind, steps.structure.modules, steps.update_at_reset, device)
         if kind not in self._functions:
-            if self.options.get("backend", "inductor") == "inductor":
-                clear_damaged_libraries()
-            function = make()
-            # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
-            code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")
-            own = FunctionType(code, function.__globals__, function.__name__, None, function.__closure__)
-            compiled = torch.compile(own, fullgraph=True, dynamic=False, **self._arguments(device))
-            self._functions[kind] = compiled, set()
+            self._functions[kind] = self._made(make, steps, device), set()
         function, compared = self._functions[kind]
         mode = torch.is_grad_enabled(), some.dtype  # torch.compile compiles again for each
-        if mode not in compared and has_values(some):
+        if mode not in compared and self._checked(device) and has_values(some):
             refuse_other_numbers(
                 function,
                 make(),
@@ -122,13 +130,27 @@ class CompiledSteps:
                 # Who records gradients of single steps seldom wants them; a backward pass takes as long to compile.
                 parameters=None if kind[0] == "step" else _parameters(steps),
                 state=[value for _, module in steps.structure.modules for value in module.buffers()],
-                what="compiled step" if kind[0] == "step" else "compiled sequence",
-                cure='Use filter.compile(backend="aot_eager"), which leaves the compiler of kernels out, or none, '
-                "filter.compile(chunk=0); and please report the filter.",
+                what=f"{self.made} {'step' if kind[0] == 'step' else 'sequence'}",
+                cure=self.cure,
+                maker=self.maker,
             )
             compared.add(mode)
         out = function(*inputs)
         return placed(out, (value.clone() for value in tensors(out))) if self._overwrites(device) else out
+
+    def _made(self, make: partial, steps: Steps, device: torch.device) -> Callable:
+        """Compiles a function of these steps."""
+        function = make()
+        if self._by_inductor():
+            clear_damaged_libraries()
+        # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
+        code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")
+        own = FunctionType(code, function.__globals__, function.__name__, None, function.__closure__)
+        return torch.compile(own, fullgraph=True, dynamic=False, **self._arguments(device))
+
+    def _checked(self, device: torch.device) -> bool:
+        """Tells whether results are compared with eager ones."""
+        return True
 
     def _overwrites(self, device: torch.device) -> bool:
         """Tells whether outputs lie in memory that the next call uses again: that of CUDA graphs."""
@@ -138,8 +160,9 @@ class CompiledSteps:
         return bool(graphs) and device.type == "cuda"
 
     def _arguments(self, device: torch.device) -> dict[str, Any]:
-        if self.options or device.type != "cpu":
-            return self.options
+        options = self._compiler_options()
+        if options or device.type != "cpu":
+            return options
         return {"options": options_for_processors()}
 
 
@@ -158,7 +181,7 @@ class BoundSteps(NamedTuple):
 
     def step(self, entries: Entries, call: Call) -> Entries:
         """Takes one step."""
-        noise = self.filter.missing_noise(entries, call.batch_size)
+        noise = self.filter.draws.missing(entries, call.batch_size)
         return self.compiled.step(self.steps, {**entries, **noise}, call.batch_size)
 
     def scan(self, *args: Any) -> tuple[Entries, Entries]:
@@ -170,7 +193,7 @@ def _frames(steps: Steps, names: tuple) -> list[NestedKey]:
     """Returns the names of inputs that are neither noise nor beliefs."""
     structure = steps.structure
     others = {*structure.carry, *structure.belief}
-    return [name for name in names if name not in others and name[0] != "noise"]
+    return [name for name in names if name not in others and name[0] not in ("noise", "previous")]
 
 
 def _parameters(steps: Steps) -> dict[str, Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -22,6 +22,7 @@ __all__ = [
     "float_pictures",
     "is_bomb",
     "image_store",
+    "picture_files",
     "scaled",
     "text_of_size",
     "unnamed_file",
@@ -69,6 +70,27 @@ def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR) -> np.ndarray | N
     complete = next((end in data[-64:] for begin, end in ends.items() if data.startswith(begin)), bool(data))
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if complete and not is_bomb(data) else None
     return pixels if pixels is None or pixels.ndim == 2 else pixels[..., ::-1]
+
+
+def picture_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    """Images in a folder, in no order, without hidden ones, such as ._1.png, which are a file manager's.
+
+    Raises:
+        ValueError: if two of them are of one name, so that a frame would count twice, or one is neither file nor
+            folder, such as a pipe, which would wait for a writer.
+    """
+    files: dict[str, Path] = {}
+    for file in sorted(folder.iterdir()):
+        if file.suffix.lower() not in suffixes or file.name.startswith(".") or file.is_dir():
+            continue
+        if not file.is_file():
+            raise ValueError(f"{file} is no file, but a pipe, a device or a link to nowhere; take it out of the folder")
+        if (other := files.setdefault(file.stem, file)) is not file:
+            raise ValueError(
+                f"{file} and {other.name} are two images of one name, and their frame would count twice; take one of "
+                "the two out of the folder"
+            )
+    return list(files.values())
 
 
 def is_bomb(data: bytes) -> bool:

@@ -9,6 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from torch_denkf.deployment.files import name_for_c
+
 EXTRA = "pip install 'torch_denkf[lerobot]'"
 NOT_DECODED = (
     "no frame of {} can be decoded: it is damaged (download or copy it anew), or in a codec that OpenCV here lacks, "
@@ -55,7 +57,7 @@ def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator
 
 def decoded_frames(file: Path) -> Iterator[tuple[float, np.ndarray]]:
     """All frames that can be decoded, in the order in which they are shown."""
-    capture = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG)
+    capture = cv2.VideoCapture(name_for_c(file), cv2.CAP_FFMPEG)
     try:
         # OpenCV's wheels leave AV1, LeRobot's default, to the hardware.
         if _codec(capture) == "av01":
@@ -78,7 +80,7 @@ def say_if_cut(file: Path, times: Sequence[float]) -> None:
         file: the video.
         times: s, of the frames that could be decoded, one at least.
     """
-    capture = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG)
+    capture = cv2.VideoCapture(name_for_c(file), cv2.CAP_FFMPEG)
     count, rate = (capture.get(what) for what in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
     capture.release()
     if count <= 0 or rate <= 0:

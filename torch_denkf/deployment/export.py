@@ -134,7 +134,7 @@ def export_step(
         raise ValueError(f"the filter does not write {unknown}; it writes {list(inner)}")
     entries = filter.entries_of(example, one_step=True)
     if format == "onnx":
-        entries |= filter.missing_noise(entries, example.batch_size)
+        entries |= filter.draws.missing(entries, example.batch_size)
     in_keys = _inputs(filter, entries, example)
     # Not parts of one another, whose strides the graph would hold.
     values = tuple(entries[key].clone(memory_format=torch.contiguous_format) for key in in_keys)

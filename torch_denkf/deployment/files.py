@@ -18,6 +18,7 @@ from torch_denkf.compilation.lock import take_lock
 
 __all__ = [
     "clear_errors",
+    "name_for_c",
     "place_beside",
     "replacing",
     "reserve",
@@ -61,6 +62,23 @@ def clear_errors(
         else:
             raise
         raise type(error)(error.errno, f"cannot write {name or file}: {text}") from error
+
+
+def name_for_c(file: str | Path) -> str:
+    """Returns a path for a library in C that reads it as UTF-8, such as OpenCV, which any other name ends by a crash.
+
+    Raises:
+        ValueError: if it is no UTF-8; the message has its bytes.
+
+    Examples:
+        >>> name_for_c(Path("run1.mp4"))
+        'run1.mp4'
+    """
+    try:
+        str(file).encode()
+    except UnicodeEncodeError as error:
+        raise ValueError(f"the name {os.fsencode(file)!r} is no UTF-8; rename it, such as to run1.mp4") from error
+    return str(file)
 
 
 def _holds(folder: str, file: Path) -> bool:

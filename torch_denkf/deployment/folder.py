@@ -21,7 +21,7 @@ from torch_denkf.compilation.lock import locked
 from torch_denkf.deployment.files import sync, write_bytes, write_text
 from torch_denkf.deployment.rebuilt import build_from, refuse_another
 
-__all__ = ["load_folder", "read_folder_config", "save_folder"]
+__all__ = ["described", "load_folder", "read_folder_config", "save_folder"]
 
 FORMAT = "torch_denkf.filter/1"
 WEIGHTS, CONFIG = "weights.safetensors", "config.json"
@@ -40,7 +40,7 @@ def save_folder(
     """Writes a model to a folder.
 
     ``weights.safetensors`` gets parameters and buffers; ``config.json`` gets the builder's name, its settings, the
-    SHA-256 of the weights, the versions that wrote both, and what is known of the training.
+    SHA-256 of the weights, the versions that wrote both, what is known of the training, and the SHA-256 of all that.
 
     Args:
         model: the model.
@@ -86,10 +86,20 @@ def save_folder(
         _settle(folder)
         try:  # the new weights lie beside the old ones until one rename, that of the description, changes the model
             write_bytes(_unsettled(folder, config["sha256"]), weights)
-            write_text(folder / CONFIG, json.dumps(config, indent=1) + "\n")
+            write_text(folder / CONFIG, described(config))
         finally:
             _settle(folder)
     return folder
+
+
+def described(config: Mapping[str, Any]) -> str:
+    """Returns the text of ``config.json``, with a checksum of all that it says."""
+    return json.dumps({**config, "checksum": _checksum(config)}, indent=1) + "\n"
+
+
+def _checksum(config: Mapping[str, Any]) -> str:
+    said = {name: value for name, value in config.items() if name != "checksum"}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
 def _unsettled(folder: Path, sha256: object) -> Path:
@@ -119,7 +129,7 @@ def read_folder_config(folder: str | Path, builders: Mapping[str, object]) -> di
 
     Raises:
         FileNotFoundError: if there is no filter in the folder.
-        ValueError: if the file is damaged, of another format, or names another builder.
+        ValueError: if the file is damaged or changed, of another format, or names another builder.
     """
     file = Path(folder).expanduser() / CONFIG
     if not file.is_file():
@@ -134,6 +144,11 @@ def read_folder_config(folder: str | Path, builders: Mapping[str, object]) -> di
         raise ValueError(
             f"{file} is of a filter that {config.get('builder')!r} builds; expected {', '.join(map(repr, builders))}. "
             "Pass a function of your own by builders={NAME: function}"
+        )
+    if config.get("checksum") != _checksum(config):
+        raise ValueError(
+            f"{file} is damaged, or was changed by hand: it does not have its checksum; restore it from a copy, or "
+            "build the filter you want and save it"
         )
     return config
 

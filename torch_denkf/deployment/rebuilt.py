@@ -30,7 +30,11 @@ def build_from(builder: Callable[..., nn.Module], settings: Mapping[str, Any]) -
 def refuse_another(model: nn.Module, name: str, builder: Callable[..., nn.Module], settings: Mapping[str, Any]) -> None:
     """Raises a ``ValueError`` where a function of settings builds another model; the message names what differs."""
     with torch.random.fork_rng(devices=[]):
-        found = sorted(differences(model, build_from(builder, settings)))
+        built = build_from(builder, settings)
+    for label in ("builder", "settings"):  # which a model gets when it is loaded
+        if hasattr(model, label) and not hasattr(built, label):
+            setattr(built, label, getattr(model, label))
+    found = sorted(differences(model, built))
     if found:
         listed = "; ".join(found[:5]) + (f"; and {len(found) - 5} more" if len(found) > 5 else "")
         given = ", ".join(f"{key}={value!r}" for key, value in settings.items())

@@ -17,6 +17,8 @@ __all__ = ["NarrowEnsemble"]
 
 #: Readings of the second half of a sequence that it takes, and how far the median one lies off, in standard deviations.
 _READINGS, _FAR = 20, 4.0
+#: Members of whom chance correlations are small.
+_MANY = 100
 
 
 class NarrowEnsemble(Once):
@@ -63,8 +65,20 @@ def _look(
     messages.warn(
         f"narrow at {place!r}",
         f"The ensemble is too narrow for the readings {module.in_keys[2]!r} at place {place!r}: half of them lie more "
-        f"than {float(median):.1f} standard deviations from what it expects.{component} Chance correlations of "
-        "few members shrink what fast sensors say nothing about: take "
-        'EnsembleAnalysis(localisation="significance"). Else the noise of these readings, or that of the motion, is '
-        "too small.",
+        f"than {float(median):.1f} standard deviations from what it expects.{component} {_causes(members)}",
     )
+
+
+def _causes(members: Tensor | None) -> str:
+    """Lists what makes an ensemble too narrow, and the cure of each."""
+    causes = [
+        "The noise of these readings, or that of the motion, may be too small.",
+        "An outlier, or a jump, may have taken the belief away: put a gate around the filter, Gated(filter), which "
+        "believes less of what lies far off, and opens after patience= such readings.",
+    ]
+    if members is None or members.shape[-2] < _MANY:
+        causes.append(
+            "Chance correlations of few members shrink what fast sensors say nothing about: take "
+            'EnsembleAnalysis(localisation="significance").'
+        )
+    return " ".join(causes)

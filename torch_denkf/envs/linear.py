@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_count, check_number, check_shape, check_square, check_values
+from torch_denkf.envs._seeded import SeededEnv
 
 __all__ = ["LinearGaussianEnv"]
 
@@ -27,7 +27,7 @@ def _constant(name: str, value: torch.Tensor | Sequence) -> torch.Tensor:
     return constant
 
 
-class LinearGaussianEnv(Checked, EnvBase):
+class LinearGaussianEnv(Checked, SeededEnv):
     r"""Simulates :math:`x_{t+1} = F x_t + B a_t + N(0, Q)`, :math:`y_t = H x_t + N(0, R)`.
 
     Emits ``"state"`` ``[*B, S]`` (the truth), ``"observation"`` ``[*B, O]`` and ``"observed"`` ``[*B, 1]``; readings
@@ -70,10 +70,10 @@ class LinearGaussianEnv(Checked, EnvBase):
             check_count("batch_size, each number,", count, least=0)
         super().__init__(batch_size=torch.Size(batch_size), device=device)
         dtype = torch.get_default_dtype()
-        self.F, self.H = _constant("transition", transition), _constant("observation", observation)
-        check_square("transition", self.F)
-        state_dim, observation_dim = len(self.F), len(self.H)
-        check_shape("observation", self.H, (observation_dim, state_dim), "[O, S]")
+        F, H = _constant("transition", transition), _constant("observation", observation)
+        check_square("transition", F)
+        state_dim, observation_dim = len(F), len(H)
+        check_shape("observation", H, (observation_dim, state_dim), "[O, S]")
         for name, std, size in (
             ("transition_std", transition_std, state_dim),
             ("observation_std", observation_std, observation_dim),
@@ -89,12 +89,18 @@ class LinearGaussianEnv(Checked, EnvBase):
         check_number("missing", missing, least=0, most=1)
         for steps in [max_steps] if isinstance(max_steps, (int, float, str)) else list(max_steps):
             check_count("max_steps", steps if isinstance(steps, (int, float, str)) else int(steps))
-        self.B = torch.zeros(state_dim, 1) if control is None else torch.as_tensor(control, dtype=dtype)
-        self.transition_std = torch.as_tensor(transition_std, dtype=dtype)
-        self.observation_std = torch.as_tensor(observation_std, dtype=dtype)
-        self.initial_std = torch.ones(state_dim) if initial_std is None else torch.as_tensor(initial_std, dtype=dtype)
+        constants = {
+            "F": F,
+            "H": H,
+            "B": torch.zeros(state_dim, 1) if control is None else torch.as_tensor(control, dtype=dtype),
+            "transition_std": torch.as_tensor(transition_std, dtype=dtype),
+            "observation_std": torch.as_tensor(observation_std, dtype=dtype),
+            "initial_std": torch.ones(state_dim) if initial_std is None else torch.as_tensor(initial_std, dtype=dtype),
+            "max_steps": torch.as_tensor(max_steps).expand(self.batch_size),
+        }
+        for name, value in constants.items():  # which move with the environment
+            self.register_buffer(name, value if device is None else value.to(device), persistent=False)
         self.missing = missing
-        self.max_steps = torch.as_tensor(max_steps).expand(self.batch_size)
         shape = self.batch_size
         self.observation_spec = Composite(
             state=Unbounded((*shape, state_dim), dtype=dtype),
@@ -108,17 +114,14 @@ class LinearGaussianEnv(Checked, EnvBase):
         self.reward_spec = Unbounded((*shape, 1))
         flag = Binary(shape=(*shape, 1), dtype=torch.bool)
         self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape)
-        self.rng = torch.Generator().manual_seed(seed)
-
-    def _set_seed(self, seed: int | None) -> None:
-        self.rng.manual_seed(0 if seed is None else seed)
+        self._set_seed(seed)
 
     def _randn(self, like: torch.Tensor, size: int) -> torch.Tensor:
-        return torch.randn(*self.batch_size, size, generator=self.rng, dtype=like.dtype)
+        return torch.randn(*self.batch_size, size, dtype=like.dtype, **self._source(like))
 
     def _emit(self, state: torch.Tensor, step: torch.Tensor) -> TensorDict:
         reading = state @ self.H.mT + self.observation_std * self._randn(state, self.H.shape[0])
-        observed = torch.rand(*self.batch_size, 1, generator=self.rng) >= self.missing
+        observed = torch.rand(*self.batch_size, 1, **self._source(state)) >= self.missing
         reading = torch.where(observed, reading, torch.nan)
         entries = {"state": state, "observation": reading, "observed": observed, "step": step}
         truncated = step >= self.max_steps.unsqueeze(-1)
@@ -127,10 +130,10 @@ class LinearGaussianEnv(Checked, EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
         state = self.initial_std * self._randn(self.initial_std, self.F.shape[0])
-        return self._emit(state, torch.zeros(*self.batch_size, 1, dtype=torch.int64))
+        return self._emit(state, state.new_zeros(*self.batch_size, 1, dtype=torch.int64))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         state, action = tensordict["state"], tensordict["action"]
         noise = self.transition_std * self._randn(state, state.shape[-1])
         out = self._emit(state @ self.F.mT + action @ self.B.mT + noise, tensordict["step"] + 1)
-        return out.set("reward", torch.zeros(*self.batch_size, 1))
+        return out.set("reward", state.new_zeros(*self.batch_size, 1, dtype=self.reward_spec.dtype))

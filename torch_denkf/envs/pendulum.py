@@ -76,10 +76,10 @@ class NoisyPendulumEnv(LinearGaussianEnv):
         self.action_spec = Bounded(-self.MAX_TORQUE, self.MAX_TORQUE, (*self.batch_size, 1), dtype=dtype)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
-        uniform = 2 * torch.rand(*self.batch_size, 2, generator=self.rng, dtype=self.F.dtype) - 1
+        uniform = 2 * torch.rand(*self.batch_size, 2, dtype=self.F.dtype, **self._source(self.F)) - 1
         angle, velocity = torch.pi * uniform[..., :1], uniform[..., 1:]
         state = torch.cat([angle.cos(), angle.sin(), velocity], -1)
-        return self._emit(state, torch.zeros(*self.batch_size, 1, dtype=torch.int64))
+        return self._emit(state, state.new_zeros(*self.batch_size, 1, dtype=torch.int64))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         cos, sin, velocity = tensordict["state"].split(1, -1)

@@ -89,6 +89,8 @@ class ReplayEnv(RowsEnv):
         (torch.Size([2, 9, 2]), True)
     """
 
+    _turn: Tensor
+
     def __init__(
         self,
         data: EpisodeReplay,
@@ -148,16 +150,16 @@ class ReplayEnv(RowsEnv):
             shift = drawn - torch.where(which > 0, self._stretches[which - 1], 0)
             return self._starts[which] + shift, self._ends[which] + shift
         turn = self._turn + starts.reshape(-1).cumsum(0).reshape(self.batch_size) - 1
-        self._turn += int(starts.sum())
+        self._turn = self._turn + starts.sum()
         which = turn.clamp_min(0) % len(self._starts)
         return self._starts[which], self._ends[which]
 
     def _set_seed(self, seed: int | None) -> None:
         super()._set_seed(seed)
-        self._turn = 0
+        self._turn = torch.tensor(0, device=self.device)
 
     def _row(self, row: Tensor) -> TensorDict:
-        rows = self.data[row.reshape(-1).cpu()].reshape(self.batch_size)
+        rows = self.data[row.reshape(-1).to(getattr(self.data, "device", None) or "cpu")].reshape(self.batch_size)
         return rows if self.device is None else rows.to(self.device)
 
     def _rows_at(self, row: Tensor) -> TensorDict:

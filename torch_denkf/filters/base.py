@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from copy import copy
 from itertools import chain
 from typing import Any, Unpack, cast
@@ -29,16 +28,16 @@ from torchrl.modules.tensordict_module.rnn import recurrent_mode
 from torch_denkf._arguments import Checked, check_arguments
 from torch_denkf._checks import check_count
 from torch_denkf._registered import compiler, diagnosis, primers
-from torch_denkf._slices import as_rows, starts_of
+from torch_denkf._slices import as_rows, device_of, starts_of
 from torch_denkf.filters.finish import RUNS, Record, check_belief, own
 from torch_denkf.filters.gather import gather_rows, of_one_robot
-from torch_denkf.filters.noise import Drawn, draw_noise, recorded_draws
+from torch_denkf.filters.noise import Draws
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.filters.scan import Steps, where_rows
 from torch_denkf.filters.structure import KNOWN, Structure, previous_key
 from torch_denkf.modules.variance_ceiling import VarianceCeiling
-from torch_denkf.running import check_module, named_modules_of, random_parts, reads, run_module
-from torch_denkf.submodel import EXPLAINED, Call, Entries, Initial, Transition, flat_noise, in_role, role
+from torch_denkf.running import check_module, named_modules_of, reads, run_module
+from torch_denkf.submodel import Call, Entries, Initial, Transition, flat_noise, in_role, role
 
 __all__ = ["Filter"]
 
@@ -80,9 +79,10 @@ class Filter(Checked, TensorDictSequential):
         forecast_keys: the forecast of each carried entry, where it cannot be told by its name.
         variance_ceiling: the belief's variances are clamped to it, so that an unstable system that nobody observes
             stays finite, with one warning; in the state's units squared. ``None`` for no ceiling.
-        check_finite: whether a step raises where its new belief is not finite. In a sequence the NaN of a belief that
-            diverges goes on to its end. Readings are checked, or rejected, by
-            ``torch_denkf.imperfect.RejectReadings`` in front of the filter.
+        check_finite: whether a step raises where its new belief is not finite, and any run where the noise of a reading
+            is no covariance. In a sequence the NaN of a belief that diverges goes on to its end, and one warning names
+            its cause. Readings are checked, or rejected, by ``torch_denkf.imperfect.RejectReadings`` in front of the
+            filter. On a GPU nothing is looked at: each step would wait for it.
         prefix: name under which all stands that the filter writes, carries on or finds as noise: with ``"imu"`` the
             mean is ``("imu", "belief", "mean")``. Two filters of one environment or policy need one. ``None`` for none.
 
@@ -161,11 +161,7 @@ class Filter(Checked, TensorDictSequential):
             ceiling = VarianceCeiling(structure.kinds, structure.belief, self.variance_ceiling)
             structure = structure._replace(posterior=(*structure.update, ("variance_ceiling", ceiling)))
         self.structure, self.steps = structure, Steps(structure, self.update_at_reset)
-        self._drawn: dict[tuple, Drawn] = {}
-        self._sizes: Drawn = {}
-        placed = (*structure.modules, ("initial", self.initial))
-        self._random = [found for place, module in placed for found in random_parts(module, place)]
-        self._places, written = {place for place, _ in self._random}, structure.out_keys
+        self.draws, written = Draws(self), structure.out_keys
         self._own_keys = {*written, *map(unravel_key, self.initial.out_keys)}
         self.in_keys = [self.outer(key) for key in structure.in_keys(self.init_key)]
         self.out_keys = [self.outer(key) for key in written]
@@ -327,7 +323,7 @@ class Filter(Checked, TensorDictSequential):
         the last action (:class:`torch_denkf.transforms.LastAction`).
         """
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
-            belief = run_module(self.initial, self._nothing(()), Call(torch.Size(), "initial"))
+            belief = run_module(self.initial, self.draws.nothing(()), Call(torch.Size(), "initial"))
         found = Composite()
         for key in self.structure.carry:
             value = belief[key]
@@ -337,21 +333,27 @@ class Filter(Checked, TensorDictSequential):
         actions = {key: self.outer(previous_key(key)) for key in self.structure.controls}
         return primers().LastAction(actions, primers=found)
 
-    def compile(self, *, chunk: int = 4, **options) -> Filter:
+    def compile(self, *, chunk: int | None = None, **options) -> Filter:
         """From now on runs steps, and sequences in chunks of steps, through ``torch.compile``.
 
         The first call of each kind (chunk, batch size, with or without gradients) compiles, later ones reuse that;
         copies and pickles of the filter compile again. Noise is drawn outside: a seed gives what it gives eagerly, up
         to rounding. Some calls stay eager: :meth:`predict`; ``step(without=...)``; in a policy, steps in which rows may
-        reset, and sequences of its data.
+        reset.
 
         Compilers have errors that nothing else shows. So the first call also runs eagerly, and where a reading is zero
         or missing both run again with numbers in it; a sequence with gradients is differentiated both ways, too. What
         differs by more than rounding raises.
 
+        On a GPU an eager step waits for its launches. ``mode="graph"`` compiles nothing: it records what the eager
+        steps launch, and their backward pass, in CUDA graphs, in about the time of a few eager calls. There a number
+        that is no tensor, such as an inflation, stays the one of the recording; on a processor it warns, and runs
+        eagerly. With further options, such as ``backend="inductor"``, one step is compiled, and the graphs hold that.
+
         Args:
-            chunk: steps of a sequence in one compiled graph. What is left over after whole chunks runs step by step. A
-                small chunk compiles sooner, a large one runs faster. 0 goes back to eager.
+            chunk: steps of a sequence in one compiled graph, 4 by default. What is left over after whole chunks runs
+                step by step. A small chunk compiles sooner, a large one runs faster. 0 goes back to eager. With
+                ``mode="graph"`` by default all steps are in one.
             **options: of ``torch.compile``. Without any, inductor on a processor writes what calls its kernels in C++,
                 too, makes fewer calls, and saves fewer tensors for the backward pass, which takes longer to compile and
                 about 40 % less to run; ``backend="inductor"`` alone leaves that out. On a GPU
@@ -365,8 +367,7 @@ class Filter(Checked, TensorDictSequential):
                 wrong.
             ValueError: if ``chunk`` is negative.
         """
-        check_count("chunk", chunk, least=0, cure="It is a number of steps, or 0 for none")
-        self.compiled = compiler().CompiledSteps(chunk, options) if chunk else None
+        self.compiled = None if chunk == 0 else compiler().strategy(chunk, options)
         return self
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -446,7 +447,7 @@ class Filter(Checked, TensorDictSequential):
         tensordict = self.of_one_robot(tensordict)
         hidden = tensordict.copy()
         for key in {part.mask_key for part in in_role(self.module, Transition)} - {None}:
-            hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=tensordict.device))
+            hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=device_of(tensordict)))
         out = self.step(hidden, without=self.structure.readings)
         written = [key for key in self.out_keys if out.get(key, None) is not None]
         return tensordict.update(out.select(*written))
@@ -506,8 +507,8 @@ class Filter(Checked, TensorDictSequential):
             written = steps.run(structure.frames, entries, call, bool(without))
         hidden, mask = dict(entries), role(self.initial, Initial).observed_key
         if without and mask is not None and not entries.keys() >= {*reads(self.initial)[0]}:
-            hidden = {**self._nothing(call.batch_size), **entries}
-            hidden[mask] = torch.zeros(*call.batch_size, 1, dtype=torch.bool, device=tensordict.device)
+            hidden = {**self.draws.nothing(call.batch_size), **entries}
+            hidden[mask] = torch.zeros(*call.batch_size, 1, dtype=torch.bool, device=device_of(tensordict))
         start = self.initial_belief(hidden, call)
         if self.update_at_reset:
             written.update(steps.begin(entries, call, start, bool(without)))
@@ -530,7 +531,7 @@ class Filter(Checked, TensorDictSequential):
         """
         size, entries = tensordict.batch_size, self.entries_of(tensordict)
         places, time = (*dict(self.structure.modules), "initial"), len(size) > 0
-        noise = self.missing_noise(entries, size, places=places, time=time, generator=generator)
+        noise = self.draws.missing(entries, size, places=places, time=time, generator=generator)
         return self.write(tensordict, noise)
 
     def sequence(
@@ -589,11 +590,11 @@ class Filter(Checked, TensorDictSequential):
             frames = steps.run(structure.frames, entries, call)
         gathered = gather_rows(structure, entries, marks, size, self.initial_belief)
         later = [place for place, _ in (structure.transition, *structure.update)]
-        gathered.inputs.update(self.missing_noise({**entries, **gathered.starts}, size, places=later, time=True))
+        gathered.inputs.update(self.draws.missing({**entries, **gathered.starts}, size, places=later, time=True))
         cuts = [detach_every is not None and t > 0 and t % detach_every == 0 for t in range(size[-1])]
         if gathered.stored:  # these have seen their frame
             steps = steps._replace(update_at_reset=False)
-        strategy = steps if self.compiled is None or gathered.resumed else self.compiled.of(self, steps)
+        strategy = steps if self.compiled is None else self.compiled.of(self, steps)
         with set_recurrent_mode(False):
             kept, one = tuple(key for key in keep if key in structure.step_keys), Call(torch.Size(size[:-1]))
             starts = gathered.begins, gathered.starts
@@ -606,7 +607,7 @@ class Filter(Checked, TensorDictSequential):
         """``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
         size = tensordict.batch_size
         marks = starts_of(tensordict, self.init_key)
-        first = torch.zeros(size, dtype=torch.bool, device=tensordict.device)
+        first = torch.zeros(size, dtype=torch.bool, device=device_of(tensordict))
         first[..., 0] = True
         first = first if marks is None else first | marks.reshape(size)
         if any(tensordict.get(self.outer(previous_key(key)), None) is None for key in self.structure.carry):
@@ -633,8 +634,8 @@ class Filter(Checked, TensorDictSequential):
         given = tensordict.get(self._noise_key, None)
         if given is not None:
             noise = flat_noise(given)
-            if any(len(key) < 2 or key[1] not in self._places for key in noise):
-                diagnosis().check_noise(self._places, type(self).__name__, noise)
+            if any(len(key) < 2 or key[1] not in self.draws.places for key in noise):
+                diagnosis().check_noise(self.draws.places, type(self).__name__, noise)
             entries.update(noise)
         return entries
 
@@ -669,57 +670,6 @@ class Filter(Checked, TensorDictSequential):
     def of_one_robot(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
         """Returns a tensordict as it is; of a dictionary a new one, ``[]``, in the filter's precision and device."""
         return of_one_robot(type(self).__name__, self.like(), tensordict)
-
-    def missing_noise(
-        self,
-        entries: Entries,
-        size: torch.Size,
-        *,
-        places: Iterable[str] | None = None,
-        time: bool = False,
-        generator: torch.Generator | None = None,
-    ) -> Entries:
-        """Draws the noise of a step's modules, or of some, that is not there yet; one trial step tells the sizes."""
-        if not self._random:
-            return {}
-        shapes = {
-            key: value.shape[len(size) :] for key, value in entries.items() if key[0] not in ("noise", "previous")
-        }
-        # Modules may draw at some times and not at others, as those under `deterministic` do.
-        kind = (*sorted(shapes.items(), key=str), *(part.noise_names for _, part in self._random))
-        if kind not in self._drawn:
-            self._drawn[kind] = self._trial(entries, size)
-        drawn, places = self._drawn[kind], dict(self.structure.modules) if places is None else places
-        return draw_noise(drawn, entries, size, places=places, like=self.like(), time=time, generator=generator)
-
-    def _nothing(self, batch_size: Sequence[int]) -> Entries:
-        """Returns zeros for what the initial belief reads, where its shape alone counts."""
-        told, like = role(self.initial, Initial), self.like()
-        like = torch.zeros(()) if like is None else like
-        zeros = like.new_zeros(*batch_size, told.input_dim or told.state_dim or 1)
-        return {key: zeros.clone() for key in reads(self.initial)[0]}
-
-    @torch.no_grad()
-    def _trial(self, entries: Entries, size: torch.Size) -> Drawn:
-        """Finds which modules draw noise in a step, and of what sizes, by one step of the first element."""
-        row = {key: value for key, value in entries.items() if key[0] != "noise"}
-        if size.numel():
-            row = {key: value.flatten(0, len(size) - 1)[:1] if size else value for key, value in row.items()}
-        else:
-            row = {key: value.new_zeros(1, *value.shape[len(size) :]) for key, value in row.items()}
-        call = Call(torch.Size([1] if size else []))
-        devices = {value.device for value in row.values() if value.is_cuda}
-        with (
-            torch.random.fork_rng(devices=devices),
-            set_recurrent_mode(False),
-            recorded_draws(self, self._random) as drawn,
-        ):
-            start = run_module(self.initial, {**self._nothing(call.batch_size), **row}, call.part("initial"))
-            # Where an entry has not come yet, what reads it asks for what it did before; the step itself raises.
-            with suppress(KeyError, *EXPLAINED):
-                self.steps.step({**start, **row}, call, partial=True)
-        self._sizes |= drawn
-        return {place: self._sizes[place] for place, _ in self._random if place in self._sizes}
 
 
 def _shallow(module: torch.nn.Module) -> Any:

@@ -12,7 +12,7 @@ from torch import nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.filters.base import Filter
-from torch_denkf.filters.parts import FilterParts, ReadingOptions, SensorError
+from torch_denkf.filters.parts import FilterParts, ReadingOptions
 from torch_denkf.modules import (
     DiagonalNoise,
     EnsembleAnalysis,
@@ -45,11 +45,9 @@ class DEnKF(Filter):
         process_noise: Q of the motion, beside the noise of the transition's network: standard deviations ``[S]`` (a
             number for all, 0 for none), or a module that writes Q, see :mod:`torch_denkf.modules.process_noise`. An
             ensemble without any process noise collapses. ``None``: the transition's own noise alone.
-        sensor_error: coloured errors of the sensor, such as a ``FadingBias``: they become part of the state, behind its
-            S components, of transition, process noise, observation and initial belief. All these are given for the
-            state alone.
         **options: ``reading_space``, ``observation_key``, ``observed_key``, for the default ``analysis``,
-            ``visibility`` and what every filter takes, see :class:`~torch_denkf.filters.parts.ReadingOptions`.
+            ``visibility``, ``sensor_error`` and what every filter takes, see
+            :class:`~torch_denkf.filters.parts.ReadingOptions`.
 
     Raises:
         ValueError: if it is not clear where the reading is.
@@ -76,7 +74,6 @@ class DEnKF(Filter):
         *,
         initial: TensorDictModuleBase,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
-        sensor_error: SensorError | None = None,
         **options: Unpack[ReadingOptions],
     ):
         if analysis is not None:
@@ -86,7 +83,7 @@ class DEnKF(Filter):
                     "instead."
                 )
             options["reading_space"] = role(analysis, Update).reading_space
-        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, sensor_error, **options)
+        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, **options)
         if analysis is None:
             scheme = partial(EnsembleAnalysis, "perturbed" if sensor is None else "sensor")
             analysis = scheme(space=parts.space, **parts.reading(", or an analysis"))

@@ -8,7 +8,7 @@ from typing import Unpack
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters.base import Filter
-from torch_denkf.filters.parts import FilterParts, ReadingOptions, SensorError, check_moments
+from torch_denkf.filters.parts import FilterParts, ReadingOptions, check_moments
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 
 __all__ = ["EKF"]
@@ -32,14 +32,11 @@ class EKF(Filter):
             :mod:`torch_denkf.modules.process_noise`.
         initial: the initial belief: :class:`~torch_denkf.modules.MomentPrior`,
             :class:`~torch_denkf.modules.GaussianAround`.
-        sensor_error: coloured errors of the sensor, such as a ``FadingBias``: they become part of the state, behind its
-            S components, of transition, process noise, observation and initial belief. All these are given for the
-            state alone.
         stop_jacobian_gradient: the transition's Jacobian is a constant to the gradient.
         inflation: factor on the belief's standard deviations, where anything is observed. What is never observed grows
             by it without bound.
-        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``visibility`` and what every filter takes,
-            see :class:`~torch_denkf.filters.parts.ReadingOptions`.
+        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``visibility``, ``sensor_error`` and what
+            every filter takes, see :class:`~torch_denkf.filters.parts.ReadingOptions`.
 
     Raises:
         ValueError: if it is not clear where the reading is, or ``initial`` writes no mean and covariance.
@@ -75,12 +72,11 @@ class EKF(Filter):
         *,
         process_noise: TensorDictModuleBase | Sequence[float] | float,
         initial: TensorDictModuleBase,
-        sensor_error: SensorError | None = None,
         stop_jacobian_gradient: bool = False,
         inflation: float = 1.0,
         **options: Unpack[ReadingOptions],
     ):
-        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, sensor_error, **options)
+        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, **options)
         check_moments(type(self).__name__, initial)
         forecast = EKFTransition(
             parts.transition, parts.process_noise, stop_jacobian_gradient=stop_jacobian_gradient, space=parts.space

@@ -10,8 +10,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torch_denkf._checks import flag_value
-from torch_denkf.beliefs import Belief
+from torch_denkf._registered import diagnosis
 from torch_denkf.filters.structure import Structure
+from torch_denkf.functional.kernels.small_system import on_gpu
 from torch_denkf.submodel import Entries
 
 if TYPE_CHECKING:
@@ -65,25 +66,15 @@ def check_belief(structure: Structure, entries: Entries, written: Entries) -> No
         written: what it wrote.
 
     Raises:
-        ValueError: that names the inputs that are not finite.
+        ValueError: that names the cause.
     """
     finite = None
     for key, kind in structure.carried:
         for value in (written[key], entries.get(key)):  # a particle that is not finite may have been resampled away
-            if value is None or not value.is_floating_point():
+            if value is None or not value.is_floating_point() or on_gpu(value):  # to look would wait for the device
                 continue
             sound = value.isfinite().all() if kind is None else kind.finite(key[-1], value)
             finite = sound if finite is None else finite & sound
     if finite is None or flag_value(finite) is not False:
         return
-    kinds, given = dict(structure.carried), {key: value for key, value in entries.items() if value.is_floating_point()}
-    bad = [key for key, value in given.items() if not (kinds.get(key) or Belief()).finite(key[-1], value)]
-    flaws = [flaw for kind in structure.kinds for flaw in kind.flaws(entries)]
-    why = f"NaN or infinity in {bad}" if bad else " and ".join(flaws)
-    why = why or "its motion: all inputs are finite, and the filter diverged"
-    raise ValueError(
-        f"The new belief is not finite, because of {why}. The tensordict was left as it is. "
-        "Where an input is not finite: a mask that is False hides it, and RejectReadings in front of the filter makes "
-        "one. Where the filter diverged: look at the transition's weights and the noise floor, normalise the state, "
-        "clip gradients in training. check_finite=False switches this off."
-    )
+    raise ValueError(diagnosis().why_not_finite(structure, entries, written))

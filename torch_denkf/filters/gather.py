@@ -26,7 +26,6 @@ class Rows(NamedTuple):
         starts: initial or stored beliefs, ``[*B, T]`` or ``[*B, 1]``.
         stored: whether these beliefs are stored ones, which have seen their frame.
         before: the belief before the first element.
-        resumed: whether elements start from a belief that a policy stored before them.
     """
 
     size: torch.Size
@@ -35,7 +34,6 @@ class Rows(NamedTuple):
     starts: Entries
     stored: bool
     before: Entries
-    resumed: bool
 
     @property
     def fresh(self) -> Tensor:
@@ -106,7 +104,7 @@ def gather_rows(
             value = inputs[key]
             inputs[key] = torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, size[-1] - 1)], time)
     before = {key: starts[key].select(time, 0) for key in carry}
-    return Rows(size, inputs, begins, starts, stored, before, resumed)
+    return Rows(size, inputs, begins, starts, stored, before)
 
 
 def _or_first(marks: Tensor | None, size: torch.Size, device: torch.device) -> Tensor:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
+from torchrl.modules import set_recurrent_mode
 
-from torch_denkf.submodel import RECORDERS, Entries, SubModel, flat_noise
+from torch_denkf.running import random_parts, reads, run_module
+from torch_denkf.submodel import EXPLAINED, RECORDERS, Call, Entries, Initial, SubModel, flat_noise, role
 
-__all__ = ["Drawn", "draw_noise", "recorded_draws"]
+if TYPE_CHECKING:
+    from torch_denkf.filters.base import Filter
+
+__all__ = ["Drawn", "Draws", "recorded_draws"]
 
 #: The sub-models that draw noise, by place, and the sizes that they asked for.
 Drawn = dict[str, tuple[SubModel, dict[str, Any]]]
@@ -49,34 +54,88 @@ def recorded_draws(filter: nn.Module, parts: Sequence[tuple[str, SubModel]]) -> 
             part._forward_hooks, part._forward_pre_hooks, part.training = hooks, pre_hooks, training
 
 
-def draw_noise(
-    drawn: Drawn,
-    given: Mapping,
-    batch_size: torch.Size,
-    *,
-    places: Iterable[str] | None = None,
-    like: Tensor | None = None,
-    time: bool = False,
-    generator: torch.Generator | None = None,
-) -> Entries:
-    """Draws the noise that is not among what is given, of ``batch_size`` elements; of some modules, or of all.
+class Draws:
+    """Draws the noise of a filter's modules.
 
     Args:
-        drawn: which module draws what.
-        given: entries, some of which may be noise.
-        batch_size: ``[*B]``, or ``[*B, T]``.
-        places: of the modules in the filter.
-        like: has the precision and device of the noise.
-        time: whether the last of ``batch_size`` is time.
-        generator: source of randomness; torch's global one by default.
+        filter: whose modules they are.
+
+    Attributes:
+        places: of the modules that draw any.
     """
-    out: Entries = {}
-    where: dict[str, Any] = {} if like is None else {"device": like.device, "dtype": like.dtype}
-    chosen = None if places is None else tuple(places)
-    for place, (part, sizes) in drawn.items():
-        if chosen is None or place.split(".")[0] in chosen:
+
+    def __init__(self, filter: Filter):
+        placed = (*filter.structure.modules, ("initial", filter.initial))
+        self.filter, self._random = filter, [found for place, part in placed for found in random_parts(part, place)]
+        self.places = {place for place, _ in self._random}
+        self._drawn: dict[tuple, Drawn] = {}
+        self._sizes: Drawn = {}
+
+    def missing(
+        self,
+        entries: Entries,
+        size: torch.Size,
+        *,
+        places: Iterable[str] | None = None,
+        time: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> Entries:
+        """Draws the noise that is not among the entries; one trial step tells the sizes.
+
+        Args:
+            entries: what the modules read, some of which may be noise.
+            size: ``[*B]``, or ``[*B, T]``.
+            places: of the modules in the filter; by default those of a step.
+            time: whether the last of ``size`` is time.
+            generator: source of randomness; torch's global one by default.
+        """
+        if not self._random:
+            return {}
+        shapes = {
+            key: value.shape[len(size) :] for key, value in entries.items() if key[0] not in ("noise", "previous")
+        }
+        # Modules may draw at some times and not at others, as those under `deterministic` do.
+        kind = (*sorted(shapes.items(), key=str), *(part.noise_names for _, part in self._random))
+        if kind not in self._drawn:
+            self._drawn[kind] = self._trial(entries, size)
+        out, like, chosen = (
+            {},
+            self.filter.like(),
+            set(dict(self.filter.structure.modules) if places is None else places),
+        )
+        where: dict[str, Any] = {} if like is None else {"device": like.device, "dtype": like.dtype}
+        for place, (part, sizes) in self._drawn[kind].items():
             keys = [("noise", place, name) if name else ("noise", place) for name in part.noise_names]
-            if not all(key in given for key in keys):
-                noise = part.draw_noise(batch_size, time=time, generator=generator, **where, **sizes)
+            if place.split(".")[0] in chosen and not all(key in entries for key in keys):
+                noise = part.draw_noise(size, time=time, generator=generator, **where, **sizes)
                 out.update(flat_noise(noise, place))
-    return out
+        return out
+
+    def nothing(self, batch_size: Sequence[int]) -> Entries:
+        """Returns zeros for what the initial belief reads, where its shape alone counts."""
+        told, like = role(self.filter.initial, Initial), self.filter.like()
+        like = torch.zeros(()) if like is None else like
+        zeros = like.new_zeros(*batch_size, told.input_dim or told.state_dim or 1)
+        return {key: zeros.clone() for key in reads(self.filter.initial)[0]}
+
+    @torch.no_grad()
+    def _trial(self, entries: Entries, size: torch.Size) -> Drawn:
+        """Finds which modules draw noise in a step, and of what sizes, by one step of the first element."""
+        row = {key: value for key, value in entries.items() if key[0] != "noise"}
+        if size.numel():
+            row = {key: value.flatten(0, len(size) - 1)[:1] if size else value for key, value in row.items()}
+        else:
+            row = {key: value.new_zeros(1, *value.shape[len(size) :]) for key, value in row.items()}
+        call = Call(torch.Size([1] if size else []))
+        devices = {value.device for value in row.values() if value.is_cuda}
+        with (
+            torch.random.fork_rng(devices=devices),
+            set_recurrent_mode(False),
+            recorded_draws(self.filter, self._random) as drawn,
+        ):
+            start = run_module(self.filter.initial, {**self.nothing(call.batch_size), **row}, call.part("initial"))
+            # Where an entry has not come yet, what reads it asks for what it did before; the step itself raises.
+            with suppress(KeyError, *EXPLAINED):
+                self.filter.steps.step({**start, **row}, call, partial=True)
+        self._sizes |= drawn
+        return {place: self._sizes[place] for place, _ in self._random if place in self._sizes}

@@ -47,8 +47,8 @@ class ParticleFilter(Filter):
         process_noise: Q of the motion, beside the transition's own noise: standard deviations ``[S]`` (a number for
             all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
         **options: ``reading_space`` and ``observation_key``, for the default likelihood, ``observed_key``, which
-            resampling heeds, too, ``visibility``, for a Gaussian likelihood, and what every filter takes, see
-            :class:`~torch_denkf.filters.parts.ReadingOptions`.
+            resampling heeds, too, ``visibility``, for a Gaussian likelihood, ``sensor_error`` and what every filter
+            takes, see :class:`~torch_denkf.filters.parts.ReadingOptions`.
 
     Raises:
         ValueError: on an unknown ``resampling``, or if it is not clear where the reading is.
@@ -91,8 +91,9 @@ class ParticleFilter(Filter):
         **options: Unpack[ReadingOptions],
     ):
         check_choice("resampling", resampling, ("systematic", "soft", "transport", None))
-        if process_noise is not None and isinstance(transition, ResampledTransition):
-            raise ValueError("A ResampledTransition holds its motion: put the process noise into that.")
+        more = process_noise is not None or options.get("sensor_error") is not None
+        if more and isinstance(transition, ResampledTransition):
+            raise ValueError("A ResampledTransition holds its motion: put process noise and sensor_error into that.")
         parts = FilterParts(
             transition, sensor, observation, noise, initial, process_noise, optional=["noise"], **options
         )
@@ -118,10 +119,12 @@ class ParticleFilter(Filter):
                 jitter=jitter,
                 observed_key=parts.observed_key,
             )
-        ensemble, log_weight = map(unravel_key, moving.in_keys[:2])
+        (ensemble, log_weight), initial = map(unravel_key, moving.in_keys[:2]), parts.initial
         if log_weight not in map(unravel_key, initial.out_keys):
             initial = with_weights(initial, ensemble_key=ensemble, log_weight_key=log_weight)
-        modules = parts.in_order(transition=moving, observation=observation, likelihood=likelihood, analysis=analysis)
+        modules = parts.in_order(
+            transition=moving, observation=parts.observation, likelihood=likelihood, analysis=analysis
+        )
         super().__init__(modules, initial=initial, **parts.options)
 
 

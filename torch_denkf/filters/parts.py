@@ -52,12 +52,16 @@ class ReadingOptions(FilterOptions, total=False):
             may write it.
         visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.imperfect.Visibility`; the
             update heeds it, see :class:`~torch_denkf.imperfect.Visible`. ``None`` by default.
+        sensor_error: coloured errors of the sensor, such as a :class:`~torch_denkf.imperfect.FadingBias`: they become
+            part of the state, behind its S components, of transition, process noise, observation and initial belief.
+            All these are given for the state alone. ``None`` by default.
     """
 
     reading_space: Space | None
     observation_key: NestedKey | None
     observed_key: NestedKey
     visibility: Visibility | None
+    sensor_error: SensorError | None
 
 
 class FilterParts:
@@ -70,12 +74,12 @@ class FilterParts:
         noise: writes R.
         initial: the initial belief.
         process_noise: Q, as :func:`~torch_denkf.modules.process_noise.as_process_noise` takes it; ``None`` for none.
-        sensor_error: becomes part of the state, in all modules.
         optional: those of the modules that may be ``None``.
         reading_space: see :class:`ReadingOptions`.
         observation_key: likewise.
         observed_key: likewise.
         visibility: likewise.
+        sensor_error: likewise.
         **options: of :class:`Filter`, handed on.
 
     Raises:
@@ -100,13 +104,13 @@ class FilterParts:
         noise: Any,
         initial: TensorDictModuleBase,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
-        sensor_error: SensorError | None = None,
         *,
         optional: Collection[str] = (),
         reading_space: Space | None = None,
         observation_key: NestedKey | None = None,
         observed_key: NestedKey = "observed",
         visibility: Visibility | None = None,
+        sensor_error: SensorError | None = None,
         **options: Unpack[FilterOptions],
     ):
         modules = {"transition": transition, "sensor": sensor, "observation": observation, "noise": noise}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from typing import NamedTuple
 
 import torch
@@ -10,7 +11,9 @@ from tensordict import NestedKey, unravel_key
 from tensordict.utils import expand_as_right
 from torch import Tensor
 
+from torch_denkf._registered import compiler
 from torch_denkf.filters.structure import RESUMES, Placed, Structure, previous_key, takes_reading
+from torch_denkf.functional.kernels.small_system import on_gpu
 from torch_denkf.running import is_sequence, named_modules_of, reads, run_module
 from torch_denkf.submodel import Call, Entries, Transition, Update, role
 
@@ -101,7 +104,7 @@ class Steps(NamedTuple):
         written.update(forecast)
         written.update(self.run(structure.posterior, entries, call, partial))
         for key, parts in structure.totals.items():
-            if not partial or written.keys() >= {*parts}:
+            if written.keys() >= {*parts}:
                 written[key] = sum((written[part] for part in parts[1:]), written[parts[0]])
         if partial and not written.keys() >= {*structure.carry}:
             raise KeyError(
@@ -153,15 +156,19 @@ class Steps(NamedTuple):
         rows = _unbound(inputs, time, len(cuts))
         marks = () if resets is None else resets.unbind(time)
         begins = _unbound(starts, time, len(marks))
-        for t, row in enumerate(rows):
-            if cuts[t]:
-                carry = {key: value.detach() for key, value in carry.items()}
-            if RESUMES in row:
-                carry = {key: where_rows(row[RESUMES], row[previous_key(key)], value) for key, value in carry.items()}
-            reset, start = (marks[t], begins[t]) if t < len(marks) else (None, None)
-            out = self.step({**row, **carry}, call, frames=False, reset=reset, start=start)
-            carry = {key: out[key] if key in out else row[key] for key in self.structure.carry}
-            outputs.append(out)
+        trained = torch.is_grad_enabled() and not torch.compiler.is_compiling() and on_gpu(next(iter(carry.values())))
+        with compiler().sharing() if trained else nullcontext():
+            for t, row in enumerate(rows):
+                if cuts[t]:
+                    carry = {key: value.detach() for key, value in carry.items()}
+                if RESUMES in row:
+                    carry = {
+                        key: where_rows(row[RESUMES], row[previous_key(key)], value) for key, value in carry.items()
+                    }
+                reset, start = (marks[t], begins[t]) if t < len(marks) else (None, None)
+                out = self.step({**row, **carry}, call, frames=False, reset=reset, start=start)
+                carry = {key: out[key] if key in out else row[key] for key in self.structure.carry}
+                outputs.append(out)
         return carry, {key: torch.stack([out[key] for out in outputs], time) for key in keep}
 
     def blank(self, written: Entries, fresh: Tensor) -> None:

@@ -122,7 +122,7 @@ class Structure(NamedTuple):
     def completed(self, entries: Entries, stored: Entries | None = None) -> Entries:
         """Returns entries of a belief with those that follow from them, see :func:`torch_denkf.beliefs.complete`."""
         lacking = any(key not in entries for key in self.belief)
-        further = role(self.initial, Initial).derived(entries) if lacking else {}
+        further = role(self.initial, Initial).derived({**(stored or {}), **entries}) if lacking else {}
         return complete({**further, **entries}, self.belief, self.kinds, stored)
 
     @classmethod

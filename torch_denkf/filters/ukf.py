@@ -8,7 +8,7 @@ from typing import Any, Unpack
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters.base import Filter
-from torch_denkf.filters.parts import FilterParts, ReadingOptions, SensorError, check_moments
+from torch_denkf.filters.parts import FilterParts, ReadingOptions, check_moments
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
 
 __all__ = ["UKF"]
@@ -31,16 +31,13 @@ class UKF(Filter):
             :mod:`torch_denkf.modules.process_noise`.
         initial: the initial belief, :class:`~torch_denkf.modules.MomentPrior` or
             :class:`~torch_denkf.modules.GaussianAround`; its covariance may be singular.
-        sensor_error: coloured errors of the sensor, such as a ``FadingBias``: they become part of the state, behind its
-            S components, of transition, process noise, observation and initial belief. All these are given for the
-            state alone.
         alpha: spread of the sigma points.
         beta: extra weight of the central point in the covariance.
         kappa: their secondary spread. Covariances stay positive where no weight is negative, as by default.
         inflation: factor on the belief's standard deviations, where anything is observed. What is never observed grows
             by it without bound.
-        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``visibility`` and what every filter takes,
-            see :class:`~torch_denkf.filters.parts.ReadingOptions`.
+        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``visibility``, ``sensor_error`` and what
+            every filter takes, see :class:`~torch_denkf.filters.parts.ReadingOptions`.
 
     Raises:
         ValueError: if it is not clear where the reading is, or ``initial`` writes no mean and covariance.
@@ -73,14 +70,13 @@ class UKF(Filter):
         *,
         process_noise: TensorDictModuleBase | Sequence[float] | float,
         initial: TensorDictModuleBase,
-        sensor_error: SensorError | None = None,
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.5,
         inflation: float = 1.0,
         **options: Unpack[ReadingOptions],
     ):
-        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, sensor_error, **options)
+        parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, **options)
         check_moments(type(self).__name__, initial)
         both: dict[str, Any] = {"alpha": alpha, "beta": beta, "kappa": kappa, "space": parts.space}
         forecast = UKFTransition(parts.transition, parts.process_noise, **both)

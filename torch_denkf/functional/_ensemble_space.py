@@ -13,10 +13,13 @@ import torch
 from torch import Tensor
 
 from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
-from torch_denkf.functional.linalg import cholesky, inverse_square_root
+from torch_denkf.functional.kernels.small_system import on_gpu
+from torch_denkf.functional.linalg import Solver, inverse_square_root
 
 #: Elements of an ensemble in one tile: 256 KiB in single precision, which a core's own cache holds several times.
 TILE_ELEMENTS = 2**16
+#: The same on a GPU: 1 GiB in single precision; the plain formula holds a dozen arrays of the ensemble's size.
+GPU_TILE_ELEMENTS = 2**28
 
 
 def solve_ensemble_space(gram: Tensor, right: Tensor, *, square_root: bool) -> tuple[Tensor, Tensor | None, Tensor]:
@@ -43,19 +46,19 @@ def solve_ensemble_space(gram: Tensor, right: Tensor, *, square_root: bool) -> t
     size = gram.shape[-1]
     free = gram.detach().diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)  # c
     gram = gram + (free / size).unsqueeze(-1)
-    factor = cholesky(gram + torch.eye(size, dtype=gram.dtype, device=gram.device))
-    weights = torch.cholesky_solve(right, factor).mT
-    log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True) - free.log1p()
-    return weights, inverse_square_root(gram) if square_root else None, log_det
+    solver = Solver(gram, ridge=1)
+    log_det = solver.log_det() - free.log1p()
+    return solver.solve(right).mT, inverse_square_root(gram) if square_root else None, log_det
 
 
 def columns_in_a_tile(forecast: Tensor, *others: Tensor | None) -> int | None:
     """Returns how many components :func:`analyse_in_tiles` takes at a time, ``None`` where it is not to be used.
 
     Where everything fits in two tiles nothing is gained; a graph for gradients keeps all it saw, in tiles or not;
-    a compiler would unroll the loop over tiles and fuses the plain formulas itself.
+    a compiler would unroll the loop over tiles and fuses the plain formulas itself. A GPU has no such cache: tiles are
+    of :data:`GPU_TILE_ELEMENTS` there, for its memory.
     """
-    columns = TILE_ELEMENTS // max(forecast[..., 0].numel(), 1)
+    columns = (GPU_TILE_ELEMENTS if on_gpu(forecast) else TILE_ELEMENTS) // max(forecast[..., 0].numel(), 1)
     widest = max(tensor.shape[-1] for tensor in (forecast, *others) if tensor is not None)
     if columns < 64 or widest < 2 * columns or torch.compiler.is_compiling():
         return None

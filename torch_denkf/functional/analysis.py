@@ -20,8 +20,8 @@ from torch import Tensor
 from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape, check_shapes
 from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
 from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
-from torch_denkf.functional.kernels.small_system import LARGEST, solve_written_out
-from torch_denkf.functional.linalg import cholesky, inverse_square_root_difference
+from torch_denkf.functional.kernels.small_system import LARGEST, on_gpu, solve_written_out
+from torch_denkf.functional.linalg import Solver, inverse_square_root_difference
 
 Scheme = Literal["sensor", "perturbed", "etkf", "sakov"]
 Space = Literal["auto", "observation", "ensemble"]
@@ -124,6 +124,8 @@ def analyse(
         tiled = partial(analyse_in_tiles, scheme=scheme, columns=columns, rotation=rotation)
         return Analysis(*tiled(*given, observed=observed, perturbation=perturbation))
 
+    if on_gpu(forecast) and scheme == "sensor" and in_observation_space and taper is None and significance is None:
+        return _in_few_launches(*given, observed)
     samples = observation if observation.ndim == forecast.ndim else observation.unsqueeze(-2)
     reading = whiten(predicted, samples, noise, observed)  # eqs. 6 to 8
     mean = forecast.mean(-2, keepdim=True)
@@ -146,6 +148,30 @@ def analyse(
         ensemble = torch.where((count > 0).unsqueeze(-1), ensemble, forecast)
     log_noise = reading.noise.log().sum(-1, keepdim=True)
     return Analysis(ensemble, reading.innovation.squeeze(-2), *scores(square, log_det, log_noise, count, size))
+
+
+def _in_few_launches(
+    forecast: Tensor, predicted: Tensor, samples: Tensor, noise: Tensor, observed: Tensor | None
+) -> Analysis:
+    """Updates by samples of the reading, for a GPU: one mean, one difference and one product of all there is."""
+    size, dim = predicted.shape[-2:]
+    count: int | Tensor = dim
+    if observed is not None:
+        members = observed.unsqueeze(-2)
+        predicted, samples = torch.where(members, predicted, 0), torch.where(members, samples, 0)
+        noise, count = torch.where(observed, noise, 1), observed.expand(noise.shape).sum(-1, keepdim=True)
+    shift = samples - predicted
+    joint = torch.cat([predicted, forecast], -1)
+    anomalies = joint - joint.mean(-2, keepdim=True)
+    gram, cross = (anomalies[..., :dim].mT @ anomalies).split([dim, forecast.shape[-1]], -1)
+    solver = Solver(gram + ((size - 1) * noise).diag_embed())  # (E - 1) S, eq. 9
+    ensemble = forecast + shift @ solver.solve(cross)  # eqs. 11 and 12
+    if observed is not None:
+        ensemble = torch.where(observed.any(-1)[..., None, None], ensemble, forecast)
+    innovation = shift.mean(-2)
+    nis = (size - 1) * solver.square(innovation.unsqueeze(-1))
+    constant = count * math.log(2 * math.pi) - dim * math.log(size - 1)
+    return Analysis(ensemble, innovation, nis, -0.5 * (nis + solver.log_det() + constant))
 
 
 def check_analysis_arguments(
@@ -236,11 +262,9 @@ def _observation_space(
     if torch.compiler.is_compiling() and gram.shape[-1] <= LARGEST:
         increment, square, log_det = solve_written_out(gram, cross, acted_on, mean_shift)
         return increment, transformed, square, log_det
-    factor = cholesky(gram + torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))  # of S, eq. 9
-    log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
-    whitened = torch.linalg.solve_triangular(factor, mean_shift.mT, upper=False)
-    increment = acted_on @ torch.cholesky_solve(cross, factor)  # by the gain K, eq. 11
-    return increment, transformed, whitened.square().sum(-2), log_det
+    solver = Solver(gram, ridge=1)  # with S, eq. 9
+    increment = acted_on @ solver.solve(cross)  # by the gain K, eq. 11
+    return increment, transformed, solver.square(mean_shift.mT), solver.log_det()
 
 
 def _one_after_the_other(

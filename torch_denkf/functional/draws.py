@@ -42,7 +42,9 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
     draws = normal - normal.mean(-2, keepdim=True)
     if dim >= size:
         return draws
-    room = size - 1 - dim - (2 + dim // 4)  # q draws of just q dimensions are nearly dependent: scaling up their rounding
+    room = (
+        size - 1 - dim - (2 + dim // 4)
+    )  # q draws of just q dimensions are nearly dependent: scaling up their rounding
     if uncorrelated and room > 0:
         away = torch.cat([members - members.mean(-2, keepdim=True) for members in uncorrelated], -1).to(draws.dtype)
         if away.shape[-1] > room:

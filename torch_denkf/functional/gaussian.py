@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_mask, check_one_dtype, check_shape, check_shapes
 from torch_denkf.functional.kernels.small_system import LARGEST, gain_written_out
-from torch_denkf.functional.linalg import cholesky
+from torch_denkf.functional.linalg import Solver, as_covariance
 
 
 class GaussianUpdate(NamedTuple):
@@ -95,7 +95,8 @@ def kalman_update(
             its observation and noise may then be anything, NaN too. None: everything is observed.
 
     Returns:
-        A :class:`GaussianUpdate`; all NaN for those batch elements whose S is not positive definite.
+        A :class:`GaussianUpdate`; all NaN for those batch elements whose S is not positive definite, or with a
+            negative variance in R.
 
     Raises:
         ValueError: if the shapes do not fit.
@@ -110,7 +111,7 @@ def kalman_update(
     _check_update(mean, cov, observation, observation_matrix, noise)
     batch, state_dim, dim = mean.shape[:-1], mean.shape[-1], observation.shape[-1]
     if noise.ndim == mean.ndim:
-        noise = noise.diag_embed()
+        noise = as_covariance(noise, mean)
     identity = torch.eye(dim, dtype=mean.dtype, device=mean.device)
     count: int | Tensor = dim
     if observed is not None:
@@ -174,7 +175,8 @@ def gaussian_log_prob(value: Tensor, mean: Tensor, cov: Tensor) -> Tensor:
     _check_moments(mean, cov)
     check_one_dtype(mean=mean, cov=cov, value=value)
     check_shape("value", value, mean.shape, "[*B, S], as mean,")
-    nis, log_det = _whiten(value - mean, cholesky(cov))
+    solver = Solver(cov)
+    nis, log_det = solver.square((value - mean).unsqueeze(-1)), solver.log_det()
     return -0.5 * (nis + log_det + mean.shape[-1] * math.log(2 * math.pi)).squeeze(-1)
 
 
@@ -195,14 +197,8 @@ def solve_for_gain(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Ten
     """
     if torch.compiler.is_compiling() and 0 < matrix.shape[-1] <= LARGEST:
         return gain_written_out(matrix, cross, residual)
-    factor = cholesky(matrix)
-    return torch.cholesky_solve(cross, factor).mT, *_whiten(residual, factor)
-
-
-def _whiten(residual: Tensor, factor: Tensor) -> tuple[Tensor, Tensor]:
-    """Squared norm of L⁻¹ residual, and log det LLᵀ, both ``[*B, 1]``."""
-    whitened = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False)
-    return whitened.square().sum(-2), 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+    solver = Solver(matrix)
+    return solver.solve(cross).mT, solver.square(residual.unsqueeze(-1)), solver.log_det()
 
 
 def _check_moments(mean: Tensor, cov: Tensor, noise: Tensor | None = None) -> None:

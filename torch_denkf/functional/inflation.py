@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_ensemble, check_shape
+from torch_denkf.functional.kernels.small_system import on_gpu
 
 
 def inflate(ensemble: Tensor, factor: float | Tensor) -> Tensor:
@@ -104,10 +105,13 @@ def random_rotation(
         raise ValueError(f"ensemble_size must be at least 2, got {ensemble_size}")
     shape = (*batch_shape, ensemble_size - 1, ensemble_size - 1)
     gaussian = torch.randn(shape, generator=generator, dtype=dtype, device=device)
-    orthogonal, triangular = torch.linalg.qr(gaussian)
-    # Without these signs the draw would depend on the QR convention (Mezzadri 2007).
-    signs = torch.where(triangular.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0).to(gaussian.dtype)
-    orthogonal = orthogonal * signs.unsqueeze(-2)
+    if on_gpu(gaussian):
+        orthogonal = _orthogonal(gaussian)
+    else:
+        orthogonal, triangular = torch.linalg.qr(gaussian)
+        # Without these signs the draw would depend on the QR convention (Mezzadri 2007).
+        signs = torch.where(triangular.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0).to(gaussian.dtype)
+        orthogonal = orthogonal * signs.unsqueeze(-2)
     # The reflection that swaps the first axis and the direction of ones: its other columns span the rest.
     normal = torch.full((ensemble_size,), -(ensemble_size**-0.5), dtype=dtype, device=device)
     normal[0] += 1
@@ -115,6 +119,22 @@ def random_rotation(
     reflection = reflection - 2 * normal.outer(normal) / normal.dot(normal)
     basis = reflection[:, 1:]
     return basis @ orthogonal @ basis.mT + 1 / ensemble_size
+
+
+def _orthogonal(gaussian: Tensor) -> Tensor:
+    """Makes uniform orthogonal matrices without a QR decomposition, which waits for a GPU.
+
+    Householder's reflections of independent vectors of one component less each (Stewart 1980, "The efficient generation
+    of random orthogonal matrices", SIAM J. Numer. Anal. 17): of the columns of the lower triangle. Their product is
+    I − V T Vᵀ, and the inverse of T is the upper triangle of VᵀV with its diagonal halved.
+    """
+    columns = gaussian.tril()
+    signs = gaussian.diagonal(dim1=-2, dim2=-1).sign().unsqueeze(-2)
+    columns = columns + (signs * torch.linalg.vector_norm(columns, dim=-2, keepdim=True)).squeeze(-2).diag_embed()
+    columns = columns / torch.linalg.vector_norm(columns, dim=-2, keepdim=True)
+    identity = torch.eye(gaussian.shape[-1], dtype=gaussian.dtype, device=gaussian.device)
+    inverse = (columns.mT @ columns).triu(1) + identity / 2
+    return signs * (columns @ torch.linalg.solve_triangular(inverse, columns.mT, upper=True) - identity)
 
 
 def _safe_sqrt(variance: Tensor, empty: float = 0) -> Tensor:

@@ -6,10 +6,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from torch_denkf.functional.kernels.resolvents import sum_of_resolvents
 from torch_denkf.functional.kernels.small_system import (
     LARGEST_FACTOR,
     cholesky_solve_written_out,
     cholesky_written_out,
+    inverse_of,
+    on_gpu,
 )
 
 
@@ -88,10 +91,145 @@ def semidefinite_solve(cov: Tensor, right: Tensor) -> Tensor:
                 [0.0000]])
     """
     correlation, _, inverse = _correlation(cov)
-    scaled = inverse.unsqueeze(-1) * right
-    if torch.compiler.is_compiling() and 0 < cov.shape[-1] <= LARGEST_FACTOR:
-        return inverse.unsqueeze(-1) * cholesky_solve_written_out(correlation, scaled)
-    return inverse.unsqueeze(-1) * torch.cholesky_solve(scaled, cholesky(correlation))
+    return inverse.unsqueeze(-1) * solve(correlation, inverse.unsqueeze(-1) * right)
+
+
+def solve(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solves M X = Y for a symmetric positive definite M, NaN where it is not.
+
+    Args:
+        matrix: M, ``[*B, N, N]``.
+        right: Y, ``[*B, N, K]``.
+
+    Returns:
+        X, ``[*B, N, K]``.
+
+    Examples:
+        >>> solve(torch.tensor([[2.0, 1.0], [1.0, 1.0]]), torch.tensor([[1.0], [0.0]])).mT.round(decimals=4)
+        tensor([[ 1., -1.]])
+    """
+    if torch.compiler.is_compiling() and 0 < matrix.shape[-1] <= LARGEST_FACTOR:
+        return cholesky_solve_written_out(matrix, right)
+    return Solver(matrix).solve(right)
+
+
+class Solver:
+    """Solves several systems of one symmetric positive definite matrix, NaN where it is not.
+
+    A processor solves with the Cholesky factor. On a GPU the inverse multiplies: torch solves batches with MAGMA there,
+    which cannot be captured into a CUDA graph, and the inverse's backward pass is of products alone.
+
+    Args:
+        matrix: M, ``[*B, N, N]``.
+        ridge: is added to the diagonal.
+    """
+
+    def __init__(self, matrix: Tensor, ridge: float = 0):
+        self.direct = on_gpu(matrix)
+        if self.direct:
+            found: tuple[Tensor, Tensor] = (_Inverse.apply if _differentiated() else inverse_of)(matrix, ridge)
+            self.inverse, self.log = found
+            return
+        if ridge:
+            matrix = matrix + ridge * torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+        self.factor = cholesky(matrix)
+
+    def solve(self, right: Tensor) -> Tensor:
+        """Returns M⁻¹ Y, ``[*B, N, K]``."""
+        return self.inverse @ right if self.direct else torch.cholesky_solve(right, self.factor)
+
+    def square(self, vector: Tensor) -> Tensor:
+        """Returns rᵀ M⁻¹ r, ``[*B, 1]``, for r ``[*B, N, 1]``."""
+        if self.direct:
+            return (vector.mT @ (self.inverse @ vector)).squeeze(-1)
+        return torch.linalg.solve_triangular(self.factor, vector, upper=False).square().sum(-2)
+
+    def log_det(self) -> Tensor:
+        """Returns log det M, ``[*B, 1]``."""
+        return self.log if self.direct else 2 * self.factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+
+
+def divide(left: Tensor, matrix: Tensor) -> Tensor:
+    """Returns A M⁻¹ for a regular M that is not symmetric, of few columns, as a Jacobian is.
+
+    On a GPU it solves the normal equations: LU factors are MAGMA's there.
+
+    Args:
+        left: A, ``[*B, K, N]``.
+        matrix: M, ``[*B, N, N]``.
+
+    Examples:
+        >>> divide(torch.tensor([[1.0, 0.0]]), torch.tensor([[2.0, 0.0], [1.0, 1.0]]))
+        tensor([[0.5000, 0.0000]])
+    """
+    if on_gpu(matrix):
+        return left @ solve(matrix.mT @ matrix, matrix.mT)
+    return left @ torch.linalg.inv(matrix)
+
+
+class _Inverse(torch.autograd.Function):
+    """The inverse and log det of :func:`inverse_of`."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(matrix: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
+        return inverse_of(matrix, ridge)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.save_for_backward(output[0])
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor, of_log: Tensor) -> tuple[Tensor, None]:
+        (inverse,) = ctx.saved_tensors
+        return inverse * of_log.unsqueeze(-1) - inverse @ gradient @ inverse, None
+
+
+def is_covariance(cov: Tensor) -> Tensor:
+    """Tells which matrices are covariances up to rounding: symmetric and positive semi-definite, without NaN.
+
+    Rounding is relative to the variances, so that metres and milliradians count alike. Nothing is differentiated.
+
+    Args:
+        cov: ``[*B, N, N]``.
+
+    Returns:
+        Boolean, ``[*B]``.
+
+    Examples:
+        >>> import torch
+        >>> is_covariance(torch.tensor([[[1.0, 0.5], [0.5, 1.0]], [[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]]]))
+        tensor([ True, False, False])
+    """
+    cov = cov.detach() if cov.dtype == torch.float64 else cov.detach().float()  # there is no factor in half precision
+    variance, rounding = cov.diagonal(dim1=-2, dim2=-1), 100 * cov.shape[-1] * torch.finfo(cov.dtype).eps
+    largest = rounding**2 * (variance.unsqueeze(-1) * variance.unsqueeze(-2))
+    symmetric = ((cov - cov.mT).square() <= largest).flatten(-2).all(-1)
+    # A variance of zero is one, but beside a covariance, which the factor's next row divides by it.
+    ridge = rounding * variance + torch.finfo(cov.dtype).tiny
+    return symmetric & cholesky(cov + ridge.diag_embed())[..., -1, -1].isfinite()
+
+
+def as_covariance(noise: Tensor, mean: Tensor) -> Tensor:
+    """Returns the covariance of a noise: of variances, or as it is; NaN where it is none.
+
+    Args:
+        noise: variances ``[*B, N]``, of which a negative one becomes NaN, or covariances ``[*B, N, N]``.
+        mean: ``[*B, S]``, which tells them apart.
+
+    Returns:
+        ``[*B, N, N]``.
+
+    Examples:
+        >>> import torch
+        >>> as_covariance(torch.tensor([4.0, -1.0]), torch.zeros(2))
+        tensor([[4., 0.],
+                [0., nan]])
+    """
+    if noise.ndim == mean.ndim:
+        return torch.where(noise < 0, torch.nan, noise).diag_embed()
+    return torch.where(is_covariance(noise)[..., None, None], noise, torch.nan)
 
 
 def _correlation(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -158,9 +296,15 @@ def inverse_square_root_difference(matrix: Tensor) -> Tensor:
     return _symmetric_function(matrix, difference=True)
 
 
-def _symmetric_function(matrix: Tensor, *, difference: bool) -> Tensor:
+def _differentiated() -> bool:
     # Torch looks up the arguments' names at each call of apply, which takes longer than a small matrix does.
-    if torch.is_grad_enabled() or torch.compiler.is_compiling():
+    return torch.is_grad_enabled() or torch.compiler.is_compiling()
+
+
+def _symmetric_function(matrix: Tensor, *, difference: bool) -> Tensor:
+    if on_gpu(matrix):
+        return sum_of_resolvents(matrix, difference=difference)
+    if _differentiated():
         return _SymmetricFunction.apply(matrix, difference)[0]
     return _SymmetricFunction.forward(matrix, difference)[0]
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
 from torch_denkf.functional.analysis import check_significance, significant
-from torch_denkf.functional.linalg import cholesky, inverse_square_root
+from torch_denkf.functional.linalg import inverse_square_root, solve
 
 
 def gaspari_cohn(distance: Tensor, radius: float) -> Tensor:
@@ -230,7 +230,7 @@ def letkf(
         local = local * root
         gram = local @ local.mT
         local_shift = shift[..., index].movedim(-3, -2) * root  # [*B, tile, 1, L]
-        weights = torch.cholesky_solve(local @ local_shift.mT, cholesky(gram + eye))
+        weights = solve(gram + eye, local @ local_shift.mT)
         transform = inverse_square_root(gram) + weights  # column i makes member i; w is the same in all
         moved.append((part.movedim(-2, -1).unsqueeze(-2) @ transform).squeeze(-2).movedim(-1, -2))
     return mean + torch.cat(moved, -1)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
 from torch_denkf.functional.gaussian import GaussianUpdate, _check_moments, solve_for_gain
-from torch_denkf.functional.linalg import semidefinite_root
+from torch_denkf.functional.linalg import as_covariance, semidefinite_root
 from torch_denkf.functional.manifolds import Space, check_space
 
 
@@ -123,8 +123,8 @@ def unscented_moments(
     return mean, _weighted_gram(deviations, weights.cov, deviations)
 
 
-def unscented_cross(points: Tensor, images: Tensor, weights: UnscentedWeights) -> Tensor:
-    """Covariance of a state and a function of it, from sigma points (Särkkä 2013, eq. 5.75).
+def unscented_anomalies(points: Tensor, images: Tensor, weights: UnscentedWeights) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Returns the anomalies of a state and of a function of it, from sigma points (Särkkä 2013, eq. 5.75).
 
     Args:
         points: of the state, ``[*B, 2 S + 1, S]``.
@@ -132,19 +132,21 @@ def unscented_cross(points: Tensor, images: Tensor, weights: UnscentedWeights) -
         weights: see :func:`unscented_weights`.
 
     Returns:
-        The covariances, ``[*B, S, N]``.
+        A ``[*B, S, 2 S + 1]``, W ``[2 S + 1, 2 S + 1]`` and B ``[*B, N, 2 S + 1]``: the state's covariance is
+        :math:`A W A^T`, that of state and function :math:`A W B^T`.
 
     Raises:
         ValueError: if there are not as many points as weights.
 
     Examples:
         >>> points = sigma_points(torch.zeros(1), torch.eye(1))
-        >>> unscented_cross(points, 3 * points, unscented_weights(1)).round(decimals=4)
+        >>> before, weights, after = unscented_anomalies(points, 3 * points, unscented_weights(1))
+        >>> (before @ weights @ after.mT).round(decimals=4)
         tensor([[3.]])
     """
     # The points lie evenly around their mean, so that the mean of the images need not be taken off, but for digits.
     deviations = _deviations(images, weights, None)[1]
-    return (points - points[..., :1, :]).mT @ (weights.cov.unsqueeze(-1) * deviations)
+    return (points - points[..., :1, :]).mT, weights.cov.diag_embed(), deviations.mT
 
 
 def unscented_update(
@@ -193,7 +195,7 @@ def unscented_update(
     check_shape("observation", observation, (*batch, dim), "[*B, O]")
     if noise.ndim == expected.ndim:
         check_shape("noise", noise, (*batch, dim), "variances [*B, O]")
-        noise = noise.diag_embed()
+        noise = as_covariance(noise, expected)
     else:
         check_shape("noise", noise, (*batch, dim, dim), "variances [*B, O] or covariances [*B, O, O]")
     innovation = observation - expected if space is None else space.minus(observation, expected)

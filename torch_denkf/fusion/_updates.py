@@ -66,8 +66,8 @@ class Updates:
             "noise": ("sensor", "joint_noise"),
             "observed": ("forecast", "observed"),
         }
-        spaces = _flat_spaces(sensors, "A joint update", "joint=True")
-        sizes = [_observation_dim(sensor) for sensor in sensors.values()]
+        spaces = {name: check_space("reading_space", sensor.reading_space) for name, sensor in sensors.items()}
+        sizes = [one.point_dim if one else _observation_dim(sensors[name]) for name, one in spaces.items()]
         join = JoinedReading(
             [wired[name].reading for name in sensors],
             [wired[name].noise for name in sensors],
@@ -76,7 +76,9 @@ class Updates:
             noise_key=keys["noise"],
             observation_dim=None if None in sizes else sum(size for size in sizes if size is not None),
         )
-        model = JoinedObservation(models, predicted_key=("forecast", "observation"), observed_key=keys["observed"])
+        model = JoinedObservation(
+            models, list(spaces.values()), predicted_key=("forecast", "observation"), observed_key=keys["observed"]
+        )
         told = self._spaces(_side_by_side(spaces, sizes))
         return {"readings": join, **self._update("analysis", model, prefix, last, told, None, **keys)}
 
@@ -92,7 +94,7 @@ class Updates:
                 {name: wired[name].reading for name in sensors},
                 {name: wired[name].noise for name in sensors},
                 {name: wired[name].features for name in sensors if wired[name].features is not None},
-                _flat_spaces(sensors, "weights=", "weights="),
+                _flat_spaces(sensors),
                 state_key=(prefix, "ensemble"),
                 moments=prefix if self.gaussian else None,
             )
@@ -145,11 +147,11 @@ class Updates:
         return modules
 
 
-def _flat_spaces(sensors: Mapping[str, FusedSensor], owner: str, cure: str) -> dict[str, Space | None]:
+def _flat_spaces(sensors: Mapping[str, FusedSensor]) -> dict[str, Space | None]:
     """The spaces of the readings, all of numbers and angles."""
     others = [name for name, sensor in sensors.items() if not is_flat(sensor.reading_space)]
     if others:
-        raise ValueError(f"{owner} takes readings of numbers and angles, and {others} read points: leave {cure} away.")
+        raise ValueError(f"weights= takes readings of numbers and angles, and {others} read points: leave it away.")
     return {name: check_space("reading_space", sensor.reading_space) for name, sensor in sensors.items()}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from typing import Unpack
@@ -17,7 +18,7 @@ from torch_denkf.filters.options import FilterOptions
 from torch_denkf.filters.parts import check_kind
 from torch_denkf.fusion._updates import Updates
 from torch_denkf.fusion.joint_moments import JOINT_PAST, JointForecast, PresentOfJoint, joint_space
-from torch_denkf.fusion.parts import OfOwnErrors
+from torch_denkf.fusion.parts import LinearMembers, OfOwnErrors
 from torch_denkf.fusion.sensor import FusedSensor, wire
 from torch_denkf.modules import (
     EKFAnalysis,
@@ -37,8 +38,6 @@ from torch_denkf.smoothers.past_moments import CrossTransition
 from torch_denkf.submodel import Initial, role
 
 __all__ = ["FusedFilter"]
-
-_NO_NOISE = "A mean and a covariance need process_noise=..., standard deviations [S] or a module."
 
 
 class FusedFilter(Filter):
@@ -86,7 +85,7 @@ class FusedFilter(Filter):
     Raises:
         ValueError: if there is no sensor, a delay is negative or beyond the lag, process noise is missing or given
             twice, an analysis inflates or relaxes where that is refused or names a ``reading_space``, or a sensor has
-            errors that last and the transition moves a mean and a covariance or its readings live on a space.
+            errors that last and its readings live on a space.
         TypeError: for particles, sensors that are no dict, an analysis in the place of what makes it, or one that
             cannot correct earlier states.
 
@@ -126,6 +125,7 @@ class FusedFilter(Filter):
             raise ValueError("FusedFilter needs at least one sensor: sensors={name: FusedSensor(...)}.")
         gaussian = _is_gaussian(initial)
         lag = _lag_of(sensors, lag)
+        _check_motion(transition, process_noise, initial, gaussian)
         transition, process_noise, initial, sensors = _with_errors(transition, process_noise, initial, sensors)
         transition = _moving(transition, process_noise, initial, gaussian)
         modules: OrderedDict[str, TensorDictModuleBase] = OrderedDict()
@@ -208,13 +208,12 @@ def _with_errors(transition, process_noise, initial, sensors):
     total = sum(map(len, given))
     if not total:
         return transition, process_noise, initial, sensors
-    if isinstance(transition, LinearTransition | GaussianTransition):
-        raise ValueError(
-            f"sensor_error needs a transition of ensembles and process_noise=...; {type(transition).__name__} moves a "
-            "mean and a covariance. LearnedTransition(torch.nn.Linear(...), residual=False) is a linear one."
-        )
-    if process_noise is None and _is_gaussian(initial):
-        raise ValueError(_NO_NOISE)
+    moments = transition
+    if isinstance(moments, LinearTransition):
+        transition = LinearMembers(moments)
+        process_noise = transition.process_noise()
+    elif isinstance(moments, GaussianTransition):
+        transition, process_noise = moments.module, moments.process_noise
     made, begin = {}, 0
     for name, sensor in sensors.items():
         observation, end = sensor.observation, begin
@@ -225,11 +224,15 @@ def _with_errors(transition, process_noise, initial, sensors):
             end += len(sensor.sensor_error)
         made[name] = replace(sensor, observation=OfOwnErrors(observation, range(begin, end), total))
         begin = end
+    if isinstance(moments, GaussianTransition):  # the same, of the larger state
+        whole = copy(moments)
+        whole._modules = {**moments._modules, "module": transition, "process_noise": process_noise}
+        transition, process_noise = whole, None
     return transition, process_noise, initial, made
 
 
-def _moving(transition, process_noise, initial, gaussian):
-    """The transition with its process noise."""
+def _check_motion(transition, process_noise, initial, gaussian):
+    """Raises unless the transition moves the belief, and has its process noise once."""
     moments = isinstance(transition, LinearTransition | GaussianTransition)
     if moments and not gaussian:
         raise ValueError(
@@ -238,11 +241,13 @@ def _moving(transition, process_noise, initial, gaussian):
         )
     if moments and process_noise is not None:
         raise ValueError(f"{type(transition).__name__} has its process noise already; leave process_noise out.")
-    if moments:
-        return transition
+    if gaussian and not moments and process_noise is None:
+        raise ValueError("A mean and a covariance need process_noise=..., standard deviations [S] or a module.")
+
+
+def _moving(transition, process_noise, initial, gaussian):
+    """The transition with its process noise."""
     if process_noise is None:
-        if gaussian:
-            raise ValueError(_NO_NOISE)
         return transition
     noise, space = as_process_noise(process_noise, initial), role(initial, Initial).space
     made = EKFTransition if gaussian else NoisyTransition

@@ -11,8 +11,11 @@ import torch
 from tensordict import TensorDict
 
 from torch_denkf._checks import check_number
+from torch_denkf.diagnosis.logs import SECONDS, Unit, in_origin, look_at_numbers, look_at_times, warn_of_log
 
 __all__ = ["message_rows"]
+
+_SILENT = 20  # usual steps without a message of a sensor that drives the motion
 
 
 def message_rows(
@@ -21,6 +24,8 @@ def message_rows(
     driving: Sequence[str] = (),
     delays: Mapping[str, float] | None = None,
     start: float | None = None,
+    unit: Unit = "s",
+    origin: Mapping[str, Any] | None = None,
     dtype: torch.dtype | None = None,
 ) -> TensorDict:
     """Rows ``[T]`` of a log in which sensors of different rates write when they like.
@@ -34,24 +39,31 @@ def message_rows(
     that stands under NAME_noise: the name to give to ``FusedSensor(noise=...)``.
 
     Args:
-        messages: ``(stamp, sensor, value)`` or ``(stamp, sensor, value, noise)``, in any order: the stamp in seconds,
-            the sensor's name, ``[O]`` numbers, and the reading's variances ``[O]`` or covariance ``[O, O]``,
+        messages: ``(stamp, sensor, value)`` or ``(stamp, sensor, value, noise)``, in any order: the stamp, the
+            sensor's name, ``[O]`` numbers, and the reading's variances ``[O]`` or covariance ``[O, O]``,
             of tangents where it is a point of a space.
         driving: sensors that drive the motion, such as ``"imu"``. They have no mask: each row holds the mean since the
             row before, on straight lines between the messages, each of which counts for the moment of its stamp; before
-            the first and behind the last it stays as it is there. Messages of them that are not finite are left out.
+            the first and behind the last it stays as it is there; a warning says where that, or a silence between two
+            messages, is longer than twenty of its usual steps. Messages of them that are not finite are left out.
         delays: by how many seconds a sensor's stamps are later than what it saw, by name.
         start: time of the first row, in seconds; by default that of the first reading. What was read before is left
             out.
-        dtype: of the numbers; torch's default.
+        unit: of the stamps: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``. All else is in seconds.
+        origin: what is subtracted from the readings of a sensor, by its name, a number or ``[O]``, in float64, before
+            they become float32, which has seven digits: of metres of a map, degrees of latitude or encoder ticks the
+            last ones are lost. A warning says where.
+        dtype: of the numbers, floating; torch's default.
 
     Returns:
         The rows, with ``"stamp"`` ``[T, 1]`` in float64.
 
     Raises:
         ValueError: if there is no message, one is malformed or has no finite stamp, a noise is not positive, the
-            messages of a sensor differ in size, only some of them bring a noise, or two entries have one name.
-        KeyError: if ``driving`` or ``delays`` name a sensor that has no message.
+            messages of a sensor differ in size, only some of them bring a noise, two entries have one name, an element
+            is masked, all messages are from before ``start``, or one that drives has none in the time of the others.
+        KeyError: if ``driving``, ``delays`` or ``origin`` name a sensor that has no message.
+        TypeError: for a ``dtype`` that is not floating.
 
     Example:
         >>> log = [(0.10, "lidar", [0.1]), (0.13, "gps", [1.0, 2.0], [4.0, 4.0]), (0.21, "lidar", [0.2])]
@@ -61,19 +73,40 @@ def message_rows(
         >>> rows["gps_observed"].squeeze(-1), rows["gps_noise"][1]
         (tensor([False,  True, False, False]), tensor([4., 4.]))
     """
-    streams = _by_sensor(messages)
-    for what, names in (("driving", driving), ("delays", delays or {})):
+    dtype = dtype or torch.get_default_dtype()
+    if not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
+        raise TypeError(
+            f"dtype must be floating, such as torch.float32, for steps are parts of a second; got {dtype!r}"
+        )
+    if unit not in SECONDS:
+        raise ValueError(f"unit is one of {', '.join(map(repr, SECONDS))}, got {unit!r}")
+    streams = _by_sensor(messages, unit)
+    for what, names in (("driving", driving), ("delays", delays or {}), ("origin", origin or {})):
         unknown = [name for name in names if name not in streams]
         if unknown:
             raise KeyError(f"{what} names {unknown}, of which there is no message; there is {', '.join(streams)}.")
     for name, delay in (delays or {}).items():
         check_number(f"delay of {name!r}", delay)
         streams[name] = replace(streams[name], times=streams[name].times - delay)
+    for name, stream in streams.items():
+        if origin is not None and name in origin:
+            streams[name] = stream = replace(
+                stream, values=in_origin(stream.values, origin[name], f"origin of {name!r}")
+            )
+        labels = [f"{name}[{number}]" for number in range(stream.values.shape[1])]
+        look_at_numbers(
+            stream.values, labels, "the log", f"pass origin={{{name!r}: ...}} or dtype=torch.float64", dtype
+        )
     if start is not None:
         check_number("start", start)
     first = min(stream.times[0] for stream in streams.values()) if start is None else float(start)
-    drives = {name: streams.pop(name).once() for name in dict.fromkeys(driving)}
+    if start is not None and first > (last := max(stream.times[-1] for stream in streams.values())):
+        raise ValueError(f"start={start!r} is behind the last message, {last:.15g} s: pass an earlier one, or unit=.")
+    drives = {name: streams.pop(name).once(name) for name in dict.fromkeys(driving)}
     heard = {name: stream.since(first) for name, stream in streams.items()}
+    _look_at_gaps({**heard, **drives}, unit)
+    for name, drive in drives.items():
+        _look_at_silence(name, drive.times, np.concatenate([[], *(stream.times for stream in heard.values())]))
     events = [each.events() for each in (*heard.values(), *(drive.since(first) for drive in drives.values()))]
     moments, place = np.unique(np.concatenate(events), axis=0, return_inverse=True)
     times = np.concatenate([[first], moments[:, 0]])
@@ -84,7 +117,6 @@ def message_rows(
         if twice := rows.keys() & entries.keys():
             raise ValueError(f"{sorted(twice)} would be written twice: give the sensor of this name another one.")
         rows |= entries
-    dtype = dtype or torch.get_default_dtype()
     tensors = {name: torch.from_numpy(row) for name, row in rows.items()}
     kept = {name: row if name == "stamp" or row.dtype == torch.bool else row.to(dtype) for name, row in tensors.items()}
     return TensorDict(kept, [len(times)])
@@ -106,11 +138,11 @@ class _Stream:
         """The messages from a time on."""
         return self.kept(self.times >= first)
 
-    def once(self) -> _Stream:
+    def once(self, name: str) -> _Stream:
         """The last message of each time, without those that are not finite."""
         finite = self.kept(np.isfinite(self.values).all(1))
         if not len(finite.times):
-            raise ValueError("A sensor that drives the motion has no message that is finite.")
+            raise ValueError(f"{name!r} drives the motion and has no message that is finite.")
         return finite.kept(np.append(np.diff(finite.times) > 0, True))
 
     def events(self) -> np.ndarray:
@@ -142,39 +174,101 @@ class _Stream:
         return now
 
 
-def _by_sensor(messages: Iterable[Sequence[Any]]) -> dict[str, _Stream]:
-    """The messages of each sensor, in the order of their stamps.
+def _look_at_gaps(streams: Mapping[str, _Stream], unit: str) -> None:
+    """Looks at the times of all sensors together, in the name of the one that speaks before the longest gap."""
+    names = np.concatenate([np.repeat(name, len(stream.times)) for name, stream in streams.items()])
+    times = np.concatenate([stream.times for stream in streams.values()])
+    order = np.argsort(times, kind="stable")
+    at = int(np.diff(times[order]).argmax()) if len(times) > 1 else 0
+    look_at_times(times[order], "the log", str(names[order][at]) if len(times) else "", unit, ["gaps"])
+
+
+def _look_at_silence(name: str, times: np.ndarray, others: np.ndarray) -> None:
+    """Warns where a sensor that drives the motion says nothing while others read.
+
+    Raises:
+        ValueError: if it says nothing in all of that time.
+    """
+    if not len(others):
+        return
+    begin, end = others.min(), others.max()
+    if times[-1] < begin or times[0] > end:
+        raise ValueError(
+            f"{name!r} drives the motion from {times[0]:.15g} to {times[-1]:.15g} s, and has no message while the "
+            f"others read, {begin:.15g} to {end:.15g} s: pass unit=, delays= or start=, or leave out "
+            "what has another clock."
+        )
+    usual = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
+    before, after = np.searchsorted(times, begin, "right") - 1, np.searchsorted(times, end)
+    bounds = [begin] if before < 0 else [], times[max(before, 0) : after + 1], [end] if after == len(times) else []
+    knots = np.concatenate(bounds)
+    wide = np.flatnonzero(np.diff(knots) > _SILENT * usual)
+    silent = [(float(knots[at]), float(knots[at + 1])) for at in wide]
+    if silent:
+        text = ", ".join(f"{start:.10g} to {stop:.10g} s" for start, stop in silent[:4])
+        warn_of_log(
+            "the log",
+            name,
+            f"drives the motion and says nothing in {len(silent)} stretches, {text}, where its steps are usually "
+            f"{usual:.3g} s and the rows hold what it said before and after",
+            "pass start=, leave out the messages of the others there, or take it as a sensor that is not driving",
+        )
+
+
+def _by_sensor(messages: Iterable[Sequence[Any]], unit: str) -> dict[str, _Stream]:
+    """The messages of each sensor, in the order of their stamps, s.
 
     Raises:
         ValueError: see :func:`message_rows`.
     """
     found: dict[str, list[tuple[float, np.ndarray, np.ndarray | None]]] = {}
     for number, message in enumerate(messages):
-        if len(message) not in (3, 4) or not isinstance(message[1], str):
+        if not hasattr(message, "__len__") or len(message) not in (3, 4) or not isinstance(message[1], str):
             raise ValueError(
                 f"Message {number} is no (stamp, sensor, value) or (stamp, sensor, value, noise): {message!r}"
             )
-        stamp, name, value = float(message[0]), message[1], np.atleast_1d(np.asarray(message[2], float))
+        name, source = message[1], f"Message {number}, of {message[1]!r},"
+        if any(np.ma.is_masked(part) for part in message):
+            raise ValueError(f"{source} has masked elements: leave it out, or give what is there a sensor of its own.")
+        stamp = float(_floats(f"{source} has a stamp", message[0], 0)) * SECONDS[unit]
+        value = np.atleast_1d(_floats(f"{source} has a value", message[2]))
         if not np.isfinite(stamp) or value.ndim != 1:
             raise ValueError(
                 f"Message {number}, of {name!r}, has the stamp {stamp} and a value of {list(value.shape)}."
             )
-        noise = np.asarray(message[3], float) if len(message) > 3 and message[3] is not None else None
+        noise = message[3] if len(message) > 3 else None
         if noise is not None:
+            noise = _floats(f"{source} has a noise", noise)
             _check_noise(f"Message {number}, of {name!r}, has a noise", noise, len(value))
         found.setdefault(name, []).append((stamp, value, noise))
     if not found:
         raise ValueError("There is no message.")
+    for name, each in found.items():
+        look_at_times(np.array([one[0] for one in each]), "the log", name, unit, ["late", "back", "steps"])
     return {name: _stream(name, sorted(each, key=lambda one: one[0])) for name, each in found.items()}
+
+
+def _floats(what: str, given: Any, ndim: int | None = None) -> np.ndarray:
+    try:
+        array = np.asarray(given, float)
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: of a tensor that needs a gradient
+        array = None
+    if given is None or array is None or array.ndim != (array.ndim if ndim is None else ndim):
+        raise ValueError(f"{what} that is no number: {given!r}")
+    return array
 
 
 def _check_noise(what: str, noise: np.ndarray, size: int) -> None:
     square = noise.ndim == 2 and noise.shape[0] == noise.shape[1]
     if not (noise.ndim == 1 or square) or not 0 < len(noise) <= size:  # a tangent may have fewer numbers than a point
         raise ValueError(f"{what} of {list(noise.shape)}: give variances [O] or a covariance [O, O].")
-    least = np.linalg.eigvalsh(noise).min() if square else noise.min()
-    if not least > 0:
-        raise ValueError(f"{what} that is none: variances and covariances are positive; got {noise.tolist()}.")
+    least = np.linalg.eigvalsh(noise).min() if square else noise.min()  # it reads one triangle alone
+    scale = np.sqrt(np.outer(noise.diagonal(), noise.diagonal())) if least > 0 and square else 1.0
+    if not least > 0 or (square and not (abs(noise - noise.T) <= 1e-4 * scale).all()):
+        raise ValueError(
+            f"{what} that is none: variances are positive, a covariance is symmetric and positive definite; got "
+            f"{noise.tolist()}."
+        )
 
 
 def _stream(name: str, messages: list[tuple[float, np.ndarray, np.ndarray | None]]) -> _Stream:

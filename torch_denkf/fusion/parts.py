@@ -11,12 +11,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torch_denkf._checks import check_mask
+from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.functional.manifolds import Space
+from torch_denkf.modules import ConstantNoise, LinearTransition, MappedNoise
 from torch_denkf.modules.around import Wrapper, passes_on
 from torch_denkf.running import check_module, marks_of, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, Sensor, SubModel, Update
 
-__all__ = ["JoinedObservation", "JoinedReading", "OfOwnErrors", "Renamed", "StateObservation"]
+__all__ = ["JoinedObservation", "JoinedReading", "LinearMembers", "OfOwnErrors", "Renamed", "StateObservation"]
 
 
 @passes_on(Sensor)
@@ -71,6 +73,39 @@ class OfOwnErrors(Wrapper):
         system, errors = self.required(entries, key).tensor_split([-self.total], -1)
         state = torch.cat([system, errors[..., self.own]], -1)
         return self.run_inside({**entries, key: state}, call)
+
+
+class LinearMembers(SubModel):
+    """Moves the members of an ensemble as a linear transition moves a mean, :math:`F x + B a`.
+
+    Args:
+        transition: whose matrices are taken, and trained.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> move = LinearMembers(LinearTransition(2 * torch.eye(1), torch.eye(1)))
+        >>> move(TensorDict({("belief", "ensemble"): torch.ones(3, 1)}))["forecast", "ensemble"].flatten()
+        tensor([2., 2., 2.])
+    """
+
+    def __init__(self, transition: LinearTransition):
+        keys = [("belief", "ensemble"), *([] if transition.control is None else [transition.action_key])]
+        super().__init__(transition, keys, [("forecast", "ensemble")])
+
+    def compute(self, ensemble, *action):
+        """The forecast."""
+        moved = ensemble @ self.module.matrix.mT
+        return moved if not action else moved + (action[0].to(moved.dtype) @ self.module.control.mT).unsqueeze(-2)
+
+    def process_noise(self) -> TensorDictModuleBase:
+        """Returns the module that writes Q."""
+        if isinstance(self.module.noise, nn.Module):
+            return self.module.noise
+        unit = torch.ones_like(self.module.noise[0])
+        return MappedNoise(
+            ConstantNoise(unit, in_key=("belief", "mean"), out_key=("forecast", "noise")),
+            semidefinite_root(self.module.noise),
+        )
 
 
 class StateObservation(Wrapper, Update):
@@ -175,11 +210,19 @@ class JoinedObservation(SubModel):
 
     Args:
         models: by name, in the order of the readings.
+        spaces: in which each reading lives; ``None`` for plain numbers.
         predicted_key: ``[*B, E, O]``, the sum of all O.
-        observed_key: the mask ``[*B, O]``.
+        observed_key: the mask ``[*B, O]``, on spaces of tangents.
     """
 
-    def __init__(self, models: Mapping[str, StateObservation], *, predicted_key: NestedKey, observed_key: NestedKey):
+    def __init__(
+        self,
+        models: Mapping[str, StateObservation],
+        spaces: Sequence[Space | None],
+        *,
+        predicted_key: NestedKey,
+        observed_key: NestedKey,
+    ):
         needed, optional = ({} for _ in range(2))
         for model in models.values():
             must, may = reads(model)
@@ -188,6 +231,7 @@ class JoinedObservation(SubModel):
         super().__init__(
             nn.ModuleDict(models), list(needed), [predicted_key, observed_key], optional_keys=list(optional)
         )
+        self.spaces = list(spaces)
 
     def parts(self):
         """The models."""
@@ -196,10 +240,10 @@ class JoinedObservation(SubModel):
     def on_entries(self, entries, call):
         """The predicted observations, and the mask."""
         predicted, masks = [], []
-        for name, model in self.module.items():
+        for (name, model), space in zip(self.module.items(), self.spaces, strict=True):
             values, seen = model.seen(entries, call.part(name))
             predicted.append(values)
-            like = values[..., 0, :]
+            like = values[..., 0, : None if space is None else space.tangent_dim]
             masks.append(torch.ones_like(like, dtype=torch.bool) if seen is None else seen.expand(like.shape))
         return self.by_key((torch.cat(predicted, -1), torch.cat(masks, -1)))
 
@@ -210,7 +254,7 @@ class JoinedReading(Sensor):
     Args:
         reading_keys: readings ``[*B, O]``, or samples ``[*B, E, O]``, whose mean is taken.
         noise_keys: variances ``[*B, O]`` or covariances ``[*B, O, O]``, in the same order.
-        spaces: in which each reading lives, of numbers and angles; ``None`` for plain numbers.
+        spaces: in which each reading lives; ``None`` for plain numbers.
         observation_key: all readings, ``[*B, O]``.
         noise_key: all variances ``[*B, O]``, or one covariance ``[*B, O, O]`` if any sensor has one.
         observation_dim: O of all, where it is known.
@@ -246,7 +290,8 @@ class JoinedReading(Sensor):
             value if value.ndim == size + 1 else value.mean(-2) if space is None else space.mean(value)
             for value, space in zip(values[:count], self.spaces, strict=True)
         ]
-        noises, total, begin = list(values[count:]), sum(reading.shape[-1] for reading in readings), 0
+        noises, begin = list(values[count:]), 0
+        total = sum(noise.shape[-1] for noise in noises)  # of tangents
         if any(noise.ndim > size + 1 for noise in noises):
             for index, noise in enumerate(noises):
                 noise = noise if noise.ndim > size + 1 else noise.diag_embed()

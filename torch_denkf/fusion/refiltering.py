@@ -154,7 +154,7 @@ class Refiltering(Checked):
         row = row.copy()
         carry = {key: belief[key] for key in self.filter.carry_keys}
         entries = {**self.filter.entries_of(row, one_step=True), **carry}
-        self.filter.write(row, self.filter.missing_noise(entries, row.batch_size))
+        self.filter.write(row, self.filter.draws.missing(entries, row.batch_size))
         return row
 
     def _place(self, rows: list[TensorDictBase]) -> int:

@@ -28,8 +28,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_values
-from torch_denkf.beliefs import is_samples
-from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.beliefs import Ensemble, Particles, is_samples
 from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.modules.around import AroundInitial, Wrapper
@@ -392,10 +391,12 @@ class BiasedBelief(AroundInitial):
         if "ensemble" in names:
             ensemble = written[names["ensemble"]]
             noise = cast(Tensor, self._noise(entries, [ensemble], call._replace(sample=True)))
-            noise = exact_draws(noise.to(ensemble.dtype), ensemble)
+            noise = noise.to(ensemble.dtype)
+            noise = noise if "log_weight" in names else exact_draws(noise, ensemble)
             ensemble = torch.cat([ensemble, std.to(ensemble.dtype) * noise], -1)
-            mean = ensemble_mean(ensemble)
-            now = {"ensemble": ensemble, "mean": mean, "var": ensemble_var(ensemble, mean)}
+            kind = Particles() if "log_weight" in names else Ensemble()
+            now = {"ensemble": ensemble, **{name: written[key] for name, key in names.items() if name == "log_weight"}}
+            now |= {name: cast(Tensor, kind.derived(name, *now.values())) for name in ("mean", "var")}
         else:
             mean, cov = (written[names[name]] for name in ("mean", "cov"))
             std, count = std.to(mean.dtype), len(std)

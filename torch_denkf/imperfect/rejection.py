@@ -16,7 +16,8 @@ from torchrl.envs.transforms import Transform
 from torch_denkf._arguments import Checked, check_key
 from torch_denkf._checks import check_mask, check_number, flag_value
 from torch_denkf.diagnosis import entry_of
-from torch_denkf.functional.manifolds import Euclidean, Space, places_of
+from torch_denkf.functional.linalg import is_covariance
+from torch_denkf.functional.manifolds import Space, places_of
 from torch_denkf.submodel import Entries
 
 __all__ = ["RejectReadings"]
@@ -55,7 +56,8 @@ class RejectReadings(Checked, Transform):
         noises: for a reading the entry with its variances ``[*B, O]`` or its covariance ``[*B, O, O]``. Those of a
             reading that is rejected for them become one, and the identity.
         spaces: for a reading the space in which it is a point ``[*B, P]``. Its parts, such as the pose, are rejected as
-            a whole and become the neutral point; plain numbers are rejected one by one. The mask ``[*B, D]`` is of the
+            a whole and become the neutral point; plain numbers are rejected one by one. A quaternion of zeros is bad,
+            too. The mask ``[*B, D]`` is of the
             components of a tangent, and so is the noise.
         on_bad: ``"mask"`` to reject bad readings, ``"raise"`` to raise where no mask hides them. To raise, one flag is
             read back from the device in each call; under ``torch.compile`` and ``torch.vmap`` nothing raises.
@@ -65,8 +67,8 @@ class RejectReadings(Checked, Transform):
     Raises:
         TypeError: for a key that is none, a space that is none, or ``noises`` that are no dict.
         ValueError: if ``masks`` is empty, another argument names a reading that is not in ``masks``, two entries have
-            one key, or ``on_bad`` is unknown. In a call, if a mask is not boolean or of another shape; with
-            ``on_bad="raise"``, if a reading is bad.
+            one key, or ``on_bad`` is unknown. In a call, if a mask is not boolean or of another shape, or a reading has
+            not the size of its space's points; with ``on_bad="raise"``, if a reading is bad.
         KeyError: in a call, if a reading or its noise is missing.
 
     Example:
@@ -184,6 +186,12 @@ class RejectReadings(Checked, Transform):
         """
         size, value = tensordict.ndim, entry_of(tensordict, key, "RejectReadings", "Rename it in the constructor.")
         good, neutral = self._within(value), value.new_zeros(())
+        if key in self.spaces:
+            self.spaces[key].check(**{repr(key): value[(0,) * size] if 0 not in value.shape[:size] else value})
+            neutral = self.spaces[key].neutral(value)
+            point = torch.where(good, value, neutral)
+            point = point if point.is_floating_point() else point.float()
+            good = good & self.spaces[key].normalise(point).isfinite()  # a quaternion of zeros is no rotation
         known = good.unsqueeze(-1).flatten(size).all(-1, keepdim=True)
         if key in self.spaces or key in self.by_component:  # samples of one reading count together
             known = good.flatten(size, -2).all(-2) if good.ndim > size + 1 else good
@@ -195,7 +203,6 @@ class RejectReadings(Checked, Transform):
         if key in self.spaces:
             points, known = _whole_parts(self.spaces[key], known, noise)
             good = points.reshape(*points.shape[:-1], *(1,) * (value.ndim - points.ndim), points.shape[-1])
-            neutral = self.spaces[key].neutral(value)
         elif noise is not None:
             known = known & (noise if key in self.by_component else noise.all(-1, keepdim=True))
         written[key] = torch.where(good, value, neutral)
@@ -215,7 +222,7 @@ class RejectReadings(Checked, Transform):
             return good, torch.where(good, noise, 1)
         eye = torch.eye(noise.shape[-1], dtype=noise.dtype, device=noise.device)
         good = good.flatten(-2).all(-1)[..., None, None]
-        good = good & _is_covariance(torch.where(good, noise, eye).detach())[..., None, None]
+        good = good & is_covariance(torch.where(good, noise, eye))[..., None, None]
         return good[..., 0].expand(noise.shape[:-1]), torch.where(good, noise, eye)
 
     def _messages(
@@ -241,6 +248,8 @@ class RejectReadings(Checked, Transform):
                         due = f"at most {self.limit:g} in size" if abs(number) < torch.inf else "finite"
                         due = "at least zero" if bool(negative[tuple(place)]) else due
                         yield f"{name!r} is {number:g} at {[*row, *place]}, and a {what} must be {due}{cure}"
+                    if name == key in self.spaces:
+                        yield f"{name!r} at {row} is no point of {self.spaces[key]}: {value.tolist()}{cure}"
                     if name == noise:
                         yield f"{name!r} at {row} is no covariance: symmetric, without negative eigenvalues{cure}"
 
@@ -272,7 +281,7 @@ def _whole_parts(space: Space, points: Tensor, tangents: Tensor | None) -> tuple
     parts: list[tuple[Tensor, Tensor]] = []
     for place in places_of(space):
         point, tangent = points[..., place.point], None if tangents is None else tangents[..., place.tangent]
-        if isinstance(place.space, Euclidean):
+        if place.space.flat is not None:
             known = point if tangent is None else point & tangent
             parts.append((known, known))
             continue
@@ -281,17 +290,3 @@ def _whole_parts(space: Space, points: Tensor, tangents: Tensor | None) -> tuple
         dims = (place.space.point_dim, place.space.tangent_dim)
         parts.append((whole.expand(*whole.shape[:-1], dims[0]), whole.expand(*whole.shape[:-1], dims[1])))
     return torch.cat([point for point, _ in parts], -1), torch.cat([tangent for _, tangent in parts], -1)
-
-
-def _is_covariance(cov: Tensor) -> Tensor:
-    """Tells which finite matrices ``[*, O, O]`` are covariances up to rounding; their correlations are tested."""
-    cov = cov if cov.dtype == torch.float64 else cov.float()  # there is no factor in half precision
-    variance = cov.diagonal(dim1=-2, dim2=-1)
-    std = variance.clamp_min(0).sqrt()
-    std = torch.where(std > 0, std, 1)
-    correlation = cov / std.unsqueeze(-1) / std.unsqueeze(-2)
-    eye = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
-    rounding = 100 * cov.shape[-1] * torch.finfo(cov.dtype).eps
-    symmetric = ((correlation - correlation.mT).abs() <= rounding).flatten(-2).all(-1)
-    factored = torch.linalg.cholesky_ex(correlation + rounding * eye)[1] == 0
-    return (variance >= 0).all(-1) & symmetric & factored

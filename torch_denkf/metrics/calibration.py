@@ -97,7 +97,8 @@ def interval_coverage(
 ) -> Tensor:
     """Share of the truth inside the central interval of a Gaussian, ``mean ± z sqrt(variance)``.
 
-    It is ``level`` for a calibrated belief, less for an overconfident one.
+    It is ``level`` for a calibrated belief, less for an overconfident one. Without ``space`` variances of points are of
+    other axes than their differences: :func:`torch_denkf.diagnosis.evaluate` takes the space from a filter.
 
     Args:
         mean: ``[*B, S]``.
@@ -107,7 +108,7 @@ def interval_coverage(
         space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. The variance is one of tangents.
 
     Returns:
-        One share a state dimension, ``[S]``.
+        One share a state dimension, ``[S]``; NaN where a belief is.
 
     Raises:
         ValueError: if the shapes differ, if ``level`` is not in (0, 1), or if a variance is negative.
@@ -121,7 +122,7 @@ def interval_coverage(
     _check_variance(variance, error)
     check_level(level)
     quantile = torch.special.ndtri(torch.tensor(0.5 + level / 2, dtype=torch.float64)).item()
-    return _share(error.abs() <= quantile * variance.sqrt(), known_tangents(truth, space))
+    return _share(quantile * variance.sqrt() - error.abs(), known_tangents(truth, space))
 
 
 def ensemble_interval_coverage(
@@ -144,7 +145,7 @@ def ensemble_interval_coverage(
         space: whose points members and truth are; ``None`` for plain numbers. Tangents at the members' mean are ranked.
 
     Returns:
-        One share a state dimension, ``[S]``.
+        One share a state dimension, ``[S]``; NaN where a belief is.
 
     Raises:
         ValueError: if the shapes do not fit, ``level`` is not in (0, 1) or more than the members can tell, or
@@ -160,7 +161,7 @@ def ensemble_interval_coverage(
     """
     members, offset = _around_mean(ensemble, truth, space)
     lower, upper = ensemble_interval(members, level=level)
-    return _share((lower <= offset) & (offset <= upper), known_tangents(truth, space))
+    return _share(torch.minimum(offset - lower, upper - offset), known_tangents(truth, space))
 
 
 def ensemble_interval(ensemble: Tensor, *, level: float = 0.9) -> tuple[Tensor, Tensor]:
@@ -401,5 +402,7 @@ def _check_variance(variance: Tensor, error: Tensor) -> None:
         raise ValueError(f"variances cannot be negative; the least is {variance.min().item():.3g}.")
 
 
-def _share(inside: Tensor, truth: Tensor) -> Tensor:
-    return mean_of_known(inside.to(torch.get_default_dtype()), truth)
+def _share(margin: Tensor, truth: Tensor) -> Tensor:
+    """The share of margins ``[*B, S]`` that are not negative; NaN where one is NaN."""
+    inside = (margin >= 0).to(torch.get_default_dtype())
+    return mean_of_known(inside.where(~margin.isnan(), torch.nan), truth)

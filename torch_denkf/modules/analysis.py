@@ -13,8 +13,8 @@ from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.functional.moments import ensemble_cov
-from torch_denkf.modules._spaces import mean_and_tangents
 from torch_denkf.modules.ensemble import EnsembleAnalysisKeys, EnsembleUpdate
+from torch_denkf.modules.spaces import mean_and_tangents
 from torch_denkf.modules.tensors import as_floating, check_dims
 
 __all__ = ["EnsembleAnalysis"]

@@ -67,9 +67,9 @@ class EKFTransition(GaussianTransition):
             forecast, jacobian, _ = _linearise_on(move, entries, call, mean, self.space, self.space)
         if self.stop_jacobian_gradient:
             jacobian = jacobian.detach()
-        moved = jacobian @ cov
-        cov = moved @ jacobian.mT
-        return forecast, (cov + cov.mT) / 2, moved.mT
+        moved = jacobian @ cov @ jacobian.mT
+        link = (torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device), cov, jacobian) if wanted else None
+        return forecast, (moved + moved.mT) / 2, link
 
 
 class EKFAnalysis(GaussianAnalysis):

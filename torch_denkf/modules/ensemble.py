@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_choice, check_number, check_values
 from torch_denkf.functional.manifolds import Space, check_space
+from torch_denkf.modules.spaces import told
 from torch_denkf.submodel import Call, Entries, Update
 
 __all__ = ["EnsembleAnalysisKeys", "EnsembleUpdate"]
@@ -124,10 +125,10 @@ class EnsembleUpdate(Update):
         """
         if self.reading_space is None:
             return entries
-        keys = self.in_keys[1:3]
+        keys, observed = self.in_keys[1:3], told(self.reading_space, entries.get(self.observed_key))
         predicted, reading = (self.required(entries, key) for key in keys)
-        aligned = self.reading_space.align(predicted, reading, entries.get(self.observed_key))
-        return {**entries, **dict(zip(keys, aligned, strict=True))}
+        aligned = dict(zip(keys, self.reading_space.align(predicted, reading, observed), strict=True))
+        return {**entries, **aligned, **({} if observed is None else {self.observed_key: observed})}
 
     def on_aligned(self, entries: Entries, call: Call) -> Entries:
         """The belief and the diagnostics of entries as :meth:`aligned` gives them."""

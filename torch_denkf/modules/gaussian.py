@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TypedDict
 
 import torch
@@ -12,8 +12,9 @@ from torch import nn
 
 from torch_denkf._checks import check_number
 from torch_denkf.functional.gaussian import GaussianUpdate
+from torch_denkf.functional.linalg import as_covariance
 from torch_denkf.functional.manifolds import Space, check_space, is_flat
-from torch_denkf.modules._spaces import mean_reading
+from torch_denkf.modules.spaces import mean_reading, told
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.running import check_module, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, SubModel, Transition, Update
@@ -81,21 +82,24 @@ class GaussianTransition(Transition):
 
     def on_entries(self, entries, call):
         """The forecast."""
-        return self.with_cross(entries, call, wanted=False)[0]
+        return self.with_link(entries, call, wanted=False)[0]
 
-    def with_cross(self, entries: Entries, call: Call, *, wanted: bool = True) -> tuple[Entries, torch.Tensor | None]:
-        """Returns the forecast; and, where wanted, the covariance of the states before and after ``[*B, S, S]``."""
+    def with_link(self, entries: Entries, call: Call, *, wanted: bool = True) -> tuple[Entries, Sequence[torch.Tensor]]:
+        """Returns the forecast; and, where wanted, how it follows from the state before: A, M, B and Q.
+
+        The covariance before is A M Aᵀ, that of the states before and after is A M Bᵀ, the forecast's B M Bᵀ + Q.
+        """
         mean, cov = (self.required(entries, key) for key in self.in_keys[:2])
-        mean, cov, cross = self._forecast(entries, mean, cov, call._replace(sample=False), wanted)
+        mean, cov, link = self._forecast(entries, mean, cov, call._replace(sample=False), wanted)
         work = {**entries, self.out_keys[0]: mean}
-        noise = run_module(self.process_noise, work, call.part("process_noise"))
-        cov = cov + as_covariance(noise[unravel_key(self.process_noise.out_keys[0])], mean)
-        return {self.out_keys[0]: mean, self.out_keys[1]: cov}, cross
+        written = run_module(self.process_noise, work, call.part("process_noise"))
+        noise = as_covariance(written[unravel_key(self.process_noise.out_keys[0])], mean)
+        return {self.out_keys[0]: mean, self.out_keys[1]: cov + noise}, (*(link or ()), noise)
 
     def _forecast(
         self, entries: Entries, mean, cov, call: Call, wanted: bool
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        """Mean and covariance before the process noise is added, and where wanted the cross-covariance."""
+    ) -> tuple[torch.Tensor, torch.Tensor, Sequence[torch.Tensor] | None]:
+        """Mean and covariance before the process noise is added, and where wanted A, M and B."""
         raise NotImplementedError
 
     def _move(self, entries: Entries, states: torch.Tensor, call: Call) -> torch.Tensor:
@@ -187,7 +191,7 @@ class GaussianAnalysis(Update):
         """The belief and the diagnostics."""
         mean, cov, observation, noise = (self.required(entries, key) for key in self.in_keys[:4])
         if observation.ndim > mean.ndim:
-            observation = mean_reading(self.reading_space, observation)
+            observation = mean_reading(self.reading_space, observation, entries.get(self.observed_key))
         update, observed = self._update(entries, mean, cov, observation, noise, call._replace(sample=False))
         values = updated(update, observed, self.inflation)
         return dict(zip(self.out_keys, values, strict=True))
@@ -236,7 +240,7 @@ class GaussianAnalysis(Update):
             written = run_module(self.module, {**entries, self.ensemble_key: states}, call)
         given, made = entries.get(self.observed_key), written.get(self.observed_key)
         mask = given if made is None else made if given is None else made & given
-        return written[self.predicted_key], mask
+        return written[self.predicted_key], told(self.reading_space, mask)
 
 
 def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: float = 1.0) -> tuple[torch.Tensor, ...]:
@@ -250,11 +254,6 @@ def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: fl
         cov = inflated if observed is None else torch.where(observed.any(-1)[..., None, None], inflated, cov)
     variance = cov.diagonal(dim1=-2, dim2=-1)
     return update.mean, cov, variance, update.innovation, update.nis, update.log_likelihood
-
-
-def as_covariance(noise: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
-    """Covariance ``[*B, N, N]`` from variances ``[*B, N]``, or as it is; ``mean`` ``[*B, S]`` tells them apart."""
-    return noise.diag_embed() if noise.ndim == mean.ndim else noise
 
 
 def further_keys(

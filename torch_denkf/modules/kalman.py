@@ -11,10 +11,10 @@ from torch import nn
 
 from torch_denkf._checks import check_covariance, check_number, check_shape, check_square, check_values
 from torch_denkf.functional import kalman_predict, kalman_update
-from torch_denkf.functional.linalg import product_of_known
+from torch_denkf.functional.linalg import as_covariance, product_of_known
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.modules._spaces import mean_reading
-from torch_denkf.modules.gaussian import as_covariance, further_keys, updated
+from torch_denkf.modules.gaussian import further_keys, updated
+from torch_denkf.modules.spaces import mean_reading
 from torch_denkf.modules.tensors import as_standard_deviations, register_constant, register_matrix
 from torch_denkf.running import run_module
 from torch_denkf.submodel import Call, Entries, Initial, Transition, Update
@@ -168,6 +168,10 @@ class LinearTransition(Transition):
 
     def on_entries(self, entries, call):
         """Returns the forecast."""
+        return self.with_link(entries, call)[0]
+
+    def with_link(self, entries: Entries, call: Call) -> tuple[Entries, Sequence[torch.Tensor]]:
+        """Returns the forecast, and how it follows from the state before, see :class:`GaussianTransition`."""
         mean, cov = entries.get(self.in_keys[0]), entries.get(self.in_keys[1])
         if mean is None or cov is None:
             mean, cov = self.values(entries)[:2]  # raises, and says what there is
@@ -179,12 +183,10 @@ class LinearTransition(Transition):
             forecast = forecast + self.required(entries, self.action_key).to(mean.dtype) @ self.control.mT
         if not isinstance(noise, torch.Tensor):
             written = run_module(noise, {**entries, self.out_keys[0]: forecast}, call.part("noise"))
-            forecast_cov = forecast_cov + as_covariance(written[unravel_key(noise.out_keys[0])], mean)
-        return {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}
-
-    def with_cross(self, entries: Entries, call: Call) -> tuple[Entries, torch.Tensor]:
-        """Returns the forecast, and the covariance of the states before and after, ``[*B, S, S]``."""
-        return self.on_entries(entries, call), self.required(entries, self.in_keys[1]) @ self.matrix.mT
+            constant = as_covariance(written[unravel_key(noise.out_keys[0])], mean)
+            forecast_cov = forecast_cov + constant
+        link = torch.eye(len(self.matrix), dtype=cov.dtype, device=cov.device), cov, self.matrix, constant
+        return {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}, link
 
 
 class KalmanAnalysis(Update):
@@ -272,7 +274,7 @@ class KalmanAnalysis(Update):
         *noise, observed = rest
         noise = noise[0] if noise else self.noise.expand(*mean.shape[:-1], *self.noise.shape)
         if observation.ndim > mean.ndim:
-            observation = mean_reading(self.reading_space, observation)
+            observation = mean_reading(self.reading_space, observation, None)
         if self.reading_space is not None:  # the same turn as the prediction
             predicted = mean @ self.matrix.mT
             observation = predicted + self.reading_space.minus(observation, predicted)

@@ -12,7 +12,7 @@ from torch import nn
 
 from torch_denkf._checks import check_choice, check_count
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.modules._spaces import mean_reading
+from torch_denkf.modules.spaces import mean_reading, told
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import as_vector, mean_of_members
 from torch_denkf.submodel import Update
@@ -28,7 +28,8 @@ _SMALLEST_LOG_LIKELIHOOD = -20.0
 class GaussianLikelihood(Update):
     r"""Log-density of the reading around each particle's prediction, :math:`\log N(\tilde y; h(x^i), R)`.
 
-    Dimensions that are not observed drop out; where nothing is observed it is zero for all particles.
+    Dimensions that are not observed, or whose variance is infinite, drop out; where nothing is observed it is zero for
+    all particles.
 
     Args:
         reading_space: in which the reading lives, such as ``Circle()`` for an angle; ``None`` for plain numbers.
@@ -77,8 +78,9 @@ class GaussianLikelihood(Update):
                 f"GaussianLikelihood takes variances [*B, O]; {self.in_keys[2]!r} has shape {list(variance.shape)}. "
                 "Use DiagonalNoise or ConstantNoise."
             )
+        observed = told(self.reading_space, observed)
         if reading.ndim > len(batch_size) + 1:
-            reading = mean_reading(self.reading_space, reading)
+            reading = mean_reading(self.reading_space, reading, observed)
         reading = reading.unsqueeze(-2)
         if self.reading_space is not None:  # from each particle by itself: they may lie all around
             mask = None if observed is None else observed.unsqueeze(-2)
@@ -96,9 +98,8 @@ class GaussianLikelihood(Update):
             reading, variance = torch.where(observed, reading, 0.0), torch.where(observed, variance, 1.0)
         residual = reading - predicted
         terms = -0.5 * (residual.square() / variance + variance.log() + math.log(2 * math.pi))
-        if observed is not None:
-            terms = torch.where(observed, terms, 0.0)
-        return terms.sum(-1)
+        shown = variance != torch.inf if observed is None else observed & (variance != torch.inf)
+        return torch.where(shown, terms, 0.0).sum(-1)
 
 
 class LearnedLikelihood(Update):
@@ -208,7 +209,7 @@ class LearnedLikelihood(Update):
         if readings:
             (reading,) = readings
             if reading.ndim > len(batch_size) + 1:
-                reading = mean_reading(self.reading_space, reading)
+                reading = mean_reading(self.reading_space, reading, observed)
             reading, space = reading.unsqueeze(-2), self.reading_space
             seen = (reading - predicted if space is None else space.minus(reading, predicted)) / self.scale
         else:

@@ -12,7 +12,7 @@ from torch import nn
 
 from torch_denkf._checks import check_choice
 from torch_denkf.functional.draws import exact_draws
-from torch_denkf.functional.linalg import semidefinite_root
+from torch_denkf.functional.linalg import as_covariance, semidefinite_root
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules.noise import ConstantNoise
@@ -159,7 +159,7 @@ class NoisyTransition(Transition):
         if covariance.ndim == len(call.batch_size) + 1:
             noise = covariance.sqrt().unsqueeze(-2) * normal
         else:
-            noise = normal @ semidefinite_root(covariance).mT
+            noise = normal @ semidefinite_root(as_covariance(covariance, covariance[..., 0])).mT
         if self.space is not None:
             if self.dims is not None:
                 noise = noise.new_zeros(*noise.shape[:-1], whole).index_add(-1, self.dims, noise)

@@ -36,6 +36,10 @@ from torch_denkf.functional.kernels.random_bits import (
 __all__ = ["FlipoutLinear", "StochasticMLP", "deterministic"]
 
 
+#: Replaces linear layers, where the steps of a sequence share their gradients.
+LAYERS: list[Callable] = []
+
+
 class FlipoutLinear(nn.Module):
     r"""A linear layer with Gaussian weights, sampled by flipout.
 
@@ -121,7 +125,7 @@ class StochasticMLP(nn.Module):
         output_gain: factor on the last layer's initial weights; a small one starts a residual model near the
             identity, zero starts it there.
         balanced: whether each unit is dropped in the same share of an ensemble's members, drawn without replacement
-            (``"dropout"``); its mean is then nearer to that of infinitely many members. ``False`` for independent draws.
+            (``"dropout"``); their mean is then nearer to that of infinitely many. ``False`` for independent draws.
 
     Shapes:
         input ``[*, in_features]``, output ``[*, out_features]``. Noise: for dropout, uint8 random bytes
@@ -243,6 +247,8 @@ class StochasticMLP(nn.Module):
             run = list(zip(self.layers, (*factors, None), strict=True))
         else:
             run = list(zip(self.layers, repeat(None)))
+        if LAYERS and not torch.compiler.is_compiling():
+            run = [(LAYERS[0](layer), factor) for layer, factor in run]
         hidden, recorded = x, torch.is_grad_enabled()
         for layer, factor in run[:-1]:
             hidden = layer(hidden)

@@ -12,7 +12,7 @@ from torch_denkf.functional.manifolds import is_flat
 from torch_denkf.functional.unscented import (
     UnscentedWeights,
     sigma_points,
-    unscented_cross,
+    unscented_anomalies,
     unscented_moments,
     unscented_update,
     unscented_weights,
@@ -88,14 +88,14 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
         if self.space is None:
             points, weights = self._points(mean, cov)
             moved = self._move(entries, points, call)
-            cross = unscented_cross(points, moved, weights) if wanted else None
-            return *unscented_moments(moved, weights), cross
+            link = unscented_anomalies(points, moved, weights) if wanted else None
+            return *unscented_moments(moved, weights), link
         points, weights = self._points(torch.zeros_like(cov[..., 0]), cov)
         moved = self._move(entries, self.space.plus(mean.unsqueeze(-2), points), call)
         center = self.space.mean(moved, weights.mean)
         tangents = self.space.minus(moved, center.unsqueeze(-2))
-        cross = unscented_cross(points, tangents, weights) if wanted else None
-        return center, unscented_moments(tangents, weights)[1], cross
+        link = unscented_anomalies(points, tangents, weights) if wanted else None
+        return center, unscented_moments(tangents, weights)[1], link
 
 
 class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
@@ -150,7 +150,8 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
         predicted, observed = self._observe(entries, around, call)
         if on is not None and on.flat is None:
             expected = on.mean(predicted, weights.mean)
-            predicted, on = on.minus(predicted, expected.unsqueeze(-2)), None
             observation = self._innovation(observation, expected, observed)
+            mask = None if observed is None else observed.unsqueeze(-2)
+            predicted, on = on.innovation(predicted, expected.unsqueeze(-2), mask), None
         update = unscented_update(points, predicted, observation, noise, weights, observed=observed, space=on)
         return self._moved(mean, update), observed

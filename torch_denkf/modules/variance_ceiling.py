@@ -9,6 +9,7 @@ from torch import nn
 
 from torch_denkf._checks import check_number, flag_value
 from torch_denkf.beliefs import Belief
+from torch_denkf.functional.kernels.small_system import on_gpu
 from torch_denkf.submodel import SubModel
 
 __all__ = ["VarianceCeiling"]
@@ -60,7 +61,7 @@ class VarianceCeiling(SubModel):
         for key, kind in self.kinds:
             variance = entries.get(key)
             # Whether anything is to be clamped is not looked at where that would wait for a device.
-            above = None if variance is None or variance.is_cuda else flag_value((variance > self.ceiling).any())
+            above = None if variance is None or on_gpu(variance) else flag_value((variance > self.ceiling).any())
             if variance is None or above is False:
                 continue
             if above:

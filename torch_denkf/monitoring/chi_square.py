@@ -28,7 +28,8 @@ def chi_square_p_value(value: Tensor, freedom: float | Tensor) -> Tensor:
         >>> chi_square_p_value(torch.tensor([3.8415, 0.0]), 1.0).round(decimals=4)
         tensor([0.0500, 1.0000])
     """
-    freedom = torch.as_tensor(freedom, dtype=value.dtype, device=value.device).detach()  # torch has no derivative by it
+    freedom = freedom if isinstance(freedom, Tensor) else value.new_full((), freedom)
+    freedom = freedom.to(value).detach()  # torch has no derivative by it
     seen = freedom > 0
     # Replaced before the function is called, so that neither its value nor its gradient is NaN there.
     tail = torch.special.gammaincc(torch.where(seen, freedom, 1) / 2, torch.where(seen, value, 1).clamp_min(1e-30) / 2)

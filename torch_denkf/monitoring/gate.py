@@ -11,6 +11,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
+from torch_denkf.imperfect import Visible
 from torch_denkf.modules.around import Around
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.monitoring._calibration import IDENTITY, check_observation_dim, chi_square_table, empirical_quantile
@@ -38,8 +39,9 @@ class GateOptions(TypedDict, total=False):
         rate: probability that the sum of a sound sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
             acts.
         freedom: of Student's t; 4 by default.
-        patience: after so many rejected steps in a row the gate opens: the forecast, and the past states that are
-            carried beside it, are spread until they reach the reading, and the window is emptied. 50 by default.
+        patience: after so many steps in a row at which a reading was not believed the gate opens: the forecast, and the
+            past states that are carried next to it, are spread until they reach the reading, and the window is emptied.
+            Set more than the longest fault has readings; 50 by default.
         by_component: whether each component of the reading is judged by itself; for ensembles alone, False by default.
         adapt_noise: rate at which the reading's variances are adapted to its innovations, about the inverse of the
             steps that are remembered; 0 by default, for none.
@@ -62,6 +64,8 @@ class GateOptions(TypedDict, total=False):
 
 def can_be_gated(analysis: nn.Module) -> TypeGuard[Update]:
     """Whether a module is an analysis that says where its forecast, its reading and its diagnostics are."""
+    if isinstance(analysis, Visible):
+        return analysis.kind != "particles" and can_be_gated(analysis.module)
     wrapped = isinstance(analysis, Around) and not analysis.updates_ensemble
     if not isinstance(analysis, Update) or analysis.observed_key is None or wrapped:
         return False
@@ -84,7 +88,7 @@ class GatedAnalysis(Around):
     ========================= ============ ============================================================================
     (key, ``terms``)          ``[W,K,2]``  normalised innovations squared of the last observed steps, the latest first,
                                            and their degrees of freedom
-    (key, ``shut``)           ``[K]``      rejected steps in a row
+    (key, ``shut``)           ``[K]``      steps in a row at which a reading was not believed
     (key, ``log_noise``)      ``[K]``      logarithm of the adapted factor on the variances
     (key, ``log_inflation``)  ``[1]``      logarithm of the adapted factor on the forecast's variances
     (key, ``factor``)         ``[K]``      factor on the variances by which the gate answered; infinite where rejected
@@ -100,8 +104,10 @@ class GatedAnalysis(Around):
 
     Args:
         analysis: :class:`EnsembleAnalysis`, :class:`LocalEnsembleAnalysis`, :class:`KalmanAnalysis`,
-            :class:`EKFAnalysis` or :class:`UKFAnalysis`; or a :class:`LaggedAnalysis`, whose past a reading then
-            corrects as far as it is believed. Its keys and its noise are kept.
+            :class:`EKFAnalysis` or :class:`UKFAnalysis`; :class:`~torch_denkf.imperfect.Visible` of one of these, whose
+            readings the gate does not count while their probability of being about the state is below one half; or a
+            :class:`LaggedAnalysis`, whose past a reading then corrects as far as it is believed. Its keys and its noise
+            are kept.
         observation_dim: O, components of the reading.
         **options: see :class:`GateOptions`.
 
@@ -155,11 +161,12 @@ class GatedAnalysis(Around):
         if not can_be_gated(analysis):
             raise TypeError(
                 f"{type(analysis).__name__} does not say where its variances and its forecast are. A gate goes around "
-                "an EnsembleAnalysis, LocalEnsembleAnalysis, KalmanAnalysis, EKFAnalysis or UKFAnalysis, or one of "
-                "your own: its in_keys begin with two of the forecast and its reading_keys, it names its observed_key, "
-                "and it writes nis and innovation under its info_prefix."
+                "an EnsembleAnalysis, LocalEnsembleAnalysis, KalmanAnalysis, EKFAnalysis or UKFAnalysis, or Visible of "
+                "one of these, or one of your own: its in_keys begin with two of the forecast and its reading_keys, it "
+                "names its observed_key, and it writes nis and innovation under its info_prefix."
             )
-        of_ensemble = analysis.updates_ensemble
+        inside = analysis.module if isinstance(analysis, Visible) else analysis
+        of_ensemble = inside.updates_ensemble
         if by_component and not of_ensemble:
             raise ValueError("by_component is for ensembles: an update of mean and covariance is judged as a whole")
         if response not in ("reject", "student", "huber"):
@@ -172,8 +179,9 @@ class GatedAnalysis(Around):
         check_number("adapt_noise", adapt_noise, least=0, below=1)
         check_number("adapt_inflation", adapt_inflation, least=0, below=1)
         claimed = None
-        if isinstance(analysis, KalmanAnalysis) and analysis.noise is not None:
-            claimed, analysis = analysis.noise, _with_noise_from((gate_prefix, "claimed"), analysis)
+        if isinstance(inside, KalmanAnalysis) and inside.noise is not None:
+            claimed, read = inside.noise, _with_noise_from((gate_prefix, "claimed"), inside)
+            analysis = analysis.around(read) if isinstance(analysis, Visible) else read
         state = [(gate_prefix, name) for name in ("terms", "shut", "log_noise", "log_inflation")]
         further = [(gate_prefix, name) for name in ("factor", "nis", "innovation", "part_nis")]
         in_keys = [key for key in analysis.in_keys if claimed is None or key != analysis.in_keys[3]]
@@ -228,25 +236,29 @@ class GatedAnalysis(Around):
         seen = freedom > 0
         term = torch.stack([calibrated, freedom], -1).unsqueeze(-3)
         terms = torch.where(seen[..., None, :, None], torch.cat([term, terms[..., :-1, :, :]], -3), terms)
+        rejects = self.response == "reject"
         if self.rate:
             evidence, total = terms.sum(-3).unbind(-1)
-            # What was rejected is believed again when it fits well, not when it is just within the limit.
-            limits = torch.where(shut > 0, self.usual[total.long()], self.limits[total.long()] * self.slack)
-            limit = limits.to(dtype)
+            limit = self.limits[total.long()] * self.slack
+            if rejects:  # what was rejected is believed again when it fits well, not when it is just within the limit
+                limit = torch.where(shut > 0, self.usual[total.long()], limit)
+            limit = limit.to(dtype)
             factor = torch.where(seen, disbelief(evidence, limit, self.response, freedom=self.freedom), 1)
-            if self.response == "reject":
-                rejected = factor > 1
-                opens = rejected & (shut >= self.patience)
-                rejected = rejected & ~opens
-                factor = torch.where(opens, 1, factor)
-                terms = torch.where(opens[..., None, :, None], 0, terms)
-                shut = torch.where(rejected, shut + 1, torch.where(seen, 0, shut))
-                reach = torch.where(opens, (calibrated / freedom.clamp_min(1)).clamp_min(1), 1).amax(-1, keepdim=True)
-                seen = seen & ~rejected  # an outlier is no measure of the noise
-                wider = torch.where(seen.any(-1, keepdim=True), inflation * reach, 1)
-                out = self._without(self._with_past(self._wider(plain, wider), reach), call, rejected)
-            else:
-                out = self._analyse(self._noisier(entries, factor), call)
+            doubted = factor > 1
+            opens = doubted & (shut >= self.patience)
+            doubted = doubted & ~opens
+            factor = torch.where(opens, 1, factor)
+            terms = torch.where(opens[..., None, :, None], 0, terms)
+            shut = torch.where(doubted, shut + 1, torch.where(seen, 0, shut))
+            reach = torch.where(opens, (calibrated / freedom.clamp_min(1)).clamp_min(1), 1).amax(-1, keepdim=True)
+            wider = inflation * reach
+            if rejects:
+                seen = seen & ~doubted  # an outlier is no measure of the noise
+                wider = torch.where(seen.any(-1, keepdim=True), wider, 1)
+            spread = self._with_past(self._wider(plain, wider), reach)
+            out = (
+                self._without(spread, call, doubted) if rejects else self._analyse(self._noisier(spread, factor), call)
+            )
         else:
             factor = torch.ones_like(part)
         if self.adapt_noise:
@@ -279,8 +291,11 @@ class GatedAnalysis(Around):
         """Normalised innovations squared ``[*B, K]``, and how many components were observed in each."""
         mask = entries.get(self.observed_key)
         observed = torch.ones_like(innovation) if mask is None else mask.expand(innovation.shape).to(nis.dtype)
+        if isinstance(self.module, Visible):  # what is not about the state says nothing about the sensor
+            visible = entries.get(self.module.visible_key)
+            observed = observed if visible is None else torch.where(visible >= 0.5, observed, 0)
         if not self.by_component:
-            return nis, observed.sum(-1, keepdim=True)
+            return torch.where(observed.any(-1, keepdim=True), nis, 0), observed.sum(-1, keepdim=True)
         predicted, variance = entries[self.module.in_keys[1]], entries[self.noise_variance_key]
         seen = observed > 0  # what is not observed may be NaN
         predicted = predicted.var(-2) if predicted.shape[-2] > 1 else torch.zeros_like(innovation)
@@ -306,9 +321,10 @@ class GatedAnalysis(Around):
 
     def _with_past(self, entries: Entries, factor: Tensor) -> Entries:
         """The entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
-        if not isinstance(self.module, LaggedAnalysis):
+        inside = self.module.module if isinstance(self.module, Visible) else self.module
+        if not isinstance(inside, LaggedAnalysis):
             return entries
-        key = self.module.in_keys[-1]
+        key = inside.in_keys[-1]
         past, space = entries[key], self.module.space
         if space is not None:
             of_times = spread_about_mean(past.movedim(-2, -3), factor.sqrt().unsqueeze(-2), space)

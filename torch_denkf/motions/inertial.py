@@ -206,7 +206,7 @@ def move_inertially(pose: Tensor, rate: Tensor, force: Tensor, dt: float | Tenso
     third = series(square, one_minus_sinc)
     once = bend(angles, force * dt, series(square, half_versine), third)
     twice = bend(angles, 0.5 * force * dt, 2 * third, 2 * series(square, fourth))
-    fall = pose.new_tensor([0.0, 0.0, -gravity]) * dt
+    fall = -gravity * torch.eye(3, dtype=pose.dtype, device=pose.device)[2] * dt
     turned = SO3().compose(orientation, SO3().exp(angles))
     moved = position + (velocity + 0.5 * fall + rotate(orientation, twice)) * dt
     return torch.cat([turned, velocity + fall + rotate(orientation, once), moved], -1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -17,13 +17,16 @@ from torch import Tensor
 
 from torch_denkf._checks import check_mask
 from torch_denkf._registered import diagnosis
+from torch_denkf.beliefs import is_samples
 from torch_denkf.functional.manifolds import Space, is_flat, whole_parts
-from torch_denkf.submodel import Initial, role
+from torch_denkf.running import writes
+from torch_denkf.submodel import Initial, Update, in_role, role
 
 if TYPE_CHECKING:
+    from torch_denkf.filters import Filter
     from torch_denkf.objectives.filter_loss import FilterLoss
 
-__all__ = ["Keys", "Labels", "Truth", "check_row_mask", "mean_of"]
+__all__ = ["Keys", "Labels", "Reading", "Truth", "check_row_mask", "mean_of"]
 
 
 @dataclass
@@ -38,8 +41,9 @@ class Keys:
         target_observation: true observation ``[*B, O]``; where it is missing and the filter's observation model has
             no parameters, it is that model's observation of the true state.
         target_observed: which components of the true observation are known, ``[*B, 1]`` or ``[*B, O]``, bool.
-        observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``.
-        sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``.
+        observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``; by default the one that the sensor's update reads.
+        sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``, or the name of one sensor of several; by
+            default those that the filter's one sensor writes.
         visible: probability that the reading is about the state, ``[*B, 1]``, as a head beside the sensor says.
         target_visible: whether it is, ``[*B, 1]``, bool or 0 and 1; NaN where that is not known.
         visible_observed: where it is known, ``[*B, 1]``, bool; by default its name and ``_observed``.
@@ -49,11 +53,50 @@ class Keys:
     state_observed: NestedKey | None = None
     target_observation: NestedKey = "target_observation"
     target_observed: NestedKey | None = None
-    observed: NestedKey = "observed"
-    sensor: NestedKey = ("sensor", "ensemble")
+    observed: NestedKey | None = None
+    sensor: NestedKey | None = None
     visible: NestedKey = ("sensor", "visible")
     target_visible: NestedKey = "visible"
     visible_observed: NestedKey | None = None
+
+
+class Reading(NamedTuple):
+    """A reading that a loss scores.
+
+    Attributes:
+        samples: its key.
+        observed: its mask.
+        noise: its R.
+        model: module that predicts it, with an ``observe()`` method; ``None`` where there is none.
+    """
+
+    samples: NestedKey = ("sensor", "ensemble")
+    observed: NestedKey = "observed"
+    noise: NestedKey = ("sensor", "noise")
+    model: Any = None
+
+    @classmethod
+    def of(cls, filter: Filter, keys: Keys) -> Reading:
+        """Finds the reading of the sensor that ``keys`` name, or of the only one; no model where there are several."""
+        found: dict[NestedKey, Update] = {}
+        default, observed = cls(), keys.observed
+        for module in filter.update_modules:
+            for part in in_role(module, Update):
+                found.update((key, part) for key in map(unravel_key, part.reading_keys[:1]) if key not in found)
+        names = [key for key in filter.structure.frame_keys if is_samples(key)] or [default.samples]
+        if keys.sensor is not None:
+            name = unravel_key(keys.sensor)
+            names = [key for key in found if key[:-1] == ("sensor", name)] or [name]
+        read = [key for key in names if key in found]
+        parts = [found[key] for key in read] or list(found.values())
+        if len(parts) > 1:
+            return default if observed is None else cls(names[0], observed)
+        part, owners = parts[0] if parts else role(None, Update), filter.update_modules
+        if len(found) > 1:
+            owners = [part, *(module for module in owners if unravel_key(part.predicted_key) in writes(module))]
+        model = next((part for module in owners for part in module.modules() if hasattr(part, "observe")), None)
+        noise = unravel_key((*part.reading_keys[1:], default.noise)[0])
+        return cls((read or names)[0], observed or part.observed_key or default.observed, noise, model)
 
 
 class Labels(NamedTuple):
@@ -181,7 +224,7 @@ class Truth:
 
     def visible(self) -> Labels:
         """Returns whether the sensor sees, ``[*B, 1]``, where that is known and there is a reading."""
-        values, mask = self.entry(self.keys.target_visible, given=True), self.data.get(self.keys.observed, None)
+        values, mask = self.entry(self.keys.target_visible, given=True), self.out.get(self.loss.reading.observed, None)
         values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
         labels = self._labels("visible", values, 1)
         return labels if mask is None else labels._replace(mask=labels.mask & mask.any(-1, keepdim=True))

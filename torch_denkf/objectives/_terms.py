@@ -8,17 +8,15 @@ from __future__ import annotations
 import math
 
 import torch
-from tensordict import NestedKey, unravel_key
-from tensordict.nn import TensorDictModuleBase
+from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf import beliefs
-from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble, crps_gaussian, crps_weighted, energy_score
 from torch_denkf.functional.gaussian import gaussian_log_prob
+from torch_denkf.functional.linalg import as_covariance
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules import StochasticMLP
-from torch_denkf.modules.gaussian import as_covariance
 from torch_denkf.objectives._labels import Labels, Truth, check_row_mask, mean_of
 from torch_denkf.objectives.filter_loss import FilterLoss, Term
 
@@ -116,8 +114,9 @@ class Sensor(Term):
 
     def exists(self, loss: FilterLoss) -> bool:
         """A module writes its samples, or the user has named where they are."""
-        key = unravel_key(loss.tensor_keys.sensor)
-        return key in written_by(loss.filter) or key != loss.default_keys.sensor
+        structure = loss.filter.structure
+        samples = [*filter(beliefs.is_samples, structure.frame_keys)] or ("sensor", "ensemble") in structure.step_keys
+        return loss.tensor_keys.sensor is not None or bool(samples)
 
 
 class Noise(Term):
@@ -128,7 +127,7 @@ class Noise(Term):
 
     def forward(self, out, truth):
         samples, labels = sensor_samples(truth)
-        noise = truth.entry(truth.keys.noise, "R must follow from frames alone. ")
+        noise = truth.entry(truth.keys.noise or truth.loss.reading.noise, "R must follow from frames alone. ")
         error = labels.errors(samples).mean(-2)
         return score_gaussian(error, labels.mask, as_covariance(noise, error), "nll", labels.scale), labels.rows
 
@@ -154,11 +153,12 @@ class Observation(Term):
     of_frames = True
 
     def forward(self, out, truth):
-        model = observation_model(truth.loss.filter)
+        model = truth.loss.reading.model
         if model is None:
             raise KeyError(
                 "loss_observation is of a model with an observe() method, and the filter has no observation model with "
-                "one. Set the weight observation=0."
+                "one, or one for each of several sensors: name one, set_keys(sensor=NAME). Or set the weight "
+                "observation=0."
             )
         state = truth.whole_state()
         observation = model.observe(state.values)
@@ -301,41 +301,31 @@ def sensor_samples(truth: Truth) -> tuple[Tensor, Labels]:
     Raises:
         KeyError: if there are no samples, or no true observation.
     """
-    keys, filter, data = truth.keys, truth.loss.filter, truth.data
-    target, model = data.get(keys.target_observation, None), observation_model(filter)
+    keys, filter, data, reading = truth.keys, truth.loss.filter, truth.data, truth.loss.reading
+    target, model = data.get(keys.target_observation, None), reading.model
     if target is None:
         if model is None or learns(model):
-            why = (
-                "has no observation model with an observe() method" if model is None else "learns its observation model"
-            )
+            several = "has no observation model with an observe() method, or several sensors, of which none is named"
+            why = several if model is None else "learns its observation model"
             raise KeyError(
                 f"loss_sensor needs the true observation in {keys.target_observation!r}, because the filter {why}. Add "
-                "the entry, rename it with set_keys(target_observation=...), or set the weight sensor=0.0."
+                "the entry, or rename it with set_keys(target_observation=...); name a sensor, set_keys(sensor=...); "
+                "or set the weight sensor=0.0."
             )
         target = truth.observed_state(model.observe)
-    cure = "" if keys.sensor in written_by(filter) else "No module of the filter writes it: set the weight sensor=0.0. "
-    samples = truth.entry(keys.sensor, cure)
+    written = [key for key in (*filter.structure.frame_keys, *filter.structure.step_keys) if beliefs.is_samples(key)]
+    cure = f"The filter writes the samples {written}: name one of several sensors, or set the weight sensor=0.0. "
+    samples = truth.entry(reading.samples, "" if reading.samples in written else cure)
     if samples.ndim == data.ndim + 1:
         samples = samples.unsqueeze(-2)
     labels = truth.observation(target, samples.shape[-1])
-    observed = data.get(keys.observed, None)
+    observed = truth.out.get(reading.observed, None)
     if observed is not None:
-        check_row_mask(keys.observed, observed, labels.values)
+        check_row_mask(reading.observed, observed, labels.values)
         labels = labels._replace(mask=labels.mask & observed.all(-1, keepdim=True))
     return samples, labels
-
-
-def observation_model(filter: Filter) -> TensorDictModuleBase | None:
-    """The filter's model of what it observes in a state, which may be a part of its analysis."""
-    parts = (part for module in filter.update_modules for part in module.modules())
-    return next((part for part in parts if hasattr(part, "observe")), None)
 
 
 def learns(model: nn.Module) -> bool:
     """Tells whether a model has parameters."""
     return any(True for _ in model.parameters())
-
-
-def written_by(filter: Filter) -> list[NestedKey]:
-    """Lists what a filter writes, by the names of its modules, without a prefix."""
-    return [*filter.structure.frame_keys, *filter.structure.step_keys]

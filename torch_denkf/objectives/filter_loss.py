@@ -18,7 +18,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.tensors import as_floating, check_dims
-from torch_denkf.objectives._labels import Keys, Truth
+from torch_denkf.objectives._labels import Keys, Reading, Truth
 
 __all__ = ["FilterLoss", "ReadingsOptions", "Scale", "SequenceKeys", "SequenceOptions", "StateOptions", "Term"]
 
@@ -236,6 +236,11 @@ class FilterLoss(Checked, LossModule):
         self.terms = nn.ModuleList(_checked_terms(terms))
         self._choose_terms()
 
+    def register_buffer(self, name: str, tensor: Tensor | None, persistent: bool = True) -> None:
+        """Keeps a constant, on the filter's device."""
+        like = self.filter.like()
+        super().register_buffer(name, tensor if tensor is None or like is None else tensor.to(like.device), persistent)
+
     def _check_entries(self, name: str, value: Tensor) -> None:
         """Raises a ``ValueError`` unless a value has one entry for each of ``dims``, where these are given."""
         if self.dims is not None and value.numel() != len(self.dims):
@@ -267,6 +272,7 @@ class FilterLoss(Checked, LossModule):
         self._choose_terms()
 
     def _choose_terms(self) -> None:
+        self.reading = Reading.of(self.filter, self.tensor_keys)
         given = {term.name: float(term.exists(self)) if term.weight is None else term.weight for term in self.terms}
         self.weights = {name: weight for name, weight in given.items() if weight}
         self.out_keys = [f"loss_{name}" for name in self.weights]

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
 
 from torch_denkf._arguments import check_key
-from torch_denkf._checks import check_count, check_values
+from torch_denkf._checks import check_count, check_values, flag_value
 from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record
 from torch_denkf.filters.structure import previous_key
@@ -62,8 +62,7 @@ class ObservationLoss(FilterLoss):
         super().__init__(filter, [_terms.Observation()], score="mse", **options)
 
     def _trained(self):
-        model = _terms.observation_model(self.filter)
-        return [] if model is None else [model]
+        return [] if self.reading.model is None else [self.reading.model]
 
     def _needed(self):
         return [self.tensor_keys.state, self.tensor_keys.target_observation]
@@ -124,12 +123,13 @@ class SensorLoss(FilterLoss):
             target_observation: true observation ``[*B, O]``; where it is missing and the filter's observation model has
                 no parameters, it is that model's observation of the true state.
             target_observed: where it is known, ``[*B, 1]`` or ``[*B, O]``.
-            observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``.
-            sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``.
-            noise: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
+            observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``; by default that of the sensor's update.
+            sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``, or the name of one sensor of several;
+                by default those that the filter's one sensor writes.
+            noise: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``; by default that of the sensor's update.
         """
 
-        noise: NestedKey = ("sensor", "noise")
+        noise: NestedKey | None = None
 
     default_keys = _AcceptedKeys
     SCORES = _terms.MEMBER_SCORES
@@ -152,11 +152,10 @@ class SensorLoss(FilterLoss):
 
     def _placed(self):
         """The modules that read frames alone and lead to what is scored: the sensor; R and a head where they are."""
-        keys = self.tensor_keys
-        wanted = {unravel_key(keys.sensor)}
-        wanted |= {unravel_key(keys.noise)} if "noise" in self.weights else set()
+        keys, reading, placed = self.tensor_keys, self.reading, []
+        wanted = {reading.samples, reading.observed}
+        wanted |= {unravel_key(keys.noise or reading.noise)} if "noise" in self.weights else set()
         wanted |= {unravel_key(keys.visible)} if "visible" in self.weights else set()
-        placed = []
         for place, module in reversed(self.filter.structure.frames):
             if not wanted.isdisjoint(map(unravel_key, module.out_keys)):
                 placed.append((place, module))
@@ -165,7 +164,7 @@ class SensorLoss(FilterLoss):
 
     def _needed(self):
         """Lists the inputs of the modules, and the true observation, or the state that it follows from."""
-        model, keys = _terms.observation_model(self.filter), self.tensor_keys
+        keys, model = self.tensor_keys, self.reading.model
         unknown = model is None or _terms.learns(model)
         needed = list(reads_of(self._trained())[0])
         if {"sensor", "noise"} & set(self.weights):
@@ -370,7 +369,7 @@ def _belief_at(truth: Tensor, belief: str, spread: Tensor, members: int | None, 
     if members is None:
         return {(belief, "mean"): truth, (belief, "cov"): std.square().diag_embed()}
     ensemble = truth.unsqueeze(-2).expand(*truth.shape[:-1], members, truth.shape[-1])
-    if spread.any():
+    if flag_value(spread.any()) is not False:
         away = std.unsqueeze(-2) * torch.randn_like(ensemble[..., :1].expand(*ensemble.shape[:-1], size))
         ensemble = ensemble + away if space is None else space.plus(ensemble, away)
     return {

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
+from torch_denkf.deployment.files import name_for_c
+
 _GIF_HEAD = b"GIF89a"
 _GIF_FOREVER = b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"
 
@@ -50,7 +52,7 @@ def write_mp4(file: Path, frames: Iterable[np.ndarray], fps: float) -> None:
             height, width = frame.shape[:2]
             frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             if writer is None:
-                writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), fps, frame.shape[1::-1])
+                writer = cv2.VideoWriter(name_for_c(file), cv2.VideoWriter.fourcc(*"mp4v"), fps, frame.shape[1::-1])
                 if not writer.isOpened():
                     raise OSError(f"OpenCV cannot write {file}; pass a .gif, or look at the folder's permissions")
             writer.write(np.ascontiguousarray(frame[..., ::-1]))

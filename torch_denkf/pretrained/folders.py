@@ -10,7 +10,7 @@ from typing import Any
 
 from torch_denkf import _registered
 from torch_denkf.deployment.files import write_text
-from torch_denkf.deployment.folder import load_folder, save_folder
+from torch_denkf.deployment.folder import load_folder, read_folder_config, save_folder
 from torch_denkf.filters import Filter
 
 __all__ = ["available", "from_pretrained", "save_pretrained"]
@@ -41,7 +41,8 @@ def from_pretrained(
             folder holds the function's name and not its code.
 
     Returns:
-        The filter, on the CPU, in evaluation mode; ``filter.settings`` are its numbers.
+        The filter, on the CPU, in evaluation mode; ``filter.settings`` are its numbers: a dataclass of its own, or the
+        arguments of its builder by name.
 
     Raises:
         FileNotFoundError: if there is no filter of that name and no such folder, or the weights are missing.
@@ -63,7 +64,12 @@ def from_pretrained(
             f"there is no trained filter {str(name_or_folder)!r} and no such folder; the library comes with "
             f"{', '.join(shipped)}"
         )
-    return load_folder(folder, {**_registered.builders(), **(builders or {})})  # type: ignore[return-value]
+    known = {**_registered.builders(), **(builders or {})}
+    model = load_folder(folder, known)
+    if not hasattr(model, "settings"):
+        config = read_folder_config(folder, known)
+        model.builder, model.settings = config["builder"], config["settings"]
+    return model  # type: ignore[return-value]
 
 
 def save_pretrained(
@@ -113,8 +119,12 @@ def save_pretrained(
     """
     known = _registered.builders()
     own = getattr(model, "settings", None)
-    if builder is None and settings is None and is_dataclass(own) and not isinstance(own, type):
-        builder, settings = known.get(getattr(model, "builder", "")), asdict(own)
+    if builder is None and settings is None:
+        builder = known.get(getattr(model, "builder", ""))
+        if is_dataclass(own) and not isinstance(own, type):
+            settings = asdict(own)
+        elif isinstance(own, Mapping):
+            settings = own
     if builder is None or settings is None:
         raise ValueError(
             f"it is not known what builds this {type(model).__name__}; pass builder=FUNCTION and settings={{...}}, a "

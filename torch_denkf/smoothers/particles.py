@@ -10,12 +10,11 @@ from torch import Tensor
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters.structure import previous_key
-from torch_denkf.functional.linalg import cholesky
+from torch_denkf.functional.linalg import as_covariance, cholesky
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing.particles import backward_smooth
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules import NoisyTransition
-from torch_denkf.modules.gaussian import as_covariance
 from torch_denkf.modules.particles import ResampledTransition
 from torch_denkf.running import run_module
 from torch_denkf.smoothers.base import Smoother

@@ -11,11 +11,12 @@ Of points of a space, V and D are of the tangents at the means: each time a mean
 from __future__ import annotations
 
 import torch
-from tensordict import NestedKey, unravel_key
+from tensordict import NestedKey
 from torch import nn
 
+from torch_denkf.functional.linalg import divide
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.functional.smoothing.rts import smoothing_gain
+from torch_denkf.functional.smoothing.rts import left_open, smoothing_gain
 from torch_denkf.modules.around import Wrapper
 from torch_denkf.modules.gaussian import GaussianTransition
 from torch_denkf.modules.kalman import LinearTransition
@@ -32,6 +33,8 @@ class CrossTransition(Wrapper, Transition):
         transition: :class:`LinearTransition`, :class:`EKFTransition` or :class:`UKFTransition`; its keys and its noise
             are kept.
         cross_key: the covariance, ``[*B, S, S]``, rows before the step.
+        open_key: the covariance of the state before the step where that after it is known, ``[*B, S, S]``; ``None`` not
+            to write it.
 
     Raises:
         TypeError: for another transition.
@@ -46,25 +49,31 @@ class CrossTransition(Wrapper, Transition):
     def __init__(
         self,
         transition: LinearTransition | GaussianTransition,
-        *,
         cross_key: NestedKey = ("forecast", "cross"),
+        open_key: NestedKey | None = None,
     ):
         if not isinstance(transition, LinearTransition | GaussianTransition):
             raise TypeError(
                 f"{type(transition).__name__} does not give the covariance of the states before and after a step; "
                 "LinearTransition, EKFTransition and UKFTransition do."
             )
-        super().__init__(transition, out_keys=[*transition.out_keys, cross_key])
+        keys = [cross_key] if open_key is None else [cross_key, open_key]
+        super().__init__(transition, out_keys=[*transition.out_keys, *keys])
 
     def on_entries(self, entries, call):
         """The forecast and the cross-covariance."""
-        written, cross = self.module.with_cross(entries, call)
-        return {**written, unravel_key(self.out_keys[-1]): cross}
+        written, link = self.module.with_link(entries, call)
+        before, middle, after = link[:3]
+        cross = before @ middle @ after.mT
+        made = [cross]
+        if len(self.out_keys) > 3:
+            made.append(left_open(smoothing_gain(cross, written[self.module.out_keys[1]]), *link))
+        return {**written, **dict(zip(self.out_keys[2:], made, strict=True))}
 
     def without_step(self, entries):
-        """Returns the cross-covariance at a reset, zero: there is no state before."""
+        """Returns the covariances at a reset, zero: there is no state before."""
         cov = self.required(entries, self.in_keys[1])
-        return {unravel_key(self.out_keys[-1]): torch.zeros_like(cov)}
+        return {key: torch.zeros_like(cov) for key in self.out_keys[2:]}
 
 
 def _copies(prefix: str, lag: int, belief: Entries) -> list[torch.Tensor]:
@@ -94,8 +103,8 @@ class MomentsPast(SubModel):
     """The past moves on by one step: gains and what they leave open, through the transition that has just been made.
 
     Args:
-        belief_prefix: prefix of ``mean``, ``cov`` and of the past, see ``MOMENTS_PAST``.
-        forecast_prefix: prefix of ``cov`` and ``cross`` of the forecast, see :class:`CrossTransition`.
+        belief_prefix: prefix of ``mean`` and of the past, see ``MOMENTS_PAST``.
+        forecast_prefix: prefix of ``cov``, ``cross`` and ``open`` of the forecast, see :class:`CrossTransition`.
         smoothed_prefix: prefix of ``age``.
         out_key: prefix of ``mean``, ``cov`` and ``gain`` of the past at the new time, before its reading.
     """
@@ -110,25 +119,22 @@ class MomentsPast(SubModel):
     ):
         in_keys = [
             (belief_prefix, "mean"),
-            (belief_prefix, "cov"),
-            (forecast_prefix, "cov"),
-            (forecast_prefix, "cross"),
+            *((forecast_prefix, name) for name in ("cov", "cross", "open")),
         ]
         in_keys += [*((belief_prefix, name) for name in MOMENTS_PAST.carried), (smoothed_prefix, "age")]
         super().__init__(nn.Identity(), in_keys, [(out_key, name) for name in ("mean", "cov", "gain")])
 
-    def compute(self, mean, cov, forecast_cov, cross, past_mean, past_cov, past_gain, age):
+    def compute(self, mean, cov, cross, open_cov, past_mean, past_cov, past_gain, age):
         """The past."""
         check_age(age, mean.shape[:-1])
         # At the start of an episode, before its own frame, no step has been made.
         start = (age < 0).unsqueeze(-1)
         identity = torch.eye(cov.shape[-1], dtype=mean.dtype, device=mean.device)
-        gain = torch.where(start, identity, smoothing_gain(cross, torch.where(start, identity, forecast_cov)))
-        left_open = torch.where(start, 0, cov - gain @ torch.where(start, 0, cross.mT))
+        gain = torch.where(start, identity, smoothing_gain(cross, torch.where(start, identity, cov)))
         means = torch.cat([mean.unsqueeze(-2), past_mean[..., :-1, :]], -2)
         gains = torch.cat([identity.expand(cov.shape).unsqueeze(-3), past_gain[..., :-1, :, :]], -3)
         opens = torch.cat([torch.zeros_like(cov).unsqueeze(-3), past_cov[..., :-1, :, :]], -3)
-        opens = opens + gains @ left_open.unsqueeze(-3) @ gains.mT
+        opens = opens + gains @ torch.where(start, 0, open_cov).unsqueeze(-3) @ gains.mT
         return means, (opens + opens.mT) / 2, gains @ gain.unsqueeze(-3)
 
 
@@ -169,6 +175,6 @@ class LaggedMoments(SubModel):
         else:
             past_mean, turn = self.space.plus(past_mean, shift), self.space.right_jacobian(shift)
             past_cov = turn @ past_cov @ turn.mT
-            past_gain = turn @ past_gain @ torch.linalg.inv(self.space.right_jacobian(learned)).unsqueeze(-3)
+            past_gain = divide(turn @ past_gain, self.space.right_jacobian(learned).unsqueeze(-3))
         age = (age + 1).clamp(max=past_mean.shape[-2])
         return past_mean, past_cov, past_gain, *_oldest(cov, past_mean, past_cov, past_gain), age

@@ -51,13 +51,13 @@ class RTSSmoother(Smoother):
             )
         self.place = filter.structure.transition[0]
         forecast = filter.structure.forecast_of[prefix, "mean"][0]
-        self.cross_key = (forecast, "cross")
+        self.link_keys = {"cross_key": (forecast, "cross"), "open_key": (forecast, "open")}
         CrossTransition(filter.transition_module)  # refuses what gives no cross-covariance
-        keys = [(prefix, "mean"), (prefix, "cov"), *((forecast, name) for name in ("mean", "cov", "cross"))]
+        keys = [(prefix, "mean"), (prefix, "cov"), *((forecast, name) for name in ("mean", "cov", "cross", "open"))]
         super().__init__(filter, lag, keys, ("mean", "cov", "var"))
 
     def _extended(self, lag):
-        own = CrossTransition(self.filter.transition_module, cross_key=self.cross_key)
+        own = CrossTransition(self.filter.transition_module, **self.link_keys)
         return rebuilt(self.filter, {self.place: own})
 
     def _smooth(self, entries, follows, out):

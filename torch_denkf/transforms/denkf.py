@@ -60,8 +60,9 @@ class DEnKFTransform(Checked, Transform):
             collectors leave out of their data. Only outside a ``SerialEnv`` or ``ParallelEnv``.
         no_grad: whether environment steps record no graph (training recomputes the sequence). A graph through a
             rollout grows with every step, so this is on by default.
-        check_finite: whether a belief that is not finite raises; costs a synchronisation a step. Where an environment
-            emits readings that are not finite, put ``torch_denkf.imperfect.RejectReadings`` in front.
+        check_finite: whether a belief that is not finite raises; on a GPU, which a step would wait for, none does.
+            Where an environment emits readings that are not finite, put ``torch_denkf.imperfect.RejectReadings`` in
+            front.
         packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step` (native code:
             load only what you would execute). At B=1 it is ten times as fast as the filter itself. It has the
             parameters of its export, is for environments of the batch size of the export, and not for use inside a
@@ -184,7 +185,11 @@ class DEnKFTransform(Checked, Transform):
                 for key in lacking:
                     start.set(self.filter.outer(key), torch.zeros_like(template[key]))
         given = {key: tensordict.get(key, None) for key in self.filter.carry_keys} if tensordict is not None else {}
-        if given and all(value is not None for value in given.values()):
+        lacking = [key for key, value in given.items() if value is None]
+        if lacking and len(lacking) < len(given) and not self._dropped_keys:
+            cure = "env.reset() takes a whole belief, or nothing of it."
+            raise diagnosis().missing_entry(type(self).__name__, lacking, tensordict.keys(True, True), cure)
+        if given and not lacking:
             mask = self._reset_mask(tensordict)
             for key, value in given.items():
                 start.set(key, value.clone() if mask is None else where_rows(mask, start.get(key), value))
@@ -257,10 +262,12 @@ class DEnKFTransform(Checked, Transform):
         """Adds the belief and the diagnostics.
 
         Raises:
-            ValueError: if the environment emits an entry of such a name already, or resets groups of agents alone.
+            ValueError: if the environment emits an entry of such a name already, or resets groups of agents alone; or
+                if a transform behind this one writes over the belief that the filter goes on with.
         """
         keys = [key for key in self._keep if key not in self._dropped_keys]
         refuse_resets_of_groups(self.parent.reset_keys, self.out_keys)
+        diagnosis().check_behind(self, [self._names[key] for key in self.filter.structure.carry])
         taken = [name for name in self.out_keys if name in observation_spec.keys(True, True)]
         if taken:
             raise ValueError(

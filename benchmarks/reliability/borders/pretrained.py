@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import struct
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -22,6 +23,7 @@ from benchmarks.reliability.target import Folder, Subject, Target, targets_of
 from torch_denkf import _registered
 from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
 from torch_denkf.applications.reacher import reacher
+from torch_denkf.deployment.folder import described
 from torch_denkf.pretrained import from_pretrained, save_pretrained
 
 CONFIG, WEIGHTS = "config.json", "weights.safetensors"
@@ -34,6 +36,18 @@ def _weights(name: str, folder: Path) -> Any:
     return dict(LOADERS[name](folder).state_dict())
 
 
+def in_config(change: d.Change) -> d.Change:
+    """Changes the description, and its checksum, as somebody with bad intentions would."""
+
+    def act(file: Path) -> None:
+        in_json(change)(file)
+        content = json.loads(file.read_text())
+        if isinstance(content, dict):
+            file.write_text(described(content))
+
+    return act
+
+
 def signed(change: d.Change) -> d.Change:
     """Changes the file of weights, and its checksum, as somebody with bad intentions would."""
 
@@ -41,7 +55,7 @@ def signed(change: d.Change) -> d.Change:
         change(file)
         if file.is_file():
             digest = hashlib.sha256(file.read_bytes()).hexdigest()
-            in_json(lambda content: content.update(sha256=digest))(file.with_name(CONFIG))
+            in_config(lambda content: content.update(sha256=digest))(file.with_name(CONFIG))
 
     return act
 
@@ -134,9 +148,9 @@ def _folders(name: str) -> Iterator[Target]:
     for file, wrong in ((CONFIG, d.BYTES), (WEIGHTS, d.SEALED)):
         yield folder.target(f"{name}, {file}", wrong.each(d.written), right, file=file)
         yield folder.target(f"{name}, {file} in its place", d.PLACES, file=file, within=4)
-    yield folder.target(f"{name}, fields", fields(FIELDS).each(in_json), file=CONFIG)
+    yield folder.target(f"{name}, fields", fields(FIELDS).each(in_config), file=CONFIG)
     for setting, values in SETTINGS[name].items():
-        wrong = fields({("settings", setting): values}, missing=False).each(in_json)
+        wrong = fields({("settings", setting): values}, missing=False).each(in_config)
         yield folder.target(f"{name}, {setting}", wrong, words=(CONFIG, setting), file=CONFIG)
     yield folder.target(f"{name}, weights", DAMAGE.each(in_weights), file=WEIGHTS)
     half = in_weights(in_first(torch.Tensor.half))

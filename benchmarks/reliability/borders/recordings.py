@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Callable, Iterator
 from functools import cache, partial
 from pathlib import Path
@@ -152,9 +154,22 @@ IMAGES = {
     "a name that is nan": _renamed("nan.png"),
     "a name that is inf": _renamed("inf.png"),
     "a time twice": lambda file: file.with_name("0.50.png").write_bytes(file.read_bytes()),
+    "a frame twice": lambda file: file.with_suffix(".jpg").write_bytes(file.read_bytes()),
+    "a pipe": lambda file: os.mkfifo(file.with_name("0.55.png")),
+    "a link to nowhere": lambda file: file.with_name("0.55.png").symlink_to("nowhere"),
     "no folder": lambda file: gone(file.parent),
     "no images": lambda file: [gone(one) for one in file.parent.iterdir()],
 }
+
+
+NAMES = {"in Latin-1": b"caf\xe9.mkv", "a byte": b"\xff.mkv", "a surrogate": b"\xed\xa0\x80.mkv"}
+
+
+def _named(name: bytes, folder: Path) -> Any:
+    """Reads a video of this name; a crash of OpenCV ends the process."""
+    file = folder / os.fsdecode(name)
+    shutil.copy(sound() / "run.mkv", file)
+    return Video(file).read(SIZE, None, False)
 
 
 def _pictures() -> Iterator[Target]:
@@ -166,7 +181,8 @@ def _pictures() -> Iterator[Target]:
     yield OWN.target("video", cut, partial(_shown, camera="video"), ("run.mkv", "stamps.csv"), "run.mkv", video)
     yield OWN.target("video in its place", d.PLACES, None, ("run.mkv", "/dev/zero"), "run.mkv", video)
     yield OWN.target("video's stamps", d.FILE, None, "stamps.csv", "stamps.csv", video, rights=ends)
-    words = ("images", "0.5.png", "half.png", "nan.png", "inf.png", "0.50.png")
+    words = ("images", "0.5.png", "half.png", "nan.png", "inf.png", "0.50.png", "0.5.jpg", "0.55.png")
+    yield Target("recordings", "a video's name", ("name",), _named, d.Wrong(NAMES), needs=sound)
     one = d.SEALED.each(d.written) | d.PLACES
     yield OWN.target("image", one, _shown, words, "images/0.5.png", images)
     yield OWN.target("images", IMAGES, None, words, "images/0.5.png", images)

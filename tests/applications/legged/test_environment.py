@@ -1,5 +1,8 @@
 """Simulated sensors against the true motion, differentiated."""
 
+import re
+from dataclasses import fields
+
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
@@ -146,3 +149,10 @@ def test_a_force_from_outside_acts_until_it_is_taken_off(make):
         assert env.data.xfrc_applied[1].tolist() == [0.0, force, 0.0, 0.0, 0.0, 0.0]
         places.append(td["true", "position"][1])
     assert places[1] - places[0] > 2e-3
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(LeggedErrors)])
+@pytest.mark.parametrize("value", [-0.01, float("nan"), float("inf"), "0.1", None, [0.1], True])
+def test_errors_that_are_none_are_named(name, value):
+    with pytest.raises((ValueError, TypeError), match=rf"\b{name}\b.*{re.escape(repr(value))}"):
+        LeggedErrors(**{name: value})

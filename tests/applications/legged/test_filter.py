@@ -108,3 +108,30 @@ def test_readings_of_another_robot_are_named(key):
 def test_no_time_between_rows_is_refused():
     with pytest.raises(ValueError, match="dt"):
         legged_filter(quadruped_env().model, **QUADRUPED, dt=0.0)
+
+
+@pytest.mark.parametrize("kind", ["EKF", "UKF", "DEnKF"])
+def test_a_run_goes_on_from_what_is_carried(kind):
+    """The velocity of the stored belief follows from it and from what the gyro reads then."""
+    env = quadruped_env(seed=1)
+    log = trotting(env, 12).select("imu", "joints", "joint_rates", "contact").unsqueeze(0)
+    filter = legged_filter(env.model, **QUADRUPED, dt=env.dt, kind=kind, ensemble_size=16)
+    log = filter.draw_noise(log)
+    with torch.no_grad():
+        whole = filter.sequence(log.clone())
+        rest = filter.sequence(log[:, 7:].clone().update(whole[:, 7:].select(*filter.carry_keys)))
+    for key in filter.belief_keys:
+        torch.testing.assert_close(rest[key], whole[key][:, 7:], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
+def test_an_environment_starts_from_a_given_belief(kind):
+    base = quadruped_env(seed=2)
+    filter = legged_filter(base.model, **QUADRUPED, dt=base.dt, kind=kind, ensemble_size=8)
+    env = TransformedEnv(base, DEnKFTransform(filter))
+    given = env.reset().select(*filter.carry_keys)
+    reset = env.reset(given.clone())
+    for key in filter.carry_keys:
+        assert reset[key].equal(given[key])
+    assert reset[VELOCITY].abs().max() < 0.5
+    assert (reset[VAR] > 0).all()

@@ -98,6 +98,26 @@ def test_feet_of_a_rigid_turn_say_one_velocity(model, log):
     assert torch.equal(features[..., 0].bool(), log["contact"][0])
 
 
+def test_feet_in_the_air_do_not_count_in_the_mean(model):
+    """Feet that disagree: the mean is of those that stand, row by row, and zero where none does."""
+    torch.manual_seed(0)
+    contacts, rows, count = contacts_of(model, rows=3), 3, 6
+    imu, joints, rates = (
+        torch.randn(count, rows * 6),
+        0.3 * torch.randn(count, rows * 16),
+        torch.randn(count, rows * 16),
+    )
+    stands = torch.rand(count, rows, 4) < 0.5
+    stands[0, 1] = False
+    features = contacts.features(imu, joints, rates, stands.flatten(-2)).unflatten(-1, (rows, 16))
+    base, mean = features[..., 4:7], features[..., 7:10]  # [count, feet, rows, 3]
+    for row in range(rows):
+        for one in range(count):
+            own = base[one, stands[one, row], row]
+            expected = own.sum(0) / max(len(own), 1)
+            assert_close(mean[one, :, row], expected.expand(4, 3), rtol=0, atol=1e-5)
+
+
 def test_the_newest_row_comes_last_and_the_first_stands_for_those_before(log):
     last = with_last_rows(log, 3)["last", "imu"].unflatten(-1, (3, 6))
     assert torch.equal(last[:, :, 2], log["imu"])

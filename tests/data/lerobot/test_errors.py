@@ -104,7 +104,9 @@ def test_missing_and_unreadable_videos(tmp_path):
     video.write_bytes(whole[: len(whole) // 2])
     fails(ValueError, r"no frame of .*episode_000001.mp4 can be decoded", tmp_path)
     video.unlink()
-    fails(FileNotFoundError, r"no video .*episode_000001.mp4; download .* or pass another camera", tmp_path)
+    fails(
+        FileNotFoundError, r"no .*episode_000001.mp4, which .* pass another camera, or pass episodes=.*: 0$", tmp_path
+    )
     write_video(video, pictures(1, 5, (24, 32)), "mp4v")
     fails(
         ValueError,

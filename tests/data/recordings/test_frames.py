@@ -1,16 +1,21 @@
 """Pictures of videos whose rate varies, of folders with other files, and copies of data sets."""
 
+import os
+import shutil
 import warnings
 from copy import deepcopy
 from fractions import Fraction
+from pathlib import Path
 from pickle import dumps, loads
 
 import numpy as np
 import pytest
 
 from tests.data.recordings.own_files import SIZE, grey, write_csv, write_images, write_video
+from torch_denkf.applications.car.odometry.images import read_frames
 from torch_denkf.data import Images, Recording, RecordingReplay, Table, Video
 from torch_denkf.envs import ReplayEnv
+from torch_denkf.plots._frames import write_mp4
 
 
 def write_varying(av, file, times):
@@ -79,3 +84,48 @@ def test_pictures_behind_a_damaged_one_keep_their_times(tmp_path):
     with pytest.warns(UserWarning, match="1.png cannot be decoded"):
         data = RecordingReplay(Recording(camera=images), size=SIZE, cache=None)
     assert data[:]["time"].squeeze(-1).tolist() == [0, 3, 7]
+
+
+def pipe(file):
+    os.mkfifo(file)
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "match"),
+    [
+        (
+            "0.2.jpg",
+            lambda file: shutil.copy(file.with_name("0.1.png"), file),
+            r"0.2.png and 0.2.jpg are two images of",
+        ),
+        ("0.25.png", pipe, r"0.25.png is no file, but a pipe"),
+        (
+            "0.25.png",
+            lambda file: file.symlink_to("nowhere.png"),
+            r"0.25.png is no file, but a pipe, .* link to nowhere",
+        ),
+        ("0.20.png", lambda file: shutil.copy(file.with_name("0.1.png"), file), r"'time' goes from 0.2 to 0.2 s"),
+    ],
+)
+def test_two_images_of_a_frame_and_what_is_no_file(tmp_path, name, make, match):
+    write_images(tmp_path / "run", [f"{k / 10:.1f}.png" for k in range(5)])
+    make(tmp_path / "run" / name)
+    with pytest.raises(ValueError, match=match):
+        Images(tmp_path / "run").read(SIZE, None, False)
+
+
+def test_names_that_are_no_utf_8(tmp_path):
+    """OpenCV crashes on such a name of a video; pictures are read by Python."""
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/r\xff"))
+    write_images(tmp_path / "run", ["0.0.png", "0.1.png"])
+    (tmp_path / "run").rename(folder)
+    assert len(Images(folder).read(SIZE, tmp_path / "cache", False)) == 2
+    write_video(tmp_path / "run.mkv", 3)
+    file = folder / "run.mkv"
+    shutil.copy(tmp_path / "run.mkv", file)
+    with pytest.raises(ValueError, match=r"r\\xff/run.mkv' is no UTF-8; rename it"):
+        Video(file).read(SIZE, None, False)
+    with pytest.raises(ValueError, match="is no UTF-8"):
+        read_frames(file)
+    with pytest.raises(ValueError, match="is no UTF-8"):
+        write_mp4(folder / "out.mp4", [grey(0)], 10.0)

@@ -25,14 +25,21 @@ def contacts(force: Tensor, on: float, off: float | None = None, *, before: Tens
         ``[*B, T, F]`` bool.
 
     Raises:
-        ValueError: if ``off`` exceeds ``on``.
+        ValueError: if ``off`` exceeds ``on``, or a force is not finite or of another shape.
+        TypeError: if ``before`` is not boolean.
 
     Example:
         >>> contacts(torch.tensor([[10.0], [70.0], [50.0], [20.0], [50.0]]), 60.0, 30.0).flatten()
         tensor([False,  True,  True, False, False])
     """
+    check_number("on", on)
     off = on / 2 if off is None else off
     check_number("off", off, most=on, cure="It is not above the threshold on")
+    if not isinstance(force, Tensor) or force.ndim < 2:
+        raise ValueError(f"force is a tensor [*B, T, F], time before feet; got {force!r}")
+    check_number("force", force)
+    if before is not None and (getattr(before, "dtype", None) != torch.bool or before.shape != force[..., 0, :].shape):
+        raise TypeError(f"before is bool, [*B, F] = {list(force[..., 0, :].shape)}; got {before!r}")
     above, keeps = force > on, force > off
     stands = torch.zeros_like(above[..., 0, :]) if before is None else before
     found = []

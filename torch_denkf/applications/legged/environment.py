@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from xml.etree import ElementTree
 
 import mujoco
@@ -14,8 +14,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torch_denkf._checks import check_number
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.applications.legged.kinematics import LegKinematics
+from torch_denkf.diagnosis import entry_of
 
 __all__ = ["LeggedEnv", "LeggedErrors", "on_floor"]
 
@@ -37,6 +38,9 @@ class LeggedErrors:
         joint_offset: constant, rad.
         joint: white, rad.
         joint_rate: white, rad/s.
+
+    Raises:
+        ValueError: if a number is negative or not finite.
     """
 
     gyro: float = math.radians(0.005)
@@ -48,6 +52,10 @@ class LeggedErrors:
     joint_offset: float = math.radians(0.5)
     joint: float = math.radians(0.05)
     joint_rate: float = 0.02
+
+    def __post_init__(self):
+        for each in fields(self):
+            check_number(each.name, getattr(self, each.name), least=0)
 
 
 class LeggedEnv(EnvBase):
@@ -89,17 +97,22 @@ class LeggedEnv(EnvBase):
         seed: int = 0,
     ):
         super().__init__(batch_size=[])
-        self.errors, self.dt, self.on, self.off = LeggedErrors() if errors is None else errors, dt, on, off
+        self.errors = LeggedErrors() if errors is None else errors
+        if not isinstance(self.errors, LeggedErrors):
+            raise TypeError(f"errors must be LeggedErrors or None; got {errors!r}")
+        kinematics = LegKinematics(model, feet, imu)
+        self.dt, self.on, self.off, self.pushes = dt, on, off, pushes
+        check_number("dt", dt, above=0)
         check_number("pushes", pushes, least=0)
-        self.pushes = pushes
+        check_number("on", on)
+        check_number("off", off, most=on, cure="It is not above the threshold on")
+        check_count("seed", seed, least=0)
         self.model, self.data, self.substeps = model, mujoco.MjData(model), round(dt / model.opt.timestep)
-        check_number("off", off, most=on)
         if abs(self.substeps * model.opt.timestep - dt) > 1e-9:
             raise ValueError(f"dt={dt} is no multiple of the model's time step, {model.opt.timestep} s.")
         if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
             raise ValueError("The base needs a free joint, the first joint of the model.")
         self.base = int(model.jnt_bodyid[0])
-        kinematics = LegKinematics(model, feet, imu)
         self.columns = [int(model.joint(name).qposadr[0]) for name in kinematics.joints]
         self.rows = [int(model.joint(name).dofadr[0]) for name in kinematics.joints]
         self.feet = [int(model.site_bodyid[model.site(f).id]) if _is_site(model, f) else model.body(f).id for f in feet]
@@ -140,7 +153,11 @@ class LeggedEnv(EnvBase):
         return readings
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        self.data.ctrl[:] = tensordict["action"].detach().numpy()
+        action = entry_of(tensordict, "action", type(self).__name__)
+        if action.shape != self.action_spec.shape:
+            raise ValueError(f"'action' is {list(self.action_spec.shape)}; got {list(action.shape)}.")
+        check_number("action", action)
+        self.data.ctrl[:] = action.detach().numpy()
         if self.pushes:
             self._push()
         readings = self._move()

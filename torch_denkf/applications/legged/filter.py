@@ -81,6 +81,7 @@ def legged_filter(
 
     Raises:
         KeyError: if the model lacks a name.
+        TypeError: on noises or contacts of another class.
         ValueError: on an unknown ``kind``, or ``contacts`` without ``rates_key``.
 
     Source:
@@ -89,6 +90,11 @@ def legged_filter(
     """
     if kind not in ("DEnKF", "EKF", "UKF"):
         raise ValueError(f'kind is "DEnKF", "EKF" or "UKF"; got {kind!r}.')
+    for name, value, wanted in (("noises", noises, LeggedNoises), ("contacts", contacts, LearnedContacts)):
+        if value is not None and not isinstance(value, wanted):
+            raise TypeError(f"{name} is of {wanted.__name__}, or None; got {value!r}"[:200])
+    if threshold is not None:
+        check_number("threshold", threshold, above=0)
     if contacts is not None and rates_key is None:
         raise ValueError("LearnedContacts is about the rates of the joints: give rates_key.")
     if isinstance(dt, (int, float)):
@@ -96,7 +102,7 @@ def legged_filter(
     n, kinematics = LeggedNoises() if noises is None else noises, LegKinematics(model, feet, imu, joints=joints)
     count, space = len(kinematics.feet), LeggedSpace(len(kinematics.feet))
     readings = LegReadings(
-        kinematics, imu_key=imu_key, joints_key=joints_key, rates_key=rates_key, contact_key=contact_key
+        kinematics, dt, imu_key=imu_key, joints_key=joints_key, rates_key=rates_key, contact_key=contact_key
     )
     slip_key, moves_key = (None, None) if contacts is None else (SLIP, MOVES)
     motion = LeggedMotion(count, dt, gravity=gravity, imu_key=imu_key, contact_key=contact_key, moves_key=moves_key)
@@ -104,14 +110,16 @@ def legged_filter(
     tangent = [n.tilt] * 3 + [n.velocity] * 3 + [0.0] * 3 + [n.gyro_bias] * 3 + [n.accelerometer_bias] * 3
     around: dict[str, Any] = {"state_key": ("legs", "start"), "space": space}
     std = torch.tensor([*tangent, *[_FAR] * 3 * count])
+    per_reading = n.gyro / dt**0.5 if isinstance(dt, (int, float)) else n.gyro * 10.0
+    velocity = BaseVelocity(kinematics.base, per_reading, ensemble=kind == "DEnKF", imu_key=imu_key)
     analysis = None
     if kind == "DEnKF":
-        initial = StartEnsemble(std, n.velocity, ensemble_size=ensemble_size, **around)
+        initial = StartEnsemble(std, n.velocity, velocity, ensemble_size=ensemble_size, **around)
         more: dict[str, Any] = {} if threshold is None else {"localisation": "significance", "threshold": threshold}
         analysis = partial(EnsembleAnalysis, "etkf", **more)
         transition = NoisyTransition(motion, process, space=process.space)
     else:
-        initial = StartMoments(std, n.velocity, **around)
+        initial = StartMoments(std, n.velocity, velocity, **around)
         transition = {"EKF": EKFTransition, "UKF": UKFTransition}[kind](motion, process, space=space)
     mask: dict[str, Any] = {"observed_key": ("legs", "observed")}
     sensors = {
@@ -124,7 +132,5 @@ def legged_filter(
         rates = FeetRates(space, imu_key=imu_key, moves_key=moves_key)
         sensors["rates"] = FusedSensor(rates, noise, observation_key=("legs", "rates"), **mask)
     fused = FusedFilter(transition, sensors, initial=initial, analysis=analysis)
-    per_reading = n.gyro / dt**0.5 if isinstance(dt, (int, float)) else n.gyro * 10.0
-    velocity = BaseVelocity(kinematics.base, per_reading, ensemble=kind == "DEnKF", imu_key=imu_key)
     modules = OrderedDict(legs=readings, **dict(named_modules_of(fused)), velocity=velocity)
     return Filter(modules, initial=initial, **options)

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import torch
 
+from torch_denkf._checks import check_number
 from torch_denkf.applications.legged.environment import LeggedEnv, LeggedErrors, on_floor
 
 __all__ = ["HUMANOID", "HarnessedEnv", "humanoid_env", "stroll"]
@@ -32,6 +33,8 @@ class HarnessedEnv(LeggedEnv):
     """
 
     def __init__(self, *args, speed: float = 0.5, turn: float = 0.0, **options):
+        check_number("speed", speed)
+        check_number("turn", turn)
         self.speed, self.turn = speed, turn
         super().__init__(*args, **options)
 
@@ -118,6 +121,8 @@ def stroll(time: float, *, pace: float = 1.0, stride: float = 0.2, lift: float =
         stride: amplitude of the hips, in rad. A speed of about ``2.5 * stride * pace`` fits it, in m/s.
         lift: by how much a knee bends that swings, in rad.
     """
+    for name, value in {"time": time, "pace": pace, "stride": stride, "lift": lift}.items():
+        check_number(name, value)
     legs, bent = [], 0.25
     for begin in (math.pi, 0.0):  # right, left
         phase = 2 * math.pi * pace * time + begin

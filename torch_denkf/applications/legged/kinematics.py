@@ -35,6 +35,7 @@ class LegKinematics(nn.Module):
 
     Raises:
         KeyError: if the model has no such site, body or joint, or ``joints`` lacks one that moves a foot.
+        TypeError: if the model is none, or a name is no string.
         ValueError: if a joint moves the sensor on the base, or a foot does not hang on the base.
 
     Example:
@@ -55,8 +56,14 @@ class LegKinematics(nn.Module):
 
     def __init__(self, model: mujoco.MjModel, feet: Sequence[str], imu: str, *, joints: Sequence[str] | None = None):
         super().__init__()
+        if not isinstance(model, mujoco.MjModel):
+            raise TypeError(f"model is a mujoco.MjModel; got {type(model).__name__}.")
+        check_names("feet", feet)
+        check_names("imu", [imu])
+        if joints is not None:
+            check_names("joints", joints)
         self.feet, self.joints = list(feet), _joint_names(model) if joints is None else list(joints)
-        sensor_body, sensor = _frame(model, imu)
+        sensor_body, sensor = _frame(model, "imu", imu)
         root = sensor_body
         while model.body_parentid[root] and not _moving_joints(model, root):
             sensor, root = SE3().compose(_pose(model, root), sensor), model.body_parentid[root]
@@ -82,13 +89,21 @@ class LegKinematics(nn.Module):
 
     def velocities(self, positions: Tensor, rates: Tensor) -> Tensor:
         """Velocities ``[*, F, 3]`` in m/s as seen from the base, by angles and rates ``[*, J]``."""
-        return (self.jacobian(positions) * rates[..., self.column].unsqueeze(-1)).sum(-2)
+        return self.moving(positions, rates)[1]
+
+    def moving(self, positions: Tensor, rates: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns positions and velocities, which take one way along the legs."""
+        end, jacobian = self._with_jacobian(positions)
+        return end, (jacobian * rates[..., self.column].unsqueeze(-1)).sum(-2)
 
     def jacobian(self, positions: Tensor) -> Tensor:
         """Derivatives ``[*, F, K, 3]`` of the positions by the K joints of each foot, zero where it has fewer."""
+        return self._with_jacobian(positions)[1]
+
+    def _with_jacobian(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         end, axes, slides, places = self._along(positions)
         lever = end.unsqueeze(-2) - places
-        return torch.linalg.cross(axes, lever) + slides
+        return end, torch.linalg.cross(axes, lever) + slides
 
     def _along(self, positions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The feet, and of each joint its axis of turn, its direction of slide, and its place."""
@@ -113,7 +128,7 @@ class LegKinematics(nn.Module):
 
     def _chain(self, model, name, root, to_sensor):
         """A fixed pose, then joints: the pose behind each, its axes, its zero and its column."""
-        body, behind = _frame(model, name)
+        body, behind = _frame(model, "feet", name)
         steps: list[tuple] = []
         while body != root:
             if not body:
@@ -139,7 +154,20 @@ class LegKinematics(nn.Module):
         self.register_buffer(name, value.to(torch.get_default_dtype()), persistent=False)
 
 
-def _frame(model: mujoco.MjModel, name: str) -> tuple[int, Tensor]:
+def check_names(argument: str, names: Sequence[str]) -> None:
+    """Raises unless an argument is a list of names, each once.
+
+    Raises:
+        TypeError: if it is something else.
+        ValueError: if it is empty, or a name comes twice.
+    """
+    if not isinstance(names, (list, tuple)) or not all(isinstance(name, str) and name for name in names):
+        raise TypeError(f"{argument} takes names, strings; got {names!r}.")
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"{argument} takes one name or more, each once; got {list(names)}.")
+
+
+def _frame(model: mujoco.MjModel, argument: str, name: str) -> tuple[int, Tensor]:
     """The body that a site or body belongs to, and its pose there ``[7]``."""
     for kind, number in _OBJECTS.items():
         found = mujoco.mj_name2id(model, number, name)
@@ -149,7 +177,7 @@ def _frame(model: mujoco.MjModel, name: str) -> tuple[int, Tensor]:
             return found, SE3().neutral().double()
     sites = [model.site(place).name for place in range(model.nsite)]
     bodies = [model.body(place).name for place in range(model.nbody)]
-    raise KeyError(f"The model has no site or body {name!r}. Its sites: {sites}; its bodies: {bodies}.")
+    raise KeyError(f"{argument}: the model has no site or body {name!r}. Its sites: {sites}; its bodies: {bodies}.")
 
 
 def _pose(model: mujoco.MjModel, body: int) -> Tensor:

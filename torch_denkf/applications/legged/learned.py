@@ -7,13 +7,14 @@ from functools import partial
 
 import mujoco
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 from torchrl.envs.transforms import CatFrames, Compose, UnaryTransform
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.applications.legged.kinematics import LegKinematics
+from torch_denkf.diagnosis import entry_of
 from torch_denkf.functional.manifolds import SO3, rotate
 from torch_denkf.modules import CholeskyNoise, StochasticMLP
 from torch_denkf.submodel import Sensor
@@ -72,6 +73,7 @@ class LearnedContacts(Sensor):
         num_cells: Sequence[int] = (64, 64),
     ):
         check_count("rows", rows)
+        check_number("rate", rate, above=0)
         check_number("lasts", lasts, least=1)
         self.rows, size = rows, 16 * rows
         network = CholeskyNoise(3, r=rate, constant=False, num_cells=num_cells, in_features=size)
@@ -104,12 +106,20 @@ class LearnedContacts(Sensor):
                 its own axes, in m/s.
 
         Raises:
-            ValueError: if no foot stands in any row.
+            ValueError: if no foot stands in any row, or an entry is of another size or not finite.
+            KeyError: if one is missing.
         """
-        features, sensor = self.features(*(log["last", key] for key in _KEYS)), self.kinematics.base
+        cure = "last_rows and with_last_rows make the last rows; the truth is that of a simulator or motion capture."
+        keys: list[NestedKey] = [("true", "velocity"), *(("last", key) for key in _KEYS)]
+        true, *last = (entry_of(log, key, type(self).__name__, cure) for key in keys)
+        for key, value in zip(keys, (true, *last), strict=True):
+            check_number(repr(key), value.to(self.lasts.dtype))
+        if list(true.shape) != [*log.shape, 3]:
+            raise ValueError(f"{keys[0]!r} is [*B, 3] = {[*log.shape, 3]}; got {list(true.shape)}.")
+        features, sensor = self.features(*last), self.kinematics.base
         own = features[..., -16:]  # of the newest row
         to_sensor = SO3().inverse(sensor[:4])
-        velocity = rotate(to_sensor, log["true", "velocity"].to(own.dtype)).unsqueeze(-2)
+        velocity = rotate(to_sensor, true.to(own.dtype)).unsqueeze(-2)
         lever = rotate(to_sensor, sensor[4:]).expand_as(own[..., 10:13])
         moves = velocity + torch.linalg.cross(own[..., 10:13], lever) - own[..., 4:7]
         stands = own[..., 0] > 0
@@ -161,6 +171,12 @@ class Variances(Sensor):
         return cov.diagonal(dim1=-2, dim2=-1), *others
 
 
+def check_rows(rows: int, every: int) -> None:
+    """Raises unless both are numbers of rows."""
+    check_count("rows", rows)
+    check_count("every", every)
+
+
 def last_rows(rows: int, every: int = 1) -> Compose:
     """A transform of an environment that keeps the last rows of what :class:`LearnedContacts` reads.
 
@@ -168,6 +184,7 @@ def last_rows(rows: int, every: int = 1) -> Compose:
         rows: K.
         every: how many rows lie between two of them, and one more.
     """
+    check_rows(rows, every)
     keys, picked = [("last", key) for key in _KEYS], partial(_picked, rows=rows, every=every)
     kept = CatFrames((rows - 1) * every + 1, in_keys=list(_KEYS), out_keys=keys, dim=-1, padding="same")
     return Compose(kept, UnaryTransform(keys, keys, fn=picked)) if every > 1 else Compose(kept)
@@ -187,6 +204,7 @@ def with_last_rows(log: TensorDictBase, rows: int, every: int = 1) -> TensorDict
         rows: K.
         every: how many rows lie between two of them, and one more.
     """
+    check_rows(rows, every)
     time = log.shape[-1]
     at = (torch.arange(time).unsqueeze(-1) + every * torch.arange(1 - rows, 1)).clamp(min=0)
     return log.copy().update({("last", key): log[key][..., at, :].flatten(-2) for key in _KEYS})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -39,6 +39,11 @@ class LeggedSpace(Space):
 
     feet: int
     _angles = 3
+    #: The same with the biases at the end; made once, as torch.compile cannot trace how it is made.
+    in_groups: Product = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        object.__setattr__(self, "in_groups", Product(Opposite(Turned(2 + self.feet)), Euclidean(6)))
 
     @property
     def point_dim(self) -> int:  # type: ignore[override]
@@ -49,11 +54,6 @@ class LeggedSpace(Space):
     def tangent_dim(self) -> int:  # type: ignore[override]
         """15 + 3 F."""
         return 15 + 3 * self.feet
-
-    @property
-    def in_groups(self) -> Product:
-        """The same with the biases at the end."""
-        return Product(Opposite(Turned(2 + self.feet)), Euclidean(6))
 
     def compose(self, first, second):
         """The second, then the first; biases add up."""
@@ -204,7 +204,7 @@ class LeggedMotionNoise(SubModel):
         slip_key: NestedKey | None = None,
     ):
         self.dt, self.learned, self.ensemble = dt, slip_key is not None, ensemble
-        self.space = Product(SE23(), Euclidean(6 + 3 * feet))
+        self.space, self.world = Product(SE23(), Euclidean(6 + 3 * feet)), LeggedSpace(feet)
         mean = [] if ensemble else [("forecast", "mean")]
         more = [*([] if slip_key is None else [slip_key]), *keys_of_dt(dt)]
         super().__init__(nn.Identity(), [*mean, contact_key, *more], [("forecast", "noise")])
@@ -218,13 +218,12 @@ class LeggedMotionNoise(SubModel):
     def compute(self, *entries):
         """Variances, or the covariance."""
         mean, (contact, *more) = (None, entries) if self.ensemble else (entries[0], entries[1:])
-        dt = self.slip.new_tensor(self.dt) if len(more) == self.learned else more[-1].to(self.slip.dtype)
+        dt = self.slip.new_full((), self.dt) if len(more) == self.learned else more[-1].to(self.slip.dtype)
         slip = more[0] * dt if self.learned else self.slip
         base = (self.base * dt**self.powers).expand(*contact.shape[:-1], 15)
         var = torch.cat([base, torch.where(contact, slip * dt, self.air).repeat_interleave(3, -1)], -1)
         if mean is None:
             return var
         # Of a foot all three axes have one variance, so the sensor's serve as well as the world's.
-        space = LeggedSpace(contact.shape[-1])
-        to_world = space.adjoint(space.inverse(mean))
+        to_world = self.world.adjoint(self.world.inverse(mean))
         return to_world @ (var.unsqueeze(-1) * to_world.mT)

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 import torch
 
+from torch_denkf._checks import check_number
 from torch_denkf.applications.legged.environment import LeggedEnv, LeggedErrors, on_floor
 from torch_denkf.applications.legged.filter import legged_filter
 from torch_denkf.applications.legged.learned import LearnedContacts
@@ -62,6 +63,8 @@ def trot(
         height: by how much legs are lifted.
         turn: by how much the strides of right and left legs differ, -1 to 1.
     """
+    for name, value in {"time": time, "pace": pace, "stride": stride, "height": height, "turn": turn}.items():
+        check_number(name, value)
     found = []
     for number, side in enumerate((-1.0, 1.0, 1.0, -1.0)):  # front left, front right, back right, back left
         phase = 2 * math.pi * pace * time + math.pi * (number % 2)

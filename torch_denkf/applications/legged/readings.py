@@ -6,9 +6,12 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
+from torch_denkf._checks import check_number
 from torch_denkf.applications.legged.kinematics import LegKinematics
+from torch_denkf.functional.kernels.small_system import on_gpu
 from torch_denkf.functional.manifolds import SO3, Space, quaternion_product, rotate
 from torch_denkf.modules import SubModel
+from torch_denkf.motions.time_step import keys_of_dt
 
 __all__ = ["FeetInBody", "FeetRates", "LegReadings"]
 
@@ -21,6 +24,7 @@ class LegReadings(SubModel):
 
     Args:
         kinematics: of the robot's legs.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]``, which is looked at here: above zero.
         imu_key: entry ``[*B, 6]``: gyro in rad/s, accelerometer in m/s^2, in the sensor's axes.
         joints_key: angles ``[*B, J]`` in rad.
         rates_key: their rates ``[*B, J]`` in rad/s; ``None`` where nothing reads them.
@@ -32,6 +36,7 @@ class LegReadings(SubModel):
     def __init__(
         self,
         kinematics: LegKinematics,
+        dt: float | NestedKey,
         *,
         imu_key: NestedKey = "imu",
         joints_key: NestedKey = "joints",
@@ -41,18 +46,24 @@ class LegReadings(SubModel):
     ):
         rates = [] if rates_key is None else [rates_key]
         names = ["feet", "observed", "start", *(["rates"] if rates else [])]
-        super().__init__(kinematics, [imu_key, joints_key, contact_key, *rates], [(prefix, name) for name in names])
+        self.steps = keys_of_dt(dt)
+        in_keys = [imu_key, joints_key, contact_key, *self.steps, *rates]
+        super().__init__(kinematics, in_keys, [(prefix, name) for name in names])
 
-    def compute(self, imu, joints, contact, rates=None):
+    def compute(self, imu, joints, contact, *others):
         """The feet, which of them stand, the start, and the feet's rates."""
-        kinematics = self.module
-        sizes = [6, len(kinematics.joints), len(kinematics.feet), len(kinematics.joints)]
-        for key, size, value in zip(self.in_keys, sizes, (imu, joints, contact, rates), strict=False):
-            if value.shape[-1:] != (size,):
+        kinematics, values = self.module, (imu, joints, contact, *others)
+        sizes = [6, len(kinematics.joints), len(kinematics.feet), *[1] * len(self.steps), len(kinematics.joints)]
+        for key, size, value in zip(self.in_keys, sizes, values, strict=False):
+            if value.shape != (*imu.shape[:-1], size):
                 raise ValueError(f"{key!r} of this robot is [*B, {size}]; got {list(value.shape)}.")
-        feet = self.module(joints.to(self.module.base.dtype))
-        out = feet.flatten(-2), contact.repeat_interleave(3, -1), self._start(imu[..., 3:].to(feet.dtype), feet)
-        return out if rates is None else (*out, self.module.velocities(joints, rates).flatten(-2))
+        if self.steps and not on_gpu(joints):
+            check_number(repr(self.steps[0]), others[0], above=0, cure="It is the time step in seconds")
+        rates = others[-1].to(kinematics.base.dtype) if len(others) > len(self.steps) else None
+        joints = joints.to(kinematics.base.dtype)
+        feet, *moves = [kinematics(joints)] if rates is None else kinematics.moving(joints, rates)
+        begin = self._start(imu[..., 3:].to(feet.dtype), feet)
+        return feet.flatten(-2), contact.repeat_interleave(3, -1), begin, *(value.flatten(-2) for value in moves)
 
     def _start(self, force: Tensor, feet: Tensor) -> Tensor:
         sensor = self.module.base

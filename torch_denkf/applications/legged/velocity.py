@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch_denkf.functional.manifolds import SO3, rotate, rotation_matrix, skew
 from torch_denkf.functional.moments import ensemble_mean, ensemble_var
 from torch_denkf.modules import AroundState, GaussianAround, SubModel
+from torch_denkf.submodel import Entries
 
 __all__ = ["BaseVelocity", "StartEnsemble", "StartMoments", "base_velocity", "base_velocity_of_moments"]
 
@@ -42,8 +43,8 @@ def base_velocity_of_moments(mean: Tensor, cov: Tensor, gyro: Tensor, sensor: Te
     axes = rotation_matrix(sensor[:4])
     seen = axes @ rotation_matrix(mean[..., :4]).mT  # the velocity turns with the orientation, so none comes by that
     part = torch.cat([seen, (-skew(sensor[4:]) @ axes).expand_as(seen)], -1)  # by velocity, gyro's bias
-    rows = [3, 4, 5, 9, 10, 11]
-    var = (part @ cov[..., rows, :][..., rows] * part).sum(-1)
+    rows = torch.cat([cov[..., 3:6, :], cov[..., 9:12, :]], -2)
+    var = (part @ torch.cat([rows[..., 3:6], rows[..., 9:12]], -1) * part).sum(-1)
     return base_velocity(mean, gyro, sensor), var
 
 
@@ -79,34 +80,63 @@ class BaseVelocity(SubModel):
             velocity, var = ensemble_mean(members), ensemble_var(members)
         return velocity, var + self.jitter
 
+    def derived(self, carried: Entries) -> Entries:
+        """Returns both of a given belief: as the gyro turns, where the entries hold its reading; else at rest."""
+        belief = [carried[key] for key in self.in_keys[1:]]
+        bias = belief[0][..., 10:13]
+        still = bias.mean(-2) if len(belief) == 1 else bias
+        return dict(zip(_KEYS, self.compute(carried.get(self.in_keys[0], still), *belief), strict=True))
+
 
 class StartEnsemble(AroundState):
-    """Members around where a robot starts that stands still, with the base's velocity beside them."""
+    """Members around where a robot starts that stands still, with the base's velocity beside them.
 
-    def __init__(self, std, velocity_std, **options):
+    Args:
+        std: standard deviations of tangents, as of :class:`AroundState`.
+        velocity_std: of the base's velocity, in m/s.
+        velocity: writes the base's velocity of other beliefs.
+        **options: of :class:`AroundState`.
+    """
+
+    def __init__(self, std, velocity_std, velocity, **options):
         keys = [("belief", name) for name in ("ensemble", "mean", "var")]
         super().__init__(std, out_keys=[*keys, *_KEYS], **options)
-        self.velocity_std = velocity_std
+        self.velocity_std, self._velocity = velocity_std, (velocity,)  # in a tuple: it is a module of the filter's
 
     def compute(self, state, *, noise, batch_size):
         """The belief, and the velocity."""
         ensemble, mean, var = super().compute(state, noise=noise, batch_size=batch_size)
         return ensemble, mean, var, *_still(mean, self.velocity_std)
 
+    def derived(self, carried):
+        """Returns the velocity of a belief that is given."""
+        return self._velocity[0].derived(carried)
+
 
 class StartMoments(GaussianAround):
-    """A mean and a covariance around where a robot starts that stands still, with the base's velocity beside them."""
+    """A mean and a covariance around where a robot starts that stands still, with the base's velocity beside them.
 
-    def __init__(self, std, velocity_std, **options):
+    Args:
+        std: standard deviations of tangents, as of :class:`GaussianAround`.
+        velocity_std: of the base's velocity, in m/s.
+        velocity: writes the base's velocity of other beliefs.
+        **options: of :class:`GaussianAround`.
+    """
+
+    def __init__(self, std, velocity_std, velocity, **options):
         super().__init__(std, **options)
         keys = [("belief", name) for name in ("mean", "cov", "var")]
         self.out_keys = [*keys, *_KEYS]
-        self.velocity_std = velocity_std
+        self.velocity_std, self._velocity = velocity_std, (velocity,)
 
     def compute(self, state):
         """The belief, and the velocity."""
         mean, cov, var = super().compute(state)
         return mean, cov, var, *_still(mean, self.velocity_std)
+
+    def derived(self, carried):
+        """Returns the velocity of a belief that is given."""
+        return self._velocity[0].derived(carried)
 
 
 def _still(mean: Tensor, std: float) -> tuple[Tensor, Tensor]:

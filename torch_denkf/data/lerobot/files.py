@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from string import Formatter
@@ -63,6 +64,7 @@ class Layout:
         features: of ``info.json``: dtype, shape and names by key.
         camera: key of the camera.
         episodes: by number.
+        empty: episodes without rows.
         meta: the files that all this is from.
     """
 
@@ -71,6 +73,7 @@ class Layout:
     features: dict[str, dict[str, Any]]
     camera: str
     episodes: tuple[EpisodeFiles, ...]
+    empty: tuple[EpisodeFiles, ...]
     meta: tuple[Path, ...]
 
     def width(self, key: str) -> int:
@@ -100,13 +103,19 @@ class Layout:
         return tuple(str(name) for name in names)
 
 
-def read_layout(root: Path, camera: str | None) -> Layout:
+def read_layout(root: Path, camera: str | None, chosen: Sequence[int] | None = None) -> Layout:
     """Read the metadata of a LeRobot folder.
+
+    Args:
+        root: the folder.
+        camera: key of the camera; None for the only one.
+        chosen: numbers of the episodes; None for all.
 
     Raises:
         FileNotFoundError: without metadata.
-        ValueError: for versions that are not supported, cameras that are not there, malformed metadata, numbers out of
-            range, episodes that are listed twice, and paths that lead out of the folder.
+        ValueError: for versions that are not supported, cameras and episodes that are not there, malformed metadata,
+            numbers out of range, episodes that are listed twice, totals of others than are listed, and paths that lead
+            out of the folder.
     """
     file = root / "meta" / "info.json"
     if not file.is_file():
@@ -126,17 +135,78 @@ def read_layout(root: Path, camera: str | None) -> Layout:
         episodes, meta = _episodes_of_version_2(root, info, camera)
     else:
         episodes, meta = _episodes_of_version_3(root, info, camera)
+    _check_episodes(meta, episodes)
+    if chosen is None:
+        _check_totals(file, info, meta[0], episodes)
+    else:
+        episodes = _chosen(chosen, meta[0], episodes)
+    empty = tuple(episode for episode in episodes if not episode.length)
     episodes = [episode for episode in episodes if episode.length]
     if not episodes:
         raise ValueError(f"{root} has no episodes: {meta[0]} lists none; {COMPLETE}")
-    _check_episodes(meta, episodes)
     rows = sum(episode.length for episode in episodes)
     if rows > MOST_ROWS:
         raise ValueError(
             f"{meta[0]} announces {rows} rows, more than the {MOST_ROWS} that are read; its numbers are wrong"
         )
     episodes.sort(key=lambda episode: episode.number)
-    return Layout(root, fps, features, camera, tuple(episodes), (file, *meta))
+    return Layout(root, fps, features, camera, tuple(episodes), empty, (file, *meta))
+
+
+def _check_totals(file: Path, info: dict, listed: Path, episodes: Sequence[EpisodeFiles]) -> None:
+    totals = {"total_episodes": len(episodes), "total_frames": sum(episode.length for episode in episodes)}
+    for name, there in totals.items():
+        if info.get(name, there) != there:
+            raise ValueError(
+                f"{file} announces {name} {info[name]!r}, but {listed} lists {there}; {COMPLETE}, or pass "
+                "episodes= of those that are there"
+            )
+
+
+def _chosen(chosen: object, listed: Path, episodes: Sequence[EpisodeFiles]) -> list[EpisodeFiles]:
+    there = [episode.number for episode in episodes]
+    numbers = list(chosen) if isinstance(chosen, Iterable) and not isinstance(chosen, str | bytes) else []
+    if not numbers:
+        raise ValueError(f"episodes holds numbers of episodes, such as [0, 2], or is None for all; got {chosen!r}")
+    if unknown := [number for number in numbers if number not in there]:
+        raise ValueError(f"episodes names {unknown[:10]}, but {listed} lists {_some(sorted(there))}")
+    return [episode for episode in episodes if episode.number in numbers]
+
+
+def _some(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers[:10])) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")
+
+
+def check_files(layout: Layout) -> None:
+    """Looks for the files of all episodes before one of them is read, which may take hours.
+
+    Raises:
+        FileNotFoundError: if files are missing; the message says how many, and which episodes are there.
+    """
+    missing: dict[Path, None] = {}
+    whole = []
+    for episode in layout.episodes:
+        lost = [file for file in (episode.data, episode.video) if file is not None and not file.is_file()]
+        missing |= dict.fromkeys(lost)
+        whole += [] if lost else [episode.number]
+    if not missing:
+        return
+    first, *others = missing
+    more = f", nor {len(others)} more of its files, such as {others[0]}" if others else ""
+    there = f", or pass episodes= of those that are there: {_some(whole)}" if whole else ""
+    camera = "" if first.suffix == ".parquet" else ", pass another camera"
+    raise FileNotFoundError(f"no {first}, which the data set's metadata names{more}; {COMPLETE}{camera}{there}")
+
+
+def check_empty(layout: Layout) -> None:
+    """Makes sure that episodes of no rows have none.
+
+    Raises:
+        ValueError: if there are rows; names the file and the episode.
+    """
+    for episode in layout.empty:
+        if episode.data.is_file():
+            rows_of_episode(read_table(episode.data, ["episode_index"]), episode)
 
 
 def _check_features(file: Path, features: dict) -> None:
@@ -301,7 +371,7 @@ def rows_of_episode(table, episode: EpisodeFiles):
 
 
 def vectors(table, file: Path, key: str, width: int) -> np.ndarray:
-    """A column of numbers, float32 ``[n, width]``.
+    """A column of numbers, float64 ``[n, width]``.
 
     Raises:
         ValueError: if a row has another width, or none.
@@ -320,7 +390,7 @@ def vectors(table, file: Path, key: str, width: int) -> np.ndarray:
     if widths != {width} or column.null_count:
         found = "gaps" if column.null_count or None in widths else f"rows of {sorted(widths)} numbers"
         raise ValueError(f"{key!r} in {file} has {found}; meta/info.json says {width} in each row")
-    return column.to_numpy(zero_copy_only=False).astype(np.float32).reshape(-1, width)
+    return column.to_numpy(zero_copy_only=False).astype(np.float64).reshape(-1, width)
 
 
 def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict | None) -> np.ndarray | None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +19,8 @@ from torch_denkf.data.cache import cache_folder, cached, stamp
 from torch_denkf.data.lerobot.files import (
     EpisodeFiles,
     Layout,
+    check_empty,
+    check_files,
     decode_image,
     read_layout,
     read_table,
@@ -27,6 +31,7 @@ from torch_denkf.data.lerobot.sound import mask_rows, sound_times
 from torch_denkf.data.pictures import image_store, scaled, text_of_size
 from torch_denkf.data.video import frames_at_times
 from torch_denkf.deployment.progress import progress_bar
+from torch_denkf.diagnosis.logs import in_origin, look_at_numbers, warn_of_log
 
 _FORMAT = 2  # part of the cache's key: raise it when what is stored changes
 
@@ -61,29 +66,60 @@ def read_recording(
     size: tuple[int, int],
     cache: str | Path | bool | None,
     progress: bool,
+    episodes: Sequence[int] | None = None,
+    origin: Mapping[str, Any] | None = None,
 ) -> DecodedRecording:
-    """Read all episodes of a LeRobot folder, or load them from the cache.
+    """Read episodes of a LeRobot folder, or load them from the cache.
 
     Raises:
         ImportError: without pyarrow.
         FileNotFoundError: without the folder or one of its files.
         ValueError: for what is unknown, damaged or contradicts itself.
     """
-    layout = read_layout(root, camera)
+    layout = read_layout(root, camera, episodes)
     if action_key == "action" and action_key not in layout.features:  # the default: actions where there are any
         action_key = None
+        numbers = [key for key, one in layout.features.items() if one["dtype"] not in ("image", "video", "string")]
+        look_for_actions(numbers, layout.meta[0])
     keys = {"state": state_key} if action_key is None else {"state": state_key, "action": action_key}
     widths = {name: layout.width(key) for name, key in keys.items()}
     names = layout.names(state_key)
+    if unknown := [name for name in origin or {} if name not in keys]:
+        raise ValueError(f"origin names {unknown}; it holds numbers for {list(keys)}")
+    origins = {
+        name: (-in_origin(np.zeros((1, widths[name])), given, f"origin of {name!r}"))[0].tolist()
+        for name, given in (origin or {}).items()
+    }
     folder = cache_folder(cache)
     if folder is None:
-        return DecodedRecording(_read(layout, keys, widths, size, None, progress), layout.fps, names, root)
-    key = [_FORMAT, str(root), layout.camera, keys, layout.fps, *size]
+        return DecodedRecording(_read(layout, keys, widths, size, None, progress, origins), layout.fps, names, root)
+    key = [
+        _FORMAT,
+        str(root),
+        layout.camera,
+        keys,
+        layout.fps,
+        *size,
+        origins,
+        [episode.number for episode in layout.episodes],
+    ]
     key += [(str(file.relative_to(root)), *stamp(file)) for file in _files(layout)]
     digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
     entry = folder / f"lerobot-{root.name}-{layout.camera}-{size[0]}x{size[1]}-{digest}"
-    rows = cached(entry, lambda: _read(layout, keys, widths, size, folder, progress))
+    rows = cached(entry, lambda: _read(layout, keys, widths, size, folder, progress, origins))
     return DecodedRecording(rows, layout.fps, names, root)
+
+
+def look_for_actions(keys: Iterable[str], place: object) -> None:
+    """Warns of entries that are called almost as actions are, and would be left out."""
+    close = [key for key in keys if re.search("action|command|cmd", key, re.IGNORECASE)]
+    if close:
+        warn_of_log(
+            place,
+            close[0],
+            "is left out, and looks like the commands" + (f", as do {close[1:]}" if close[1:] else ""),
+            f"pass action_key={close[0]!r}, or action_key=None for none",
+        )
 
 
 def _files(layout: Layout) -> list[Path]:
@@ -126,14 +162,17 @@ def _read(
     size: tuple[int, int],
     folder: Path | None,
     progress: bool,
+    origin: Mapping[str, Sequence[float]],
 ) -> TensorDict:
+    check_files(layout)
+    check_empty(layout)
     lengths = [episode.length for episode in layout.episodes]
     starts = np.cumsum([0, *lengths])
     numbers = {name: np.empty((starts[-1], width), np.float32) for name, width in widths.items()}
     time, stamped = np.empty(starts[-1]), np.ones(starts[-1], bool)
     frames = _Frames(starts[-1], size, folder, progress)
     videos: dict[Path, list[int]] = {}
-    opened, table = None, None
+    opened, table, swallowed = None, None, set[str]()
     try:
         for place, episode in enumerate(layout.episodes):
             if episode.data != opened:
@@ -141,7 +180,13 @@ def _read(
                 _check_columns(opened, table, [*keys.values(), "episode_index"])
             rows, at = rows_of_episode(table, episode), slice(starts[place], starts[place + 1])
             for name, key in keys.items():
-                numbers[name][at] = vectors(rows, opened, key, widths[name])
+                values = vectors(rows, opened, key, widths[name])
+                if name in origin:
+                    values = values - np.array(origin[name])
+                numbers[name][at] = values
+                labels = layout.names(key) or [f"{key}[{place}]" for place in range(widths[name])]
+                if key not in swallowed and look_at_numbers(values, labels, opened, f"pass origin={{{name!r}: ...}}"):
+                    swallowed.add(key)
             if "timestamp" in rows.column_names:
                 source = f"{opened}, episode {episode.number}"
                 time[at], stamped[at] = sound_times(rows["timestamp"].to_numpy(), layout.fps, source)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -95,6 +95,10 @@ class LeRobotReplay(EpisodeReplay):
         action_dims: numbers of the action to keep, by place. Commands to other joints are noise to a learned motion.
         repeats: ``"keep"`` or ``"mask"`` repeated pictures.
         lag: rows by which the states are later than the pictures.
+        episodes: numbers of the episodes to read, by default all; only their files must be there. It does not change
+            which of them are for tests.
+        origin: what is subtracted from ``"state"`` and ``"action"``, a number or one for each of theirs, in float64,
+            before they become float32, which has seven digits. A warning says where those are too few.
         **options: of :class:`~torch_denkf.data.EpisodeReplay`.
 
     Attributes:
@@ -106,10 +110,11 @@ class LeRobotReplay(EpisodeReplay):
 
     Raises:
         ImportError: without pyarrow.
-        FileNotFoundError: without the folder, a parquet file or a video.
-        ValueError: for versions of the format that are not read, cameras and features that are not there, files that
-            are damaged or contradict the metadata, ``dims`` that are not there, splits without episodes, episodes
-            that are shorter than a slice or the lag, and other words for ``repeats``.
+        FileNotFoundError: without the folder, a parquet file or a video; the message says how many are missing, and
+            which episodes are whole.
+        ValueError: for versions of the format that are not read, cameras, features and ``episodes`` that are not there,
+            files that are damaged or contradict the metadata, ``dims`` that are not there, splits without episodes,
+            episodes that are shorter than a slice or the lag, and other words for ``repeats``.
 
     Examples:
         >>> data = LeRobotReplay("aloha_static_coffee", camera="cam_high", slice_len=16, batch_size=64)
@@ -149,12 +154,20 @@ class LeRobotReplay(EpisodeReplay):
         action_dims: Sequence[int] | None = None,
         repeats: Literal["keep", "mask"] = "keep",
         lag: int = 0,
+        episodes: Sequence[int] | None = None,
+        origin: Mapping[str, float | Sequence[float]] | None = None,
         **options: Unpack[ReplayOptions],
     ):
         check_options(options)
         if repeats not in ("keep", "mask"):
             raise ValueError(f"repeats is 'keep' or 'mask', got {repeats!r}")
+        if not (origin is None or isinstance(origin, Mapping)):
+            raise TypeError(
+                f"origin holds numbers for 'state' and 'action', such as {{'state': 5.4e6}}; got {origin!r}"
+            )
         if isinstance(root, DecodedRecording):
+            if episodes is not None or origin is not None:
+                raise ValueError("episodes= and origin= are for folders; select and subtract in the rows instead")
             recording = root
         else:
             recording = read_recording(
@@ -165,6 +178,8 @@ class LeRobotReplay(EpisodeReplay):
                 size=check_size(size),
                 cache=options.get("cache", True),
                 progress=options.get("progress", True),
+                episodes=episodes,
+                origin=origin,
             )
         self.fps, self.names, self.lag = recording.fps, recording.names, lag
         self._images = JoinedPictures([recording.rows["image"]])

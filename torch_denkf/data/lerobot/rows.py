@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from torch_denkf._checks import check_number
-from torch_denkf.data.lerobot.recording import DecodedRecording
+from torch_denkf.data.lerobot.recording import DecodedRecording, look_for_actions
 from torch_denkf.data.lerobot.sound import mask_rows
 from torch_denkf.data.pictures import image_store, scaled
 
@@ -97,6 +97,8 @@ def recording_from_rows(
     whole = size is None and isinstance(rows, TensorDictBase)
     image = _images(rows, pixels_key) if whole else None
     keep = image is not None and image.dtype == torch.uint8
+    if action_key == "action" and "action" not in rows[:1]:
+        look_for_actions(map(str, rows[:1].keys()), "the rows")
     store: np.ndarray | None = None
     numbers: list[TensorDict] = []
     for at in stretches:

@@ -13,6 +13,7 @@ from torch_denkf.data.times import MOST_WRONG, filled, sound
 
 __all__ = ["mask_rows", "sound_times"]
 
+OFF = 0.25  # a share of 1 / fps, by which the usual step may be off
 _NUMBERS = ("state", "action")
 
 
@@ -25,7 +26,7 @@ def sound_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray,
         source: file and episode, for the message.
 
     Raises:
-        ValueError: if more than a tenth are not finite or do not increase.
+        ValueError: if more than a tenth are not finite or do not increase, or they are not ``1 / fps`` apart.
     """
     try:
         times = np.asarray(times, np.float64)
@@ -38,6 +39,12 @@ def sound_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray,
             f"{source}: the timestamp {times[wrong[0]]:g} of frame {wrong[0]} does not increase, nor do "
             f"{len(wrong) - 1} others of {len(times)}; expected seconds that count frames, k / fps: download it anew, "
             "or write them anew"
+        )
+    step = float(np.median(np.diff(times[good]))) if good.sum() > 1 else 1 / fps
+    if abs(step * fps - 1) > OFF:
+        raise ValueError(
+            f"{source}: timestamps are {step:.4g} s apart, but fps in meta/info.json is {fps:g}, which makes "
+            f"{1 / fps:.4g} s; correct fps there, or write the timestamps anew"
         )
     return (filled(times, good, 1 / fps) if len(wrong) else times), good
 

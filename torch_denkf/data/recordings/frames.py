@@ -18,12 +18,13 @@ from tensordict import TensorDict
 
 from torch_denkf._checks import check_number
 from torch_denkf.data.cache import cache_folder, cached, stamp
-from torch_denkf.data.pictures import CURE, decode_picture, scaled, text_of_size, unnamed_file
-from torch_denkf.data.recordings.tables import SECONDS, Unit, check_stream, check_times, read_numbers
+from torch_denkf.data.pictures import CURE, decode_picture, picture_files, scaled, text_of_size, unnamed_file
+from torch_denkf.data.recordings.tables import check_stream, check_times, read_numbers
 from torch_denkf.data.text import read_number
 from torch_denkf.data.video import NOT_DECODED, decoded_frames, say_if_cut
 from torch_denkf.deployment.files import clear_errors
 from torch_denkf.deployment.progress import progress_bar
+from torch_denkf.diagnosis.logs import SECONDS, Unit, look_at_times
 
 __all__ = ["Frames", "Images", "Video"]
 
@@ -86,6 +87,7 @@ class Frames:
             stored = cached(entry, lambda: self._decode(source, files, size, folder, progress))
         times = self._times(source, stored)
         check_times(times, lambda row: f"picture {row} (from 0) of {source}", self.time)
+        look_at_times(times, source, self.time, self.unit)
         return TensorDict({"pixels": stored["pixels"], "time": torch.from_numpy(times)}, stored.batch_size)
 
     def _files(self, source: Path) -> list[Path]:
@@ -109,6 +111,8 @@ class Frames:
             times = numbers[:, 0]
             check_times(times * SECONDS[self.unit], where, self.time)
         else:
+            if np.ma.is_masked(given):
+                raise ValueError(f"times of {source} has masked elements; pass a time for each picture")
             times = np.asarray(given, dtype=np.float64).reshape(-1)
             check_times(times * SECONDS[self.unit], "times[{}]".format, self.time)
         # Damaged pictures are not stored: the place of each tells which time is its own.
@@ -200,11 +204,7 @@ class Images(Frames):
     def _files(self, source: Path) -> list[Path]:
         if not source.is_dir():
             raise FileNotFoundError(f"no folder {self.file}; check the path")
-        files = [
-            file  # hidden ones, such as ._1.png, are a file manager's
-            for file in source.iterdir()
-            if file.suffix.lower() in _SUFFIXES and not file.name.startswith(".") and file.is_file()
-        ]
+        files = picture_files(source, _SUFFIXES)
         if not files:
             raise ValueError(f"no images in {source}; expected names that end in {', '.join(_SUFFIXES)}")
         return sorted(files, key=_in_order)

@@ -22,6 +22,7 @@ from torch_denkf.data.recordings.tables import Readings, Table
 from torch_denkf.data.replay import EpisodeReplay
 from torch_denkf.data.statistics import picture_statistics
 from torch_denkf.data.times import Span, interpolate, last_reading, nearest_reading, row_times, rows_ago
+from torch_denkf.diagnosis.logs import look_at_repeats
 
 __all__ = ["Recording", "RecordingReplay"]
 
@@ -318,8 +319,12 @@ def _on_clock(
     taken = {
         key: stream.times if isinstance(stream, Readings) else stream["time"].numpy() for key, stream in streams.items()
     }
-    came = {key: stream.arrived if _comes_late(stream) else taken[key] for key, stream in streams.items()}
-    times = {key: np.unique(of) for key, of in came.items()}
+    came: dict[str, Any] = {}
+    times: dict[str, np.ndarray] = {}
+    for key, stream in streams.items():
+        came[key] = stream.arrived if _comes_late(stream) else taken[key]
+        until = None if key == clock else getattr(stream, "until", None)
+        times[key] = np.unique(came[key] if until is None else np.append(came[key], until))
     try:
         rows = row_times(times, clock, span)
     except ValueError as error:
@@ -329,6 +334,8 @@ def _on_clock(
     out: dict[str, Tensor] = {}
     for key, stream in recording.streams.items():
         read = streams[key]
+        if isinstance(stream, Table) and stream.repeats is None and key != "action":  # commands are held
+            look_at_repeats(read.values, read.columns, stream.file)
         if stream.sample == "linear":
             values, seen = interpolate(taken[key], read.values, rows, stream.tolerance)
         else:

@@ -6,7 +6,7 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -17,11 +17,10 @@ from torch_denkf._checks import check_number
 from torch_denkf.data.parquet import read_parquet
 from torch_denkf.data.text import read_number
 from torch_denkf.data.times import Way
+from torch_denkf.diagnosis.logs import SECONDS, Unit, in_origin, look_at_numbers, look_at_times
 
 __all__ = ["Readings", "Table", "Unit", "check_times", "read_numbers"]
 
-Unit = Literal["s", "ms", "us", "ns"]
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -33,12 +32,14 @@ class Readings(NamedTuple):
         values: ``[n, C]``.
         columns: names of the values.
         arrived: when they could be read, s, ``[n]``; None where that is when they were taken.
+        until: s, the table's end, where it repeats the last reading up to there.
     """
 
     times: np.ndarray
     values: np.ndarray
     columns: tuple[str, ...]
     arrived: np.ndarray | None = None
+    until: float | None = None
 
 
 @dataclass(frozen=True)
@@ -59,10 +60,16 @@ class Table:
         tolerance: in s. With ``"last"`` and ``"nearest"``, readings that are farther away count as missing: by
             default, none with ``"last"``, half a row's time with ``"nearest"``. With ``"linear"``, no value between
             readings that are farther apart; by default there always is one.
+        origin: what is subtracted from columns, by their names, in float64, before they become float32, which has seven
+            digits: of metres of a map, degrees of latitude or encoder ticks the last ones are lost. A warning says
+            where.
+        repeats: what a row is in which no column differs from the row before. ``"drop"``: the last reading once more,
+            as in a log that repeats a slow sensor until it reads again; the row is left out. ``"keep"``: a reading of
+            its own. By default it is kept, and a warning says where a column looks as if it repeats.
 
     Raises:
-        ValueError: for an unknown ``unit`` or ``sample``, tolerances that are not positive, and ``arrived`` beside
-            another ``sample`` than ``"last"``.
+        ValueError: for an unknown ``unit``, ``sample`` or ``repeats``, tolerances that are not positive, and
+            ``arrived`` beside another ``sample`` than ``"last"``.
 
     Examples:
         >>> from tempfile import mkdtemp
@@ -80,9 +87,17 @@ class Table:
     sample: Way = "last"
     tolerance: float | None = None
     arrived: str | None = None
+    origin: Mapping[str, float] | None = None
+    repeats: Literal["drop", "keep"] | None = None
 
     def __post_init__(self):
         check_stream(self.sample, ("last", "nearest", "linear"), self.tolerance, self.unit)
+        if self.repeats not in (None, "drop", "keep"):
+            raise ValueError(f"repeats is 'drop', 'keep' or None, got {self.repeats!r}")
+        if not (self.origin is None or isinstance(self.origin, Mapping)):
+            raise TypeError(
+                f"origin holds numbers by the names of columns, such as {{'x': 5.4e6}}; got {self.origin!r}"
+            )
         if self.arrived is not None and self.sample != "last":
             raise ValueError(
                 f"arrived={self.arrived!r} says when a reading can be known, which sample={self.sample!r} does not "
@@ -108,6 +123,7 @@ class Table:
         names, numbers, place = read_numbers(Path(self.file).expanduser(), self.time, columns)
         times, values, arrived = numbers[:, 0] * SECONDS[self.unit], numbers[:, 1:], None
         check_times(times, place, self.time)
+        look_at_times(times, self.file, self.time, self.unit)
         if self.arrived is not None:
             if self.arrived not in names:
                 raise ValueError(f"{self.file} lacks the column {self.arrived!r} of arrivals; it has {list(names)}")
@@ -123,7 +139,16 @@ class Table:
                 )
         if not names:
             raise ValueError(f"{self.file} has no column to read beside {self.time!r}; leave the stream out")
-        return Readings(times, values, names, arrived)
+        if unknown := set(self.origin or ()) - set(names):
+            raise ValueError(f"origin names {sorted(map(str, unknown))}, but {self.file} is read for {list(names)}")
+        for name, origin in (self.origin or {}).items():
+            column = [names.index(name)]
+            values[:, column] = in_origin(values[:, column], origin, f"origin of {name!r}")
+        look_at_numbers(values, names, self.file)
+        if self.repeats != "drop":
+            return Readings(times, values, names, arrived)
+        new, until = np.append(True, (np.diff(values, axis=0) != 0).any(1)), times if arrived is None else arrived
+        return Readings(times[new], values[new], names, None if arrived is None else arrived[new], float(until.max()))
 
 
 def check_stream(sample: str, ways: Sequence[str], tolerance: float | None, unit: str) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_denkf.functional.kernels.small_system import on_gpu
+
 __all__ = ["dropped_relu"]
 
 
@@ -39,7 +41,8 @@ class _DroppedReLU(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor, factor: Tensor, kept: float) -> Tensor:
-        return (x * factor).relu_()
+        # Traced, nothing is changed in place: of tensors on CUDA the saved result lost its gradient (torch 2.11).
+        return (x * factor).relu() if torch.compiler.is_compiling() else (x * factor).relu_()
 
     @staticmethod
     def setup_context(ctx, inputs: tuple, output: Tensor) -> None:
@@ -49,6 +52,8 @@ class _DroppedReLU(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple:
         (output,) = ctx.saved_tensors
+        if on_gpu(output):
+            return torch.ops.aten.threshold_backward(gradient, output, 0) * ctx.kept, None, None
         return gradient * (output.sign() * ctx.kept), None, None
 
 

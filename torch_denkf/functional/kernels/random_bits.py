@@ -12,9 +12,12 @@ from math import gcd, prod
 
 import torch
 
+from torch_denkf.functional.kernels.small_system import on_gpu
+
 __all__ = ["balanced_bytes", "dropout_factor", "random_bytes", "random_keep_mask", "random_signs", "representable_rate"]
 
 _INT64_MIN = -(2**63)
+_ORDERS: dict[tuple[int, torch.device], torch.Tensor] = {}
 
 
 def representable_rate(rate: float) -> float:
@@ -104,13 +107,27 @@ def balanced_bytes(
         tensor([8])
     """
     offset, order = random_bytes((2, *batch_size, 1, units), device=device, generator=generator).unbind(0)
-    number = torch.arange(members, device=device).unsqueeze(-1)
+    orders = _orders(members, torch.device("cpu") if device is None else torch.device(device))
     if 256 % members == 0:  # bytes wrap by themselves
-        return offset + (number * (256 // members)).to(torch.uint8) * (order | 1)
-    coprime = torch.tensor([step for step in range(1, members + 1) if gcd(step, members) == 1], device=device)
-    orders = (coprime * number % members * 256 // members).to(torch.uint8).mT.contiguous()
-    chosen = orders[order.squeeze(-2).long() * len(coprime) // 256]
+        return offset + orders * (order | 1)
+    chosen = orders[order.squeeze(-2).long() * len(orders) // 256]
     return offset + chosen.mT.contiguous()
+
+
+def _orders(members: int, device: torch.device) -> torch.Tensor:
+    """Returns the orders in which bytes of one unit can stand, ``[N, E]``, or one order ``[E, 1]`` for its multiples.
+
+    They are made once a device, as no copy to the device is captured.
+    """
+    if (members, device) in _ORDERS:
+        return _ORDERS[members, device]
+    number = torch.arange(members)
+    coprime = torch.tensor([step for step in range(1, members + 1) if gcd(step, members) == 1]).unsqueeze(-1)
+    orders = number.unsqueeze(-1) if 256 % members == 0 else coprime * number % members
+    orders = (orders * 256 // members).to(torch.uint8).to(device)
+    if not torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+        _ORDERS[members, device] = orders
+    return orders
 
 
 def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torch.Tensor:
@@ -132,6 +149,8 @@ def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torc
         tensor([0.0000, 0.0000, 1.3333, 1.3333])
     """
     kept = 1 / (1 - rate)
+    if draws.dtype != torch.bool and on_gpu(draws):
+        draws = draws >= round(256 * rate)
     if draws.dtype == torch.bool:
         return draws.to(dtype) * kept
     # From byte to byte the line rises by 1024, more than twice the largest factor (256): at the first byte that is

@@ -2,7 +2,8 @@
 
 In a compiled step LAPACK's calls for a 2 x 2 system cost more than the system: they cannot be fused, each costs a
 call, and in C++ (a filter's ``compile()`` on a processor, a package of AOTInductor) some go through a slow fallback.
-Eagerly, LAPACK is the faster one.
+Eagerly, LAPACK is the faster one on a processor. On a GPU, torch's routines for batches of systems wait for the device,
+or cannot be captured into a CUDA graph, as MAGMA's: :func:`inverse_of` takes their place there.
 """
 
 from __future__ import annotations
@@ -16,6 +17,50 @@ from torch import Tensor
 LARGEST = 4
 #: The largest matrix whose factor alone is written out, of a state's covariance, say.
 LARGEST_FACTOR = 6
+#: Kinds of devices on which a call costs a launch, and a look at a result waits for all launches before it.
+GPUS = ("cuda",)
+
+
+def on_gpu(tensor: Tensor) -> bool:
+    """Tells whether routines that wait for the device, or cannot be captured into a graph, are to be avoided."""
+    return tensor.device.type in GPUS
+
+
+def inverse_of(matrix: Tensor, ridge: float = 0) -> tuple[Tensor, Tensor]:
+    """The inverse of a symmetric M, N x N, and log det M, in few launches and without a look at the numbers.
+
+    Up to :data:`LARGEST` rows of M and of the identity are eliminated one after the other; larger ones are factored.
+
+    Args:
+        matrix: M, ``[*B, N, N]``, with both triangles.
+        ridge: is added to the diagonal.
+
+    Returns:
+        M⁻¹, ``[*B, N, N]``, and log det M, ``[*B, 1]``. NaN where M is not positive definite.
+
+    Examples:
+        >>> inverse, log_det = inverse_of(torch.tensor([[2.0, 1.0], [1.0, 1.0]]))
+        >>> inverse.round(decimals=4), log_det.abs() < 1e-6
+        (tensor([[ 1., -1.],
+                [-1.,  2.]]), tensor([True]))
+    """
+    size = matrix.shape[-1]
+    identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    matrix = torch.add(matrix, identity, alpha=ridge) if ridge else matrix
+    if not 0 < size <= LARGEST:
+        factor, info = torch.linalg.cholesky_ex(matrix)
+        factor = torch.where((info == 0)[..., None, None], factor, torch.nan)
+        root = torch.linalg.solve_triangular(factor, identity, upper=False)
+        return root.mT @ root, 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+    rest, rows, pivots = torch.cat([matrix, identity], -1), [], []
+    for _ in range(size):  # what is left of the table has one row and one column less each time
+        pivots.append(torch.threshold(rest[..., :1, :1], 0, torch.nan))
+        rows.append(rest[..., :1, 1:] * pivots[-1].rsqrt())
+        if rest.shape[-2] > 1:
+            column = rows[-1][..., : rest.shape[-2] - 1]
+            rest = torch.addcmul(rest[..., 1:, 1:], column.mT, rows[-1], value=-1)
+    root = torch.cat([row[..., -size:] for row in rows], -2)  # L⁻¹
+    return root.mT @ root, torch.cat(pivots, -2).log().sum(-2)
 
 
 def solve_written_out(gram: Tensor, cross: Tensor, shift: Tensor, mean_shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:

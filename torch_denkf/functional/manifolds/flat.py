@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Sequence
-from itertools import groupby
 
 import torch
 from torch import Tensor
@@ -46,8 +45,10 @@ class Flat(Space):
         self._angles = len(self.circular)
         for component in self.circular:
             check_number("circular", component, least=0, below=size)
-        runs = groupby(range(size), lambda index: index in self.circular)
-        self._runs = tuple((turns, len(list(run))) for turns, run in runs)  # side by side: whether angles, how many
+        turns = [index in self.circular for index in range(size)]  # no groupby, which torch.compile cannot trace
+        ends = [index for index in range(1, size + 1) if index == size or turns[index] != turns[index - 1]]
+        runs = zip((0, *ends[:-1]), ends, strict=True)  # side by side: whether angles, how many
+        self._runs = tuple((turns[begin], end - begin) for begin, end in runs)
 
     def __repr__(self):
         return f"Flat(size={self.size}, circular={self.circular})"
@@ -64,7 +65,7 @@ class Flat(Space):
         return self
 
     @property
-    def parts(self) -> tuple[Space, ...]:
+    def parts(self) -> tuple[Space, ...]:  # type: ignore[override]
         """The lines that stand side by side, and each circle."""
         return tuple(
             part for turns, count in self._runs for part in ([Circle()] * count if turns else [Euclidean(count)])
@@ -152,15 +153,19 @@ class Flat(Space):
         if len(self.circular) == self.size:
             return of_circles(*values)
         if len(self._runs) > _RUNS:
-            turns = torch.tensor([index in self.circular for index in range(self.size)], device=values[0].device)
+            place = torch.arange(self.size, device=values[0].device)
+            turns = sum(((place == index) for index in self.circular[1:]), place == self.circular[0])
             both = zip(of_circles(*values), of_lines(*values), strict=True)
             return tuple(torch.where(turns, circles, lines) for circles, lines in both)
         runs = zip(*(value.split([count for _, count in self._runs], -1) for value in values), strict=True)
         parts = [(of_circles if turns else of_lines)(*own) for (turns, _), own in zip(self._runs, runs, strict=True)]
         return tuple(torch.cat(own, -1) for own in zip(*parts, strict=True))
 
-    def _whole(self, known):
-        return known, known
+    def told(self, observed):
+        """The mask itself: numbers are hidden one by one."""
+        return observed, observed
+
+    _whole = told
 
 
 class Euclidean(Flat):

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf.functional.manifolds.flat import Flat
-from torch_denkf.functional.manifolds.space import Space, blocks, eye
+from torch_denkf.functional.manifolds.space import Space, blocks, eye, side_by_side
 
 __all__ = ["Opposite", "Place", "Product", "Repeated", "places_of", "whole_parts"]
 
@@ -48,12 +48,17 @@ class Opposite(Space):
         return self.part.tangent_dim
 
     @property
+    def parts(self) -> Sequence[Space]:  # type: ignore[override]
+        """Those of the space, each with its steps on the other side."""
+        return tuple(part.flat or Opposite(part) for part in self.part.parts)
+
+    @property
     def _angles(self) -> int:  # type: ignore[override]
         return self.part._angles
 
     def compose(self, first, second):
         """The second, then the first."""
-        return self.part.compose(second, first)
+        return self.part.compose(self.part.normalise(second), first)  # a reading may be so to rounding alone
 
     def inverse(self, point):
         """That of the space."""
@@ -214,9 +219,14 @@ class Repeated(Space):
         return self.count * self.part.tangent_dim
 
     @property
+    def parts(self) -> Sequence[Space]:  # type: ignore[override]
+        """N times the same."""
+        return (self.part,) * self.count
+
+    @property
     def flat(self):
         """The parts side by side, where these are lines and circles."""
-        return _joined([self.part] * self.count)
+        return _joined(self.parts)
 
     def compose(self, first, second):
         """Point by point."""
@@ -299,7 +309,7 @@ def places_of(space: Space) -> list[Place]:
     todo = [space]
     while todo:
         part = todo.pop(0)
-        if isinstance(part, Product) or (isinstance(part, Flat) and len(part.parts) > 1):
+        if part.parts and tuple(part.parts) != (part,):
             todo = [*part.parts, *todo]
             continue
         ends = point + part.point_dim, tangent + part.tangent_dim
@@ -325,12 +335,7 @@ def whole_parts(space: Space, known: Tensor) -> tuple[Tensor, Tensor]:
         >>> whole_parts(Product(SO3(), Euclidean(2)), torch.tensor([True, True, False, True, True, False]))[1]
         tensor([False, False, False,  True, False])
     """
-    points, tangents = [], []
-    for place in places_of(space):
-        whole, told = place.space._whole(known[..., place.point])
-        points.append(whole)
-        tangents.append(told)
-    return torch.cat(points, -1), torch.cat(tangents, -1)
+    return side_by_side([place.space._whole(known[..., place.point]) for place in places_of(space)])
 
 
 def _joined(parts: Sequence[Space]) -> Flat | None:

@@ -26,7 +26,8 @@ def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
 
 def rotation_matrix(quaternion: Tensor) -> Tensor:
     """The matrix ``[*, 3, 3]`` of a quaternion ``[*, 4]``: its columns are the body's axes in the world's."""
-    return torch.stack([rotate(quaternion, axis) for axis in torch.eye(3).to(quaternion)], -1)
+    axes = torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)
+    return torch.stack([rotate(quaternion, axis) for axis in axes], -1)
 
 
 def quaternion_of(matrix: Tensor) -> Tensor:

@@ -18,12 +18,21 @@ from torch_denkf.functional.manifolds.quaternions import (
     skew,
     unit,
 )
-from torch_denkf.functional.manifolds.space import Space, blocks, eye
+from torch_denkf.functional.manifolds.space import Space, blocks, eye, side_by_side
 
 __all__ = ["SE2", "SE3", "SE23", "SO3", "Turned"]
 
 _SMALL = {torch.float32: 0.25, torch.float64: 1e-2}  # angles squared below which a series is as exact as the formula
 _NEAR = {torch.float32: 1e-2, torch.float64: 1e-4}  # tangents squared below which the arc tangent's series is as exact
+
+
+def _one_by_one(self: Space, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Narrows a mask of tangents to a whole rotation and whole vectors, which are told apart."""
+    turn, size = known[..., : self._angles].all(-1, keepdim=True), 2 if self._angles == 1 else 3
+    vectors = known[..., self._angles :].unflatten(-1, ((self.tangent_dim - self._angles) // size, size))
+    vectors = vectors.all(-1).repeat_interleave(size, -1)
+    turns = [turn.repeat_interleave(count, -1) for count in (self.point_dim - vectors.shape[-1], self._angles)]
+    return side_by_side([(turns[0], turns[1]), (vectors, vectors)])
 
 
 @dataclass(frozen=True)
@@ -38,6 +47,7 @@ class SE2(Space):
 
     point_dim = tangent_dim = 3
     _angles = 1
+    _told = _one_by_one
 
     def compose(self, first, second):
         """The second pose, seen from the first one's axes."""
@@ -121,6 +131,7 @@ class _RotationAndVectors(Space):
 
     vectors: int
     _angles = 3
+    _told = _one_by_one
 
     @property
     def point_dim(self) -> int:  # type: ignore[override]

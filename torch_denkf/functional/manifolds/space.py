@@ -31,6 +31,7 @@ class Space:
 
     point_dim: int
     tangent_dim: int
+    parts: Sequence[Space] = ()  # of which it is made, if it is made of others
     _angles = 0  # leading numbers of a tangent that are a rotation
 
     @property
@@ -131,11 +132,27 @@ class Space:
     def innovation(self, reading: Tensor, expected: Tensor, observed: Tensor | None = None) -> Tensor:
         """The shortest tangent ``[*, D]`` from an expected reading to the one that came, both ``[*, P]``.
 
-        Behind a mask ``[*, 1]`` or ``[*, D]`` a reading may be NaN: what is expected stands in its place there.
+        Where a mask ``[*, 1]`` or ``[*, D]`` hides the reading, see :meth:`told`, the expected one stands in its place:
+        no number there, a zero or NaN, has a part in a value or a gradient.
         """
+        self.check(reading=reading, expected=expected)
         if observed is not None:
-            reading = torch.where(observed.all(-1, keepdim=True) | reading.isfinite(), reading, expected)
+            reading = torch.where(self.told(observed)[0], reading, expected)
         return self.minus(*torch.broadcast_tensors(reading, expected))
+
+    def told(self, observed: Tensor) -> tuple[Tensor, Tensor]:
+        """Narrows a mask ``[*, D]`` to whole rotations and vectors: the numbers of one that is hidden in part mix.
+
+        Returns:
+            The mask of a point's numbers ``[*, P]``, and of a tangent's ``[*, D]``. One ``[*, 1]`` stays.
+        """
+        if observed.shape[-1] == 1:
+            return observed, observed
+        self.check(observed=observed)
+        if not self.parts:
+            return self._told(observed)
+        apart = observed.split([part.tangent_dim for part in self.parts], -1)
+        return side_by_side([part.told(own) for part, own in zip(self.parts, apart, strict=True)])
 
     def align(self, predicted: Tensor, reading: Tensor, observed: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Maps predictions and a reading to plain numbers, which can be averaged and subtracted.
@@ -151,32 +168,37 @@ class Space:
             Numbers ``[*B, E, D]``, and ``[*B, D]`` or ``[*B, E, D]``.
         """
         center = self.near(predicted)
-        expected = center.unsqueeze(-2)
+        expected, mask = center.unsqueeze(-2), None if observed is None else observed.unsqueeze(-2)
         if reading.ndim < predicted.ndim:
-            return self.minus(predicted, expected), self.innovation(reading, center, observed)
-        mask = None if observed is None else observed.unsqueeze(-2)
-        return self.minus(predicted, expected), self.innovation(reading, expected, mask)
+            return self.innovation(predicted, expected, mask), self.innovation(reading, center, observed)
+        return self.innovation(predicted, expected, mask), self.innovation(reading, expected, mask)
 
     def _whole(self, known: Tensor) -> tuple[Tensor, Tensor]:
         """Returns :func:`whole_parts` of a space that is no product."""
         known = known.all(-1, keepdim=True)
         return known.expand(*known.shape[:-1], self.point_dim), known.expand(*known.shape[:-1], self.tangent_dim)
 
+    _told = _whole  # of a mask of tangents
+
     def perturb(self, point: Tensor, std: Tensor, noise: Tensor) -> Tensor:
         """A random point ``[*, P]``: standard normal ``noise`` ``[*, D]`` times standard deviations ``[*, D]`` away."""
         return self.plus(point, std * noise)
 
     def check(self, **values: Tensor) -> None:
-        """Raises unless the last dimension of each value, ``tangent`` or any point, has the right size.
+        """Raises unless the last dimension of each value has the right size, and no point is boolean.
+
+        Args:
+            **values: a ``tangent``, the mask of one, ``observed``, and any points.
 
         Raises:
             ValueError: if it has not; names the value.
         """
         for name, value in values.items():
-            due = self.tangent_dim if name == "tangent" else self.point_dim
-            if value.shape[-1:] != (due,):
-                kind = "tangent" if name == "tangent" else "point"
-                raise ValueError(f"{name} has shape {list(value.shape)}; a {kind} of {self} is [*, {due}].")
+            kind = "tangent" if name in ("tangent", "observed") else "point"
+            due = self.tangent_dim if kind == "tangent" else self.point_dim
+            flags = " of flags" if value.dtype == torch.bool and name != "observed" else ""
+            if flags or value.shape[-1:] != (due,):
+                raise ValueError(f"{name} has shape {list(value.shape)}{flags}; a {kind} of {self} is [*, {due}].")
 
 
 def check_space(name: str, space: Space | None, *, flat: bool = False) -> Space | None:
@@ -213,6 +235,12 @@ def is_flat(*spaces: Space | None) -> bool:
 def eye(like: Tensor, size: int) -> Tensor:
     """Returns the identity ``[*, size, size]`` for points ``[*, N]``."""
     return torch.eye(size, dtype=like.dtype, device=like.device).expand(*like.shape[:-1], size, size)
+
+
+def side_by_side(parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Joins masks of the points and tangents of parts."""
+    points, tangents = zip(*parts, strict=True)
+    return torch.cat(points, -1), torch.cat(tangents, -1)
 
 
 def blocks(parts: Sequence[Tensor]) -> Tensor:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_ensemble, check_number, check_shape
-from torch_denkf.functional.linalg import cholesky, semidefinite_solve
+from torch_denkf.functional.linalg import semidefinite_solve, solve
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_anomalies
 from torch_denkf.functional.smoothing.rts import check_lag
@@ -71,8 +71,8 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping:
     level = torch.where(level > 0, level, 1)  # members without any spread: nothing is learned, and nothing is singular
     ridge = 10 * size * torch.finfo(gram.dtype).eps
     identity = torch.eye(size, dtype=gram.dtype, device=gram.device)
-    factor = cholesky(gram + level * (1 / size + ridge * identity))
-    return ensemble + torch.cholesky_solve(scaled @ (shift * scale).mT, factor).mT @ anomalies
+    weights = solve(gram + level * (1 / size + ridge * identity), scaled @ (shift * scale).mT)
+    return ensemble + weights.mT @ anomalies
 
 
 def enrts_smooth(

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_ensemble, check_shape
-from torch_denkf.functional.linalg import cholesky, inverse_square_root
+from torch_denkf.functional.linalg import inverse_square_root, solve
 
 
 def iterated_smoothing(
@@ -83,7 +83,7 @@ def iterated_smoothing(
         slopes = inverse @ ((predicted - expected) * scale)
         gram = slopes @ slopes.mT
         gradient = slopes @ ((observation.unsqueeze(-2) - expected) * scale).mT - weights
-        weights = weights + torch.cholesky_solve(gradient, cholesky(identity + gram))
+        weights = weights + solve(identity + gram, gradient)
         transform = inverse_square_root(gram)
         inverse = transform + gram @ transform
         members = mean + (weights.mT + transform) @ anomalies

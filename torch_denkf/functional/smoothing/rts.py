@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_count, check_shape
-from torch_denkf.functional.linalg import semidefinite_solve
+from torch_denkf.functional.linalg import divide, semidefinite_solve
 from torch_denkf.functional.manifolds import Space
 
 
@@ -35,6 +35,32 @@ def smoothing_gain(cross: Tensor, forecast_cov: Tensor) -> Tensor:
     return semidefinite_solve(forecast_cov, cross.mT).mT
 
 
+def left_open(gain: Tensor, before: Tensor, middle: Tensor, after: Tensor, noise: Tensor) -> Tensor:
+    """Returns the covariance of the state at t where that of t + 1 is known, in Joseph's form.
+
+    (A − G B) M (A − G B)ᵀ + G Q Gᵀ equals P − G P_f Gᵀ. Round-off leaves it positive where P is far larger than Q, as
+    at the start of a run that knows little.
+
+    Args:
+        gain: G, ``[*B, S, S]``.
+        before: A, ``[*B, S, N]``, with P = A M Aᵀ at t; for a linear transition the identity.
+        middle: M, ``[*B, N, N]``; for a linear transition P.
+        after: B, ``[*B, S, N]``, with P_f = B M Bᵀ + Q at t + 1; for a linear transition F.
+        noise: Q, ``[*B, S, S]``.
+
+    Returns:
+        ``[*B, S, S]``.
+
+    Examples:
+        >>> import torch
+        >>> one = torch.ones(1, 1)
+        >>> left_open(0.5 * one, one, one, one, one)
+        tensor([[0.5000]])
+    """
+    rest = before - gain @ after
+    return rest @ middle @ rest.mT + gain @ noise @ gain.mT
+
+
 def rts_step(
     mean: Tensor,
     cov: Tensor,
@@ -44,6 +70,7 @@ def rts_step(
     smoothed_mean: Tensor,
     smoothed_cov: Tensor,
     *,
+    open_cov: Tensor | None = None,
     space: Space | None = None,
 ) -> tuple[Tensor, Tensor]:
     """One step back in time: the smoothed belief of t from that of t + 1.
@@ -58,6 +85,7 @@ def rts_step(
         cross: C, the covariance of the states at t and t + 1 in that forecast, ``[*B, S, S]``, rows at t.
         smoothed_mean: of t + 1, ``[*B, S]``.
         smoothed_cov: P_s of t + 1, ``[*B, S, S]``.
+        open_cov: P − G P_f Gᵀ, see :func:`left_open`; ``None`` for the difference itself.
         space: in which the state lives: means are points, and each covariance is of the tangents at its mean. ``None``
             for plain numbers.
 
@@ -83,15 +111,16 @@ def rts_step(
     for name, value in (("cov", cov), ("forecast_cov", forecast_cov), ("cross", cross), ("smoothed_cov", smoothed_cov)):
         check_shape(name, value, square, "[*B, S, S]")
     gain = smoothing_gain(cross, forecast_cov)
+    rest = cov - gain @ cross.mT if open_cov is None else open_cov
     if space is None:
         shift = gain @ (smoothed_mean - forecast_mean).unsqueeze(-1)
-        out = cov - gain @ cross.mT + gain @ smoothed_cov @ gain.mT
+        out = rest + gain @ smoothed_cov @ gain.mT
         return mean + shift.squeeze(-1), (out + out.mT) / 2
     learned = space.minus(smoothed_mean, forecast_mean)
-    back = gain @ torch.linalg.inv(space.right_jacobian(learned))  # from the tangents at the smoothed mean
+    back = divide(gain, space.right_jacobian(learned))  # from the tangents at the smoothed mean
     step = (gain @ learned.unsqueeze(-1)).squeeze(-1)
     turn = space.right_jacobian(step)  # to the tangents at the new mean
-    out = turn @ (cov - gain @ cross.mT + back @ smoothed_cov @ back.mT) @ turn.mT
+    out = turn @ (rest + back @ smoothed_cov @ back.mT) @ turn.mT
     return space.plus(mean, step), (out + out.mT) / 2
 
 
@@ -101,6 +130,7 @@ def rts_smooth(
     forecast_mean: Tensor,
     forecast_cov: Tensor,
     cross: Tensor,
+    open_cov: Tensor | None = None,
     *,
     follows: Tensor | None = None,
     lag: int | None = None,
@@ -114,6 +144,7 @@ def rts_smooth(
         forecast_mean: of each time, made from the belief before it, ``[*B, T, S]``.
         forecast_cov: its covariance, ``[*B, T, S, S]``.
         cross: the covariance of the state before and the state at each time, ``[*B, T, S, S]``, rows before.
+        open_cov: of the step to each time, see :func:`rts_step`, ``[*B, T, S, S]``.
         follows: boolean ``[*B, T]``; False where an element is not a step on from the one before it, such as the first
             of an episode: nothing flows back from there. The first element's is not read. None: all follow.
         lag: how many later readings count: the belief of t given those up to t + lag. None: all of the sequence.
@@ -142,7 +173,8 @@ def rts_smooth(
     def back(index: slice | int, later_mean: Tensor, later_cov: Tensor) -> tuple[Tensor, Tensor]:
         own = before[..., index, :], before_cov[..., index, :, :]
         step = forecast[..., index, :], predicted_cov[..., index, :, :], link[..., index, :, :]
-        new_mean, new_cov = rts_step(*own, *step, later_mean, later_cov, space=space)
+        rest = None if open_cov is None else open_cov[..., 1:, :, :][..., index, :, :]
+        new_mean, new_cov = rts_step(*own, *step, later_mean, later_cov, open_cov=rest, space=space)
         if follows is None:
             return new_mean, new_cov
         joined = follows[..., index].unsqueeze(-1)

@@ -214,6 +214,8 @@ def test_mistakes_are_one_line(kitti, checkpoint, tmp_path, capsys):
     large.write_text("fx=718 fy=718 cx=607 cy=185")
     (tmp_path / "empty").mkdir()
     (tmp_path / "notes.txt").write_text("fx: 700\n")
+    many = tmp_path / "many.txt"
+    many.write_text("".join(f"{0.1 * n}\n" for n in range(99)))
     (tmp_path / "drive.mp4").write_bytes(b"no video")
     (tmp_path / "path.csv").write_text("a,b\n1,2\n")
     times = ["--times", drive / "times.txt"]
@@ -225,6 +227,7 @@ def test_mistakes_are_one_line(kitti, checkpoint, tmp_path, capsys):
         (["--height", "165", *times], "height must be .* It is that of the camera over the road, in m"),
         (["--fps", "2"], r"frames are 0\.5 s apart, but the filter moves in steps of 0\.103 s"),
         (["--fps", "10", *times], "--fps or --times, not both"),
+        (["--times", many], "many.txt has 99 times, but .*image_2 has 12 frames; pass a row for each"),
         (["--times", large], r"large\.txt:1: expected a time in s"),
         (["--times", kitti / "poses/b.txt"], "times must increase"),
     ]

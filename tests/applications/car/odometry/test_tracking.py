@@ -1,5 +1,6 @@
 """Tracking frame by frame equals filtering the whole drive; cameras that do not fit are noticed."""
 
+import os
 import warnings
 import weakref
 from itertools import pairwise
@@ -221,3 +222,56 @@ def test_a_damaged_frame_of_a_video_is_missing(tmp_path):
     data[starts[5] : starts[5] + 2000] = bytes(2000)
     file.write_bytes(data)
     assert [frame is None for frame in read_frames(file)] == [k == 5 for k in range(8)]
+
+
+@pytest.mark.parametrize("blank", [0, 8, 255, 250, 127, (255, 0, 0), (20, 20, 240)])
+def test_a_frame_of_one_colour_is_missing(blank, checkpoint, drive):
+    """It shows nothing, whatever its colour; a few pixels in it, or a little noise, are no street."""
+    car, good = from_pretrained(checkpoint), calibration_of(drive)
+    images = [np.repeat(image[..., None], 3, -1) for image in frames_of(drive)[:6]]
+    covered = np.full_like(images[3], blank)
+    covered[5, 5] = 128
+    covered = (covered + np.random.default_rng(0).integers(0, 2, covered.shape)).clip(0, 255).astype(np.uint8)
+    if blank == 255:
+        covered[:] = 255
+    if blank == 8:
+        covered[:] = 8
+    expected = list(track(car, [*images[:3], None, *images[4:]], good))
+    found = list(track(car, [*images[:3], covered, *images[4:]], good))
+    assert [belief.observed for belief in found] == [False, True, True, False, True, True]
+    for belief, other in zip(found, expected, strict=True):
+        assert belief.mean.equal(other.mean)
+    whole = list(track(car, [*images[:3], covered, *images[4:]], good, black_level=None))
+    assert [belief.observed for belief in whole] == [False, True, True, True, True, True]
+    with pytest.raises(ValueError, match=r"no two frames .* black or of one colour all over do not count"):
+        list(track(car, [covered] * 4, good))
+
+
+def test_low_contrast_is_no_single_colour(checkpoint, drive):
+    """Fog and night: a quarter and a tenth of the contrast."""
+    car, good = from_pretrained(checkpoint), calibration_of(drive)
+    for share, offset in ((0.25, 180), (0.1, 0)):
+        images = [(image * share + offset).astype(np.uint8) for image in frames_of(drive)[:4]]
+        assert [belief.observed for belief in track(car, images, good)] == [False, True, True, True]
+
+
+def test_more_times_than_frames(checkpoint, drive):
+    car, images, good = from_pretrained(checkpoint), frames_of(drive)[:4], calibration_of(drive)
+    with pytest.warns(UserWarning, match="the track: 'times' has 3 more than the 4 frames; pass a time for each"):
+        list(track(car, images, good, times=[0.1 * number for number in range(7)]))
+
+
+def test_a_folder_of_images_that_counts_a_frame_twice_or_hangs(tmp_path):
+    for name in ("000001.png", "000002.png", "000003.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((4, 6), np.uint8))
+    assert len(list(read_frames(tmp_path))) == 3
+    (tmp_path / "000002.jpg").write_bytes((tmp_path / "000002.png").read_bytes())
+    with pytest.raises(ValueError, match=r"000002.png and 000002.jpg are two images of one name"):
+        read_frames(tmp_path)
+    (tmp_path / "000002.jpg").rename(tmp_path / "2.jpg")
+    with pytest.raises(ValueError, match=r"has two images of one number, 2.jpg, 000002.png"):
+        read_frames(tmp_path)
+    (tmp_path / "2.jpg").unlink()
+    os.mkfifo(tmp_path / "000004.png")
+    with pytest.raises(ValueError, match=r"000004.png is no file, but a pipe"):
+        read_frames(tmp_path)

@@ -16,6 +16,7 @@ from torch_denkf.applications.car.odometry.roles import assign_roles
 from torch_denkf.applications.car.odometry.scores import calibrate
 from torch_denkf.applications.car.odometry.streams import Drive, all_frames, lose_frames, read_spans, take_spans
 from torch_denkf.applications.car.odometry.training import Updates, train_car_filter
+from torch_denkf.deployment.folder import described
 from torch_denkf.pretrained import from_pretrained
 from torch_denkf.training import FilterTrainer
 
@@ -180,7 +181,7 @@ def test_damaged_folders_are_named(checkpoint, tmp_path):
     def change(**settings):
         content = json.loads(good)
         content["settings"] |= settings
-        config.write_text(json.dumps(content))
+        config.write_text(described(content))
 
     change(ensemble_size=16)
     with pytest.raises(ValueError, match=r"weights\.safetensors does not fit config\.json"):

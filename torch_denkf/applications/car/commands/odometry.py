@@ -48,7 +48,7 @@ class Odometry(Command):
     height: float = KITTI_HEIGHT  # of the camera over the road, m: it scales the path
     pitch: float = 0.0  # how far the camera looks up from the road, rad
     seed: int = 0  # of the filter's noise
-    black_level: int | None = 8  # frames none of whose pixels is brighter, of 255, count as missing
+    black_level: int | None = 8  # frames that are black or of one colour to so many of 255 grey values are missing
     repair: bool = True  # leave the flow as it is where something stands still before the moving camera
     pictures: bool = True  # leave the pictures out
     threads: int = 1  # of torch and OpenCV
@@ -146,9 +146,12 @@ def _times(file: Path | None, source) -> Sequence[float] | None:
     times = read_times(file)
     if source.count is None or len(times) == source.count:
         return times
-    if len(times) >= source.first + source.count:
+    if source.first and len(times) >= source.first + source.count:
         return times[source.first : source.first + source.count]
-    raise ValueError(f"{file} has {len(times)} times, but {source.path} has {source.count} frames")
+    numbered = f", numbered from {source.first}" if source.first else ""
+    raise ValueError(
+        f"{file} has {len(times)} times, but {source.path} has {source.count} frames{numbered}; pass a row for each"
+    )
 
 
 def _uneven(source) -> Sequence[float] | None:

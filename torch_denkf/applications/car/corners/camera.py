@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from torch_denkf._checks import check_number
 
 __all__ = ["StereoCamera"]
 
@@ -24,6 +27,9 @@ class StereoCamera:
         radial: an image's radius is too large by the factor ``1 + radial[0] + radial[1] r^2 + radial[2] r^4``.
         disparity_offset: what disparities are short of, in pixels: what to multiply 1, x, y, x^2, xy, y^2 and r^4 with,
             or the first of it.
+
+    Raises:
+        ValueError: if a number is not finite, ``focal`` or ``baseline`` is not positive, or there are too many or few.
     """
 
     focal: float
@@ -31,6 +37,16 @@ class StereoCamera:
     baseline: float
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
     disparity_offset: tuple[float, ...] = (0.0,)
+
+    def __post_init__(self):
+        check_number("focal", self.focal, above=0, cure="It is in pixels")
+        check_number("baseline", self.baseline, above=0, most=100, cure="It is in m")
+        for name, counts in (("center", [2]), ("radial", [3]), ("disparity_offset", range(1, 8))):
+            numbers = getattr(self, name)
+            if isinstance(numbers, str) or not isinstance(numbers, Sequence) or len(numbers) not in counts:
+                raise ValueError(f"{name} must be {' or '.join(map(str, counts))} numbers; got {numbers!r}")
+            for number in numbers:
+                check_number(f"each number of {name}", number)
 
     def corners(self, pixels: Tensor) -> Tensor:
         """Corners ``[*, 3]`` of what a tracker gives, ``[*, 4]``: u left, v left, u right, v right."""

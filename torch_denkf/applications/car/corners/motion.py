@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import cv2
@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torch_denkf._checks import check_count, check_number, check_shape
 from torch_denkf.applications.car.corners.camera import StereoCamera
 from torch_denkf.functional.manifolds import SE3, SO3, quaternion_of, rotate, rotation_matrix, skew
 
@@ -36,6 +37,9 @@ class CornerNoise:
         stereo_stale: what it is multiplied with where a corner has been through rows that repeat the one before.
         stereo_walk: how much it changes from row to row.
         freedom: degrees of freedom of Student's t, by which outliers count less.
+
+    Raises:
+        ValueError: if a number is negative or not finite, or ``pixel``, ``disparity`` or ``freedom`` is zero.
     """
 
     pixel: float = 0.06
@@ -48,6 +52,11 @@ class CornerNoise:
     stereo_stale: float = 1.0
     stereo_walk: float = 0.1
     freedom: float = 1.4
+
+    def __post_init__(self):
+        for each in fields(self):
+            above = 0 if each.name in ("pixel", "disparity", "freedom") else None
+            check_number(each.name, getattr(self, each.name), least=0, above=above)
 
     def stereo_var(self, corners: Tensor, offset: Tensor, stale: Tensor) -> Tensor:
         """Variance of the error that stays with a corner, ``[*]`` in pixels^2, before anything is seen of it.
@@ -111,9 +120,16 @@ def corner_motion(
         steps: of Gauss-Newton.
 
     Returns:
-        A :class:`CornerMotion`; where fewer than four corners are seen, the covariance means nothing.
+        A :class:`CornerMotion`; where fewer than four corners are seen, the covariance means nothing. Corners that are
+        not finite, or have a disparity below half a pixel, count as not seen.
+
+    Raises:
+        ValueError: if the shapes do not go together, or ``seen`` is not boolean.
     """
     noise = CornerNoise() if noise is None else noise
+    check_count("steps", steps, least=0)
+    _check_shapes(before, after, seen, stereo_var, start)
+    seen = seen & before.isfinite().all(-1) & after.isfinite().all(-1)
     seen = seen & (before[..., 2] > 0.5) & (after[..., 2] > 0.5)
     before = torch.where(seen.unsqueeze(-1), before, before.new_tensor([*camera.center, 10.0]))
     after = torch.where(seen.unsqueeze(-1), after, before)
@@ -153,7 +169,21 @@ def corner_motion(
     gain = (stays.unsqueeze(-1) * (own - through)).unsqueeze(-2) @ inverse  # of the error that stays
     error = (gain @ left.unsqueeze(-1))[..., 0, 0]
     var = stays - stays * (gain @ (own - through).unsqueeze(-1))[..., 0, 0]
+    error, var = torch.where(ahead, error, 0.0), torch.where(ahead, var, stays)
     return CornerMotion(pose, torch.linalg.inv(information), mean, weight, error, var)
+
+
+def _check_shapes(before: Tensor, after: Tensor, seen: Tensor, stereo_var: Tensor | None, start: Tensor | None) -> None:
+    if before.ndim < 2 or before.shape[-1] != 3:
+        raise ValueError(f"before must be corners (u, v, disparity), [*B, N, 3]; got {list(before.shape)}")
+    check_shape("after", after, before.shape, "[*B, N, 3], as before")
+    check_shape("seen", seen, before.shape[:-1], "[*B, N]")
+    if seen.dtype != torch.bool:
+        raise ValueError(f"seen must be boolean; got {seen.dtype}")
+    if stereo_var is not None:
+        check_shape("stereo_var", stereo_var, before.shape[:-1], "[*B, N]")
+    if start is not None:
+        check_shape("start", start, (*before.shape[:-2], 7), "[*B, 7], points of SE3")
 
 
 def corner_motions(

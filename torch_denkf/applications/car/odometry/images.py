@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 
 from torch_denkf.applications.car.kitti.files import read_calibration
-from torch_denkf.data.pictures import is_bomb
+from torch_denkf.data.pictures import is_bomb, picture_files
 from torch_denkf.data.text import read_number
+from torch_denkf.deployment.files import name_for_c
 
 __all__ = ["FrameSource", "read_camera", "read_frames", "read_times"]
 
@@ -153,7 +154,7 @@ class FrameSource:
 
     def _video(self, pictures: bool = True) -> Iterator[tuple[float | None, np.ndarray | None]]:
         """Times in s and, if asked for, frames; ``None`` where a frame is missing."""
-        video = cv2.VideoCapture(str(self.path))
+        video = cv2.VideoCapture(name_for_c(self.path))
         try:
             # A failed read is the end, which comes before or after the guessed count, or a damaged frame before it.
             expected, read, missing, there = video.get(cv2.CAP_PROP_FRAME_COUNT), 0, 0, True
@@ -191,7 +192,8 @@ def read_frames(path: str | Path) -> FrameSource:
 
     Raises:
         FileNotFoundError: if there is nothing at ``path``, or no image in the folder.
-        ValueError: if the file is not a video that OpenCV decodes.
+        ValueError: if the file is not a video that OpenCV decodes, its name is no UTF-8, two images are of one frame,
+            or an image is no file, but a pipe.
 
     Example:
         >>> import tempfile
@@ -204,21 +206,21 @@ def read_frames(path: str | Path) -> FrameSource:
     """
     path = Path(path).expanduser()
     if path.is_dir():
-        files = sorted(
-            (f for f in path.iterdir() if f.suffix.lower() in _IMAGES and not f.name.startswith(".")),
-            key=lambda f: _natural(f.name),
-        )
+        files = sorted(picture_files(path, _IMAGES), key=lambda f: _natural(f.name))
         if not files:
             raise FileNotFoundError(f"no images in {path}; expected png, jpg, bmp, tif, pgm, ppm or webp files")
         numbers = [int(file.stem) if file.stem.isdigit() else -1 for file in files]
         span = numbers[-1] - numbers[0] + 1
-        if min(numbers) < 0 or len(set(numbers)) < len(numbers) or span > 2 * len(numbers) + 10:
+        if min(numbers) >= 0 and len(set(numbers)) < len(numbers):
+            twice = [file.name for file, number in zip(files, numbers, strict=True) if numbers.count(number) > 1]
+            raise ValueError(f"{path} has two images of one number, {', '.join(twice[:2])}; take one out of the folder")
+        if min(numbers) < 0 or span > 2 * len(numbers) + 10:
             return FrameSource(path, list(files), 0, len(files), None)
         of = dict(zip(numbers, files, strict=True))
         return FrameSource(path, [of.get(n) for n in range(numbers[0], numbers[-1] + 1)], numbers[0], span, None)
     if not path.is_file():
         raise FileNotFoundError(f"nothing at {path}; pass a folder of images or a video")
-    video = cv2.VideoCapture(str(path))
+    video = cv2.VideoCapture(name_for_c(path))
     there, _ = video.read()
     fps, count = video.get(cv2.CAP_PROP_FPS), int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     video.release()

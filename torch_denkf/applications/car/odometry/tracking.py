@@ -17,6 +17,7 @@ from torch_denkf.applications.car.odometry.camera import CarCamera, check_frame
 from torch_denkf.applications.car.odometry.filter import VELOCITIES, CarFilter
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE, TWO_VIEW_SHAPE
+from torch_denkf.diagnosis.logs import warn_of_log
 
 __all__ = ["TrackedBelief", "track"]
 
@@ -84,7 +85,9 @@ def track(
         height: of the camera over the road, in m.
         pitch: how far the camera looks up from the road, in rad; -0.04 to 0.02 are found out without.
         black_level: a frame counts as missing if it is black all over: at most a thousandth of its pixels is brighter
-            than this grey value, of 255. No street looks like that, not even at night. ``None`` checks nothing.
+            than this grey value, of 255. No street looks like that, not even at night. Likewise if it is white, or of
+            any other colour, all over: at most a thousandth is farther than half of this from the pixel in the middle
+            of all. ``None`` checks nothing.
         repair: whether the flow is continued over what stands still before the moving camera, see
             ``vision.signs.static_region``.
         seed: of the filter's noise.
@@ -120,22 +123,27 @@ def track(
 
 
 def _seen(frames: Iterable[np.ndarray | None], black_level: int | None) -> Iterator[np.ndarray | None]:
-    """The frames, ``None`` for those that are missing or black."""
+    """The frames, ``None`` for those that are missing, black or of one colour."""
     for number, frame in enumerate(frames):
         if frame is not None:
             check_frame(frame, number)
-        yield None if frame is None or (black_level is not None and _is_black(frame, black_level)) else frame
+        yield None if frame is None or (black_level is not None and _is_blank(frame, black_level)) else frame
 
 
-def _is_black(frame: np.ndarray, level: int) -> bool:
-    """Whether hardly a pixel is brighter than the level."""
-    return float((frame > level).mean()) <= 1e-3
+def _is_blank(frame: np.ndarray, level: int) -> bool:
+    """Tells whether hardly a pixel is brighter than the level, or differs from the others."""
+    if float((frame > level).mean()) <= 1e-3:
+        return True
+    middle = np.median(frame[::8, ::8].reshape(-1, *frame.shape[2:]), 0)
+    other = (frame < middle - level / 2) | (frame > middle + level / 2)
+    return float(other.mean()) <= 1e-3
 
 
 def _track(car, frames, calibration, times, fps, height, pitch, repair, seed) -> Iterator[TrackedBelief]:
     settings, run, camera, done = car.settings, None, None, 0
     clock, stamps = _clock(times, fps, settings.dt)
     last: _Seen | None = None
+    number = -1
     for number, frame in enumerate(frames):
         time = next(stamps, None)
         if time is None:
@@ -165,10 +173,12 @@ def _track(car, frames, calibration, times, fps, height, pitch, repair, seed) ->
         run.step(reading, between)
         done = step
         yield run.belief(number, clock.time, reading is not None, between)._replace(hidden=hidden)
+    if times is not None and (left := sum(1 for _ in stamps)):
+        warn_of_log("the track", "times", f"has {left} more than the {number + 1} frames", "pass a time for each frame")
     if run is None:
         raise ValueError(
             f"there are no two frames at most {settings.longest} steps apart, which a path needs; those that are black "
-            "all over do not count, see black_level"
+            "or of one colour all over do not count, see black_level"
         )
 
 

@@ -1,0 +1,249 @@
+"""Recordings that contradict their metadata, are there in part, or hold numbers that float32 does not."""
+
+import json
+import warnings
+from functools import partial
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as parquet
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
+
+from tests.data.lerobot.lerobot_folder import (
+    FPS,
+    SIZE,
+    actions,
+    joints,
+    pictures,
+    write_info,
+    write_version_2,
+    write_version_3,
+)
+from torch_denkf.data import LeRobotReplay
+from torch_denkf.data.lerobot.rows import recording_from_rows
+
+open_all = partial(LeRobotReplay, size=SIZE, cache=None, split="all", progress=False)
+VIDEO = "videos/chunk-{:03d}/observation.images.top/episode_{:06d}.mkv"
+
+
+@pytest.fixture(autouse=True)
+def _no_other_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        yield
+
+
+def edit_info(root, **changes):
+    file = root / "meta/info.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+
+
+def with_lengths(root, version, lengths):
+    if version == 3:
+        write_version_3(root, [lengths])
+    else:
+        write_version_2(root, lengths)
+
+
+def announce(root, version, episode, length):
+    """Writes another length into the metadata."""
+    if version == 2:
+        file = root / "meta/episodes.jsonl"
+        entries = [json.loads(line) for line in file.read_text().splitlines()]
+        entries[episode]["length"] = length
+        file.write_text("\n".join(map(json.dumps, entries)))
+        return
+    file = root / "meta/episodes/chunk-000/file-000.parquet"
+    entries = parquet.read_table(file).to_pylist()
+    entries[episode]["length"] = length
+    parquet.write_table(pa.Table.from_pylist(entries), file)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_episode_of_no_length_that_has_rows(tmp_path, version):
+    with_lengths(tmp_path, version, [4, 5, 3])
+    announce(tmp_path, version, 1, 0)
+    with pytest.raises(ValueError, match="has 5 rows of episode 1, but the metadata says 0; download both anew"):
+        open_all(tmp_path)
+    assert len(open_all(tmp_path, episodes=[0, 2])) == 7
+
+
+def test_an_episode_that_was_given_up(tmp_path):
+    """It has neither rows nor files, or a file without its rows."""
+    write_version_2(tmp_path, [4, 5, 3])
+    announce(tmp_path, 2, 1, 0)
+    (tmp_path / "data/chunk-000/episode_000001.parquet").unlink()
+    assert [episode.number for episode in open_all(tmp_path).episodes] == [0, 2]
+
+
+@pytest.mark.parametrize("fps", [2 * FPS, FPS / 2, 1.3 * FPS])
+def test_times_that_contradict_fps(tmp_path, fps):
+    write_version_2(tmp_path, [6])
+    edit_info(tmp_path, fps=fps)
+    with pytest.raises(
+        ValueError, match=rf"episode 0: timestamps are 0.1 s apart, but fps in meta/info.json is {fps:g}"
+    ):
+        open_all(tmp_path)
+    edit_info(tmp_path, fps=1.1 * FPS)
+    assert_close(open_all(tmp_path)[:]["time"].flatten(), torch.arange(6).double() / FPS, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "announced"), [("total_episodes", 50), ("total_frames", 12), ("total_frames", "9")])
+def test_totals_of_others_than_are_listed(tmp_path, name, announced):
+    write_version_2(tmp_path, [4, 5])
+    edit_info(tmp_path, total_episodes=2, total_frames=9)
+    assert len(open_all(tmp_path)) == 9
+    edit_info(tmp_path, **{name: announced})
+    with pytest.raises(
+        ValueError, match=rf"info.json announces {name} {announced!r}, but .*episodes.jsonl lists \d; .*episodes="
+    ):
+        open_all(tmp_path)
+    assert len(open_all(tmp_path, episodes=[0, 1])) == 9
+
+
+@pytest.mark.parametrize("name", ["actions", "observation.command", "motor_cmd"])
+def test_commands_under_another_name(tmp_path, name):
+    write_version_2(tmp_path, [4])
+    info = json.loads((tmp_path / "meta/info.json").read_text())
+    features = {name if key == "action" else key: one for key, one in info["features"].items()}
+    edit_info(tmp_path, features=features)
+    file = tmp_path / "data/chunk-000/episode_000000.parquet"
+    table = parquet.read_table(file)
+    parquet.write_table(table.rename_columns([name if one == "action" else one for one in table.column_names]), file)
+    with pytest.warns(UserWarning, match=rf"info.json: '{name}' is left out, and looks .* action_key='{name}'") as said:
+        assert "action" not in open_all(tmp_path)[:]
+    assert said[0].filename == __file__
+    assert_close(open_all(tmp_path, action_key=name)[:]["action"], torch.from_numpy(actions(0, 4)))
+    assert "action" not in open_all(tmp_path, action_key=None)[:]
+
+
+def test_commands_under_another_name_in_rows():
+    image = torch.zeros(4, 3, 8, 8, dtype=torch.uint8)
+    rows = {
+        "observation": {"image": image, "state": torch.rand(4, 2)},
+        "episode": torch.zeros(4),
+        "actions": image[:, 0, 0],
+    }
+    with pytest.warns(UserWarning, match="the rows: 'actions' is left out.* action_key='actions'"):
+        recording_from_rows(TensorDict(rows, [4]), fps=10.0)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_some_of_the_episodes(tmp_path, version):
+    with_lengths(tmp_path, version, [3, 4, 5, 6, 3, 4, 5])
+    everything, some = open_all(tmp_path), open_all(tmp_path, episodes=[5, 1, 2])
+    assert [episode.number for episode in some.episodes] == [1, 2, 5]
+    for episode in some.episodes:
+        mine = some[episode.start : episode.start + episode.length]
+        whole = everything.episodes[episode.number]
+        theirs = everything[whole.start : whole.start + whole.length]
+        for key in ("pixels", "state", "action", "time"):
+            assert mine[key].equal(theirs[key])
+    for split in ("train", "test"):
+        found = {episode.number for episode in open_all(tmp_path, split=split).episodes}
+        chosen = sorted(found & {1, 2, 5})
+        if chosen:
+            data = open_all(tmp_path, split=split, episodes=[1, 2, 5])
+            assert [episode.number for episode in data.episodes] == chosen
+
+
+def test_videos_that_are_missing(tmp_path):
+    """All of them are told of at once, with the episodes that are whole, which can be read."""
+    write_version_2(tmp_path, [3] * 7)
+    for episode in (1, 2, 5):
+        (tmp_path / VIDEO.format(episode // 2, episode)).unlink()
+    (tmp_path / "data/chunk-001/episode_000003.parquet").unlink()
+    with pytest.raises(
+        FileNotFoundError,
+        match=r"no .*episode_000001.mkv, .* nor 3 more of its files, such as .*episode_000002.mkv; .*: 0, 4, 6$",
+    ):
+        open_all(tmp_path)
+    data = open_all(tmp_path, episodes=[0, 4, 6])
+    assert_close(data[:]["state"], torch.from_numpy(np.concatenate([joints(episode, 3) for episode in (0, 4, 6)])))
+    shown = np.concatenate([pictures(episode, 3) for episode in (0, 4, 6)]).transpose(0, 3, 1, 2)
+    assert_close(data[:]["pixels"], torch.from_numpy(shown).float() / 255)
+
+
+@pytest.mark.parametrize(
+    ("episodes", "match"),
+    [
+        ([], r"episodes holds numbers of episodes, such as \[0, 2\].*got \[\]"),
+        (1, "episodes holds numbers of episodes.*got 1"),
+        ("0", "episodes holds numbers of episodes.*got '0'"),
+        ([0, 7], r"episodes names \[7\], but .*episodes.jsonl lists 0, 1"),
+        (["0"], r"episodes names \['0'\], but"),
+        ([[0]], r"episodes names \[\[0\]\], but"),
+    ],
+)
+def test_episodes_that_are_not_there(tmp_path, episodes, match):
+    write_version_2(tmp_path, [3, 3])
+    with pytest.raises(ValueError, match=match):
+        open_all(tmp_path, episodes=episodes)
+
+
+@pytest.mark.parametrize("cached", [False, True])
+def test_large_numbers(tmp_path, cached):
+    """Of encoders that count to 2.1e9, float32 swallows steps of 7; behind an origin they are there."""
+    root = tmp_path / "robot"
+    write_version_2(root, [40])
+    file = root / "data/chunk-000/episode_000000.parquet"
+    table, ticks = parquet.read_table(file), 7 * np.arange(120.0).reshape(40, 3)
+    place = table.column_names.index("observation.state")
+    large = pa.array(list(2.1e9 + ticks), pa.list_(pa.float64()))
+    parquet.write_table(table.set_column(place, "observation.state", large), file)
+    options = {"cache": tmp_path / "cache" if cached else None}
+    match = (
+        r"episode_000000.parquet: 'shoulder' moves by 21 a row near 2100000\d+[.5]*, where float32 resolves 1.3e\+02"
+    )
+    with pytest.warns(UserWarning, match=match + r".*'wrist'.*; pass origin=\{'state': \.\.\.\}") as said:
+        open_all(root, **options)
+    assert len(said) == 1
+    kept = open_all(root, **options, origin={"state": 2.1e9})[:]["state"]
+    assert_close(kept, torch.from_numpy(ticks).float())
+    near = open_all(root, **options, origin={"state": torch.tensor([2.1e9 + 1] * 3, dtype=torch.float64)})[:]["state"]
+    assert_close(near, torch.from_numpy(ticks - 1).float())  # not another origin's entry of the cache
+    each = open_all(root, **options, origin={"state": [2.1e9, 2.1e9 + 7, 2.1e9], "action": 1.0}, dims=[1])[:]
+    assert_close(each["state"], torch.from_numpy(ticks - 7)[:, 1:2].float())
+    assert_close(each["action"], torch.from_numpy(actions(0, 40) - 1))
+
+
+@pytest.mark.parametrize(
+    ("origin", "error", "match"),
+    [
+        (5.0, TypeError, "origin holds numbers for 'state' and 'action'"),
+        ({"joints": 1.0}, ValueError, r"origin names \['joints'\]; it holds numbers for \['state', 'action'\]"),
+        ({"state": [1.0, 2.0]}, ValueError, "origin of 'state' must be a finite number, or 3 of them"),
+        ({"state": "far"}, ValueError, "origin of 'state' must be a finite number"),
+    ],
+)
+def test_origins_that_are_none(tmp_path, origin, error, match):
+    write_version_2(tmp_path, [3])
+    with pytest.raises(error, match=match):
+        open_all(tmp_path, origin=origin)
+
+
+def test_rows_in_memory_are_selected_by_their_owner():
+    image = torch.zeros(4, 3, 8, 8, dtype=torch.uint8)
+    rows = TensorDict({"observation": {"image": image, "state": torch.rand(4, 2)}, "episode": torch.zeros(4)}, [4])
+    recording = recording_from_rows(rows, fps=10.0)
+    for options in ({"episodes": [0]}, {"origin": {"state": 1.0}}):
+        with pytest.raises(ValueError, match="episodes= and origin= are for folders"):
+            LeRobotReplay(recording, **options)
+
+
+def test_a_stamp_that_is_missing_leaves_the_others_their_steps(tmp_path):
+    write_version_2(tmp_path, [20])
+    file = tmp_path / "data/chunk-000/episode_000000.parquet"
+    table = parquet.read_table(file)
+    times = np.arange(20) / FPS
+    times[7] = np.nan
+    parquet.write_table(table.set_column(table.column_names.index("timestamp"), "timestamp", pa.array(times)), file)
+    with pytest.warns(UserWarning, match="1 of 20 rows have a timestamp that does not increase"):
+        data = open_all(tmp_path)
+    assert_close(data[:]["time"].flatten(), torch.arange(20).double() / FPS)
+    write_info(tmp_path, "v2.1", True, "mkv", fps=FPS * 2)
+    with pytest.raises(ValueError, match=r"timestamps are 0.1 s apart"):
+        open_all(tmp_path)

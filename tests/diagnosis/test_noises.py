@@ -1,0 +1,184 @@
+"""A noise that is no covariance is named, in each filter, wherever it comes from; or the result is right."""
+
+import re
+
+import pytest
+import torch
+
+from tests.diagnosis.noises_for_tests import AT, B, Given, Made, T, attitude, filter_of, run, sound_frames
+from tests.filters.factories import linear_system
+from torch_denkf import RejectReadings
+
+NAN = torch.nan
+R, Q = ("sensor", "noise"), ("forecast", "noise")
+VECTORS = {"-1": [0.5, -1.0], "-.02": [-0.02, 0.3], "NaN": [0.5, NAN]}
+MATRICES = {
+    "a negative variance": [[0.5, 0.0], [0.0, -1.0]],
+    "indefinite": [[1.0, 2.0], [2.0, 1.0]],
+    "one triangle": [[1.0, 50.0], [0.0, 1.0]],
+    "all NaN": [[NAN, NAN], [NAN, NAN]],
+}
+
+
+def filter_and_frames(name, which, source, kind, wrong):
+    """A filter, its frames, and the words by which a message may name what is wrong."""
+    wrong = torch.tensor(wrong)
+    fine = torch.tensor([0.5, 0.3]) if kind == "vector" else torch.tensor([[0.5, 0.1], [0.1, 0.3]])
+    frames, modules = sound_frames(), {"R": Given("r", R), "Q": Given("q", Q)}
+    if source == "entry":
+        frames[which.lower()] = fine.expand(B, T, *fine.shape).clone()
+        frames[which.lower()][AT] = wrong
+    else:
+        modules[which] = Made(wrong, fine, "observation", {"R": R, "Q": Q}[which])
+        frames["observation"][AT] = 7.0
+    return filter_of(name, modules["R"], modules["Q"]), frames
+
+
+GAUSSIAN = ["KalmanFilter", "EKF", "UKF", "FusedEKF"]
+SAMPLED = ["etkf", "particles", "FusedEnsemble"]
+CASES = [(name, which, "vector", what) for name in GAUSSIAN + SAMPLED for which in "RQ" for what in VECTORS]
+CASES += [(name, which, "matrix", what) for name in GAUSSIAN for which in "RQ" for what in MATRICES]
+CASES += [(name, "Q", "matrix", what) for name in SAMPLED for what in MATRICES]
+CASES = [("entry", *case) for case in CASES] + [("module", *case) for case in CASES if case[-1] in ("-1", "indefinite")]
+
+
+@pytest.mark.parametrize("way", ["step", "sequence"])
+@pytest.mark.parametrize(("source", "name", "which", "kind", "what"), CASES)
+def test_a_noise_that_is_no_covariance_is_named(source, name, which, kind, what, way):
+    torch.manual_seed(0)
+    filter, frames = filter_and_frames(name, which, source, kind, (VECTORS if kind == "vector" else MATRICES)[what])
+    word = rf"'{which.lower()}'" if source == "entry" else r"Made"
+    row = r"\[1, 2\]" if way == "sequence" else r"row \[1\]|NaN or infinity in"
+    if "NaN" in what and way == "sequence":
+        with pytest.warns(UserWarning, match=word) as told:
+            run(filter, frames, way)
+        assert any(re.search(row, str(one.message)) for one in told)
+        return
+    with pytest.raises(ValueError, match=word) as error:
+        run(filter, frames, way)
+    assert re.search(row, str(error.value))
+    assert "NaN" in what or "covariance" in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["vector", "matrix"])
+@pytest.mark.parametrize("name", GAUSSIAN)
+def test_a_reading_without_noise_is_believed(name, kind):
+    """A variance of zero is one: the limit of small ones."""
+    zero = torch.zeros(2) if kind == "vector" else torch.zeros(2, 2)
+    means = []
+    for r in (zero, zero + 1e-9 * (torch.ones(2) if kind == "vector" else torch.eye(2))):
+        filter, frames = filter_and_frames(name, "R", "entry", kind, r.tolist())
+        means.append(run(filter, frames, "sequence")["belief", "mean"])
+    torch.testing.assert_close(means[0], means[1], rtol=1e-4, atol=1e-4)
+    exact = torch.linalg.solve(linear_system()[2], frames["observation"][AT])
+    torch.testing.assert_close(means[0][AT], exact, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", SAMPLED)
+def test_members_cannot_take_a_reading_without_noise(name):
+    filter, frames = filter_and_frames(name, "R", "entry", "vector", [0.0, 0.3])
+    with pytest.raises(ValueError, match=r"'r'|'sensor', 'gps', 'noise'") as error:
+        run(filter, frames, "step")
+    assert "its variance 0 is 0" in str(error.value)
+
+
+@pytest.mark.parametrize("wrong", [[-1.0, -1.0], [NAN, NAN], [[1.0, 2.0], [2.0, 1.0]]])
+@pytest.mark.parametrize("name", ["KalmanFilter", "EKF", "UKF", "FusedEKF"])
+def test_a_noise_that_a_mask_hides_may_be_anything(name, wrong):
+    kind = "vector" if isinstance(wrong[0], float) else "matrix"
+    beliefs = []
+    for value in (wrong, [0.5, 0.3] if kind == "vector" else [[0.5, 0.1], [0.1, 0.3]]):
+        filter, frames = filter_and_frames(name, "R", "entry", kind, value)
+        frames["observed"][AT] = False
+        beliefs.append(run(filter, frames, "sequence")["belief", "mean"])
+    assert beliefs[0].equal(beliefs[1])
+    assert beliefs[0].isfinite().all()
+
+
+@pytest.mark.parametrize("first", [-1.0, NAN])
+def test_the_noise_of_an_initial_belief_is_not_read(first):
+    filter, frames = filter_and_frames("EKF", "R", "entry", "vector", [0.5, 0.3])
+    frames["r"][:, 0] = first
+    assert filter.sequence(frames)["belief", "mean"].isfinite().all()
+
+
+@pytest.mark.parametrize("wrong", [[-1.0, 0.3], [-0.02, 0.3], [[1.0, 2.0], [2.0, 1.0]], [[1.0, 50.0], [0.0, 1.0]]])
+@pytest.mark.parametrize("name", ["KalmanFilter", "EKF", "UKF"])
+def test_such_a_reading_is_missing_behind_reject_readings(name, wrong):
+    kind = "vector" if isinstance(wrong[0], float) else "matrix"
+    filter, frames = filter_and_frames(name, "R", "entry", kind, wrong)
+    hidden = frames.clone()
+    hidden["observed"][AT] = False
+    out = run(filter, RejectReadings({"observation": "observed"}, noises={"observation": "r"})(frames), "sequence")
+    assert out["info", "rejected"].sum() == 1
+    assert out["belief", "mean"].equal(run(filter, hidden, "sequence")["belief", "mean"])
+
+
+@pytest.mark.parametrize("name", SAMPLED)
+def test_an_infinite_variance_is_that_of_a_component_that_says_nothing(name):
+    found = []
+    for r in ([0.5, torch.inf], [0.5, 0.3]):
+        torch.manual_seed(0)
+        filter, frames = filter_and_frames(name, "R", "entry", "vector", r)
+        if torch.inf not in r:
+            frames["observed"] = frames["observed"].expand(B, T, 2).clone()
+            frames["observed"][AT] = torch.tensor([True, False])
+        found.append(run(filter, frames, "sequence")["belief", "mean"])
+    torch.testing.assert_close(*found)
+
+
+def test_a_negative_covariance_that_was_given_is_named():
+    """It would stay below zero where little is learned, without a NaN."""
+    filter, frames = filter_and_frames("EKF", "R", "entry", "vector", [0.5, 0.3])
+    row = filter.initialise(frames[:, 0].exclude("is_init"))
+    row["belief", "cov"] = torch.tensor([[-0.4, 0.0], [0.0, 1.0]]).expand(B, 2, 2)
+    row.update(frames[:, 1].exclude("is_init"))
+    row["q"], row["observed"] = torch.full((B, 2), 1e-3), torch.zeros(B, 1, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"negative variance in \('belief', 'var'\) in row \[0\]: component 0"):
+        filter.step(row)
+
+
+def test_without_check_finite_nothing_is_looked_at():
+    filter, frames = filter_and_frames("EKF", "R", "entry", "vector", [0.5, -1.0])
+    out = filter.with_options(check_finite=False).sequence(frames)
+    assert out["belief", "mean"][AT].isnan().all()
+
+
+# ------------------------------------------------------------------------------------------- causes of other numbers
+
+
+WRONG = {
+    "a quaternion of zeros": ("y", 0.0, r"'y', which is no point of SO3\(\): it has \[0, 0, 0, 0\]"),
+    "time that runs back": ("dt", -0.1, r"the process noise that NoiseOfStep .* makes of .*'dt' \[-0.1\]"),
+    "a step of 3e12 years": ("dt", 1e20, r"'dt' \[1e\+20\]"),
+    "a reading beyond float32": ("gyro", 1e30, r"'gyro' \[1e\+30, 1e\+30, 1e\+30\]"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+@pytest.mark.parametrize("kind", ["EKF", "etkf"])
+def test_the_cause_is_the_input_and_not_the_motion(kind, what):
+    torch.manual_seed(0)
+    filter, rows = attitude(kind)
+    key, value, message = WRONG[what]
+    rows[key][1, 1] = value
+    row = filter.initialise(rows[:, 0].copy()).update(rows[:, 1])
+    if kind == "EKF" and what == "a step of 3e12 years":  # finite: the attitude is not known, and the reading tells it
+        assert filter.step(row)["belief", "mean"].isfinite().all()
+        return
+    with pytest.raises(ValueError, match=message) as error:
+        filter.step(row)
+    assert "in row [1]" in str(error.value)
+    with pytest.warns(UserWarning, match=r"NaN from row \[1, 1\] of the sequence on, because of .*" + message):
+        out = filter.sequence(rows)
+    assert out["belief", "mean"][0].isfinite().all()
+
+
+@pytest.mark.parametrize("kind", ["EKF", "etkf"])
+def test_a_belief_that_is_no_rotation_is_named(kind):
+    filter, rows = attitude(kind)
+    row = filter.initialise(rows[:, 0].copy()).update(rows[:, 1])
+    key = filter.carry_keys[0]
+    row[key] = torch.zeros_like(row[key])
+    with pytest.raises(ValueError, match=re.escape(f"{key!r}, which is no point of Product")):
+        filter.step(row)
