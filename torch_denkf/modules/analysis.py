@@ -131,7 +131,9 @@ class EnsembleAnalysis(EnsembleUpdate):
     def _noise(self, entries, values, call):
         """Makes perturbations exact here, so that :meth:`compute` and :meth:`move_past` have the same ones."""
         noise = super()._noise(entries, values, call)
-        if self.scheme != "perturbed" or not self.exact or noise is None or noise.shape[-1] >= noise.shape[-2]:
+        if self.scheme != "perturbed" or not self.exact or not isinstance(noise, torch.Tensor):
+            return noise
+        if noise.shape[-1] >= noise.shape[-2]:  # the mean alone could be exact, and analyse() takes it out
             return noise
         forecast, predicted = values[:2]
         if self.space is not None:

@@ -154,8 +154,9 @@ class NoisyTransition(Transition):
             return ensemble
         normal = normal[..., :size]  # a point may have more numbers than its tangent
         if self.exact and self.log_weight_key not in entries:
-            near = 0 if self.space is None else self.space.near(ensemble).unsqueeze(-2)
-            normal = exact_draws(normal, ensemble if self.space is None else self.space.minus(ensemble, near))
+            space = self.space
+            away = ensemble if space is None else space.minus(ensemble, space.near(ensemble).unsqueeze(-2))
+            normal = exact_draws(normal, away)
         if covariance.ndim == len(call.batch_size) + 1:
             noise = covariance.sqrt().unsqueeze(-2) * normal
         else:
