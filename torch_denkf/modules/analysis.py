@@ -45,7 +45,7 @@ class EnsembleAnalysis(EnsembleUpdate):
             :mod:`torch_denkf.functional.manifolds`.
         reading_space: in which the reading lives, such as ``Circle()`` for an angle; innovation and R are tangents.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
-        draws: of ``"perturbed"``, ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.exact_draws`.
+        draws: of ``"perturbed"``, ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.draws.exact_draws`.
         **keys: see :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs
             learned observations, not one reading.
 

@@ -81,7 +81,7 @@ class GaussianPrior(_InitialEnsemble):
         std: standard deviations ``[S]``.
         ensemble_size: E.
         space: in which the state lives; ``None`` for plain numbers. ``mean`` is a point, ``std`` is of the tangents.
-        draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.exact_draws`.
+        draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.draws.exact_draws`.
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
 
     Example:
@@ -123,7 +123,7 @@ class AroundState(_InitialEnsemble):
         ensemble_size: E.
         state_key: the known state ``[*B, S]``.
         space: in which the state lives; ``None`` for plain numbers. ``std`` is of the tangents.
-        draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.exact_draws`.
+        draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.draws.exact_draws`.
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
 
     Raises:
@@ -168,7 +168,7 @@ class FromSensor(_InitialEnsemble):
         observation_key: learned observations ``[*B, E, O]`` or a reading ``[*B, O]``.
         noise_variance_key: variances ``[*B, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
-        draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.exact_draws`.
+        draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.draws.exact_draws`.
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
 
     Raises:
