@@ -44,8 +44,8 @@ class NoisyTransition(Transition):
         forecast_mean_key: the mean of the forecast before the noise, ``[*B, S]``.
         log_weight_key: optional log-weights of the belief ``[*B, E]``.
         space: in which the state lives; ``None`` for plain numbers. Noise and ``dims`` are of the tangents.
-        draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.draws.exact_draws`; those of weighted particles
-            are random.
+        draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.draws.exact_draws`; weighted particles
+            draw at random.
 
     Raises:
         KeyError: if an entry is missing.
