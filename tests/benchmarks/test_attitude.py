@@ -164,7 +164,7 @@ def test_filters_of_the_library_know_how_wrong_they_are():
     data["dt"] = torch.full((runs, rows, 1), DT)
     data = prepared(data)
     data["attitude"][..., :4] = wrong[:, None, :4]
-    for kind, options in (("EKF", {}), ("etkf", {"members": 32, "localisation": "significance"})):
+    for kind, options in (("EKF", {}), ("etkf", {"members": 32})):
         orientation, cov, _ = run(attitude_filter(kind, 0.01, std, **options), data)
         found = scores(orientation, data, slice(100, None), cov)
         assert 0.5 < found["nees"] < 1.4

@@ -81,6 +81,7 @@ def test_runs_differ_and_repeat(robot):
     assert slippery.log["last", "imu"].shape == (1, 100, 60)
 
 
+@pytest.mark.slow
 def test_without_feet_the_inertial_sensor_is_integrated(robot):
     """Its error grows without bound, and the intervals know it."""
     walks = scored(robot, run(robot, kind="EKF")[0])
@@ -99,6 +100,7 @@ def test_the_lstm_reads_what_the_contacts_read_of_one_row(robot):
     assert torch.equal(features.unflatten(-1, (4, 16)), last[..., -16:])
 
 
+@pytest.mark.slow
 def test_how_long_errors_of_contacts_last_is_chosen_in_validation(robot):
     short = dataclasses.replace(robot, log=robot.log[:, :40], doubtful=robot.doubtful[:, :40], rows=slice(10, None))
     noises = LeggedNoises(kinematics=0.03, rate=1.0)

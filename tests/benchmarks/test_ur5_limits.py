@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 import torch
 
 from benchmarks.ur5.limits import LinearFilter, fit, regress, slopes
@@ -34,6 +35,7 @@ def test_a_rate_that_lasts_moves_the_number_and_noise_moves_both():
     torch.testing.assert_close(noise[1], torch.full((2, 2), 0.09))
 
 
+@pytest.mark.slow
 def test_a_fitted_filter_is_as_good_as_the_one_that_knows_the_system(monkeypatch):
     monkeypatch.setattr("benchmarks.ur5.limits.LENGTH", 60)
     generator = torch.Generator().manual_seed(0)

@@ -8,7 +8,15 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from tests.filters.factories import Perturbed, has_compiler, linear_denkf, linear_kalman, toy_denkf, toy_frames
+from tests.filters.factories import (
+    Perturbed,
+    has_compiler,
+    linear_denkf,
+    linear_kalman,
+    random_draws,
+    toy_denkf,
+    toy_frames,
+)
 from torch_denkf.compilation import need_compiler
 from torch_denkf.modules import ConstantNoise, LearnedObservation, StochasticMLP
 
@@ -167,7 +175,7 @@ def test_a_stochastic_analysis_of_a_users_own_compiles(float64):
     """And gives what the library's own gives for the same seed, compiled or not."""
     frames, outs = TensorDict({"observation": torch.randn(3, 5, 2)}, [3, 5]), []
     for analysis, chunk in ((None, 0), (Perturbed(), 0), (Perturbed(), 2)):
-        filter = linear_denkf("perturbed", noisy=True)
+        filter = random_draws(linear_denkf("perturbed", noisy=True))
         if analysis is not None:
             filter = filter.with_modules(analysis=analysis)
         filter.compile(chunk=chunk, backend="eager")

@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from tests.filters.factories import random_draws
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
 from torch_denkf.monitoring import Gated
@@ -51,7 +52,7 @@ def test_filter_whose_noise_is_right_says_nothing():
 def test_names_the_reading_and_the_component_that_is_held_too_firmly(component):
     noise = [STEP, STEP]
     noise[component] = 1e-3
-    (text,) = said(walk_filter(noise), walks())
+    (text,) = said(random_draws(walk_filter(noise)), walks())
     assert "'reading' at place 'analysis'" in text
     assert f"Number {component} tells most of component {component} of the state" in text
     assert 'localisation="significance"' in text

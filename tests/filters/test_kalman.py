@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from torch.distributions import MultivariateNormal
 
-from tests.filters.factories import linear_denkf, linear_kalman, linear_system
+from tests.filters.factories import linear_denkf, linear_kalman, linear_system, random_draws
 from torch_denkf.modules import GaussianPrior
 
 
@@ -87,7 +87,7 @@ def test_large_ensemble_is_the_kalman_filter(float64, scheme):
     E, rows, T = 10_000, 8, 50
     kf = linear_kalman()
     prior = GaussianPrior(kf.initial.mean, kf.initial.cov.diagonal().sqrt(), ensemble_size=E)
-    denkf = linear_denkf(scheme, ensemble_size=E, noisy=True, initial=prior)
+    denkf = random_draws(linear_denkf(scheme, ensemble_size=E, noisy=True, initial=prior))
     # The same readings in all rows: the rows are replications, and tell the Monte-Carlo error of one run.
     td = TensorDict({"observation": torch.randn(T, 2), "observed": torch.rand(T, 2) < 0.8}, [T])
     exact = kf.sequence(td.copy())

@@ -15,6 +15,7 @@ from tests.filters.factories import (
     linear_kalman,
     linear_system,
     linear_with,
+    random_draws,
 )
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.particle_for_tests import bootstrap
@@ -172,6 +173,7 @@ def test_a_start_without_the_reading_is_the_prior(float64, case):
     else:
         filter = Filter(modules, initial=start, update_at_reset=case == "update at reset")
         noise_key = ("noise", "initial")
+    random_draws(filter)
     z, y = torch.randn(7, 2), torch.randn(2)
     given = TensorDict({"y0": y[:1], "y1": y[1:], "observation": y, noise_key: z})
     if case == "stale":

@@ -7,7 +7,16 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.differences_for_tests import check_largest_gradients
-from tests.filters.factories import OBS, NoisyLinear, assert_equal, linear_system, make_dyadic, stepwise, toy_frames
+from tests.filters.factories import (
+    OBS,
+    NoisyLinear,
+    assert_equal,
+    linear_system,
+    make_dyadic,
+    random_draws,
+    stepwise,
+    toy_frames,
+)
 from tests.filters.particle_for_tests import BELIEF, SCHEMES, E, bootstrap, toy_filter
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation
@@ -37,7 +46,7 @@ def test_step_equals_sequence_bit_for_bit(float64, scheme, learned, batch, masks
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_resets_start_from_equal_weights(float64, scheme):
-    filter = toy_filter(scheme)
+    filter = random_draws(toy_filter(scheme))
     frames = filter.draw_noise(toy_frames((3, 12)))
     out = filter.sequence(frames.copy())
     start = frames["is_init"].squeeze(-1)

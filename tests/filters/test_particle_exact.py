@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.filters.factories import linear_kalman, linear_system
+from tests.filters.factories import linear_kalman, linear_system, random_draws
 from tests.filters.particle_for_tests import E, bootstrap, readings
 from torch_denkf.modules import GaussianPrior
 
@@ -117,7 +117,7 @@ def test_without_resampling_it_is_importance_sampling(float64):
     # Deterministic motion: the weights are the products of the readings' densities along each particle's path.
     F, _, H, R = linear_system()
     start = GaussianPrior(torch.zeros(2), torch.ones(2), ensemble_size=E)
-    filter = bootstrap(E, noisy=False, initial=start, resampling=None)
+    filter = random_draws(bootstrap(E, noisy=False, initial=start, resampling=None))
     td = filter.draw_noise(readings(6, masked=False).expand(3, 6).clone())
     out = filter.sequence(td.copy())
     paths = [td["noise", "initial.initial"][:, 0]]

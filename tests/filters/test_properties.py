@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from tests.filters.factories import FixedEnsemble, NoisyLinear
+from tests.filters.factories import FixedEnsemble, NoisyLinear, random_draws
 from tests.properties_for_tests import BATCHES, FIXED, SCALES, SEEDS, Draw, close
 from torch_denkf.baselines import BackpropKF
 from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter, ParticleFilter
@@ -126,7 +126,7 @@ def test_members_may_come_in_any_order(seed, batch, scheme):
     other = plain.copy()
     other["noise"] = plain["noise"].apply(lambda value: value[..., order, :])
     for filter, row in zip(filters, (plain, other), strict=True):
-        filter.sequence(row)
+        random_draws(filter).sequence(row)  # exact ones go through a matrix, and blow up rounding
     close(other["belief", "ensemble"], plain["belief", "ensemble"][..., order, :])
     close(other["belief", "mean"], plain["belief", "mean"])
 

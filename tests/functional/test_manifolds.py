@@ -427,7 +427,11 @@ def test_means_of_numbers_and_angles():
 # ------------------------------------------------------------------------------------------ graphs, shapes, errors
 
 
-@pytest.mark.parametrize("space", [Circle(), SO3(), SE2(), Product(SE23(), Circle(), Euclidean(2))], ids=repr)
+@pytest.mark.parametrize(
+    "space",
+    [Circle(), SO3(), SE2(), pytest.param(Product(SE23(), Circle(), Euclidean(2)), marks=pytest.mark.slow)],
+    ids=repr,
+)
 def test_compiled_is_eager(space):
     point, origin = points(space, 3, 5).requires_grad_(), points(space, 3, 5).requires_grad_()
     tangent = near(space, 3, 5).requires_grad_()

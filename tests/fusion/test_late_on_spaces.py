@@ -131,6 +131,7 @@ def test_weights_of_points_are_refused():
             FusedFilter(Turning(), {"pose": sensor}, weights=weights, **parts)
 
 
+@pytest.mark.slow
 def test_steps_and_compiled_steps_are_the_sequence_and_gradients_are_finite():
     filter, data = orientations("EKF", late_key="late"), arriving(log(), LATE)
     data["is_init"] = (torch.arange(T) % 8 == 0).reshape(1, T, 1).expand(B, T, 1).clone()

@@ -29,7 +29,8 @@ PROGRAMS = ("ppo", "sac", "ddpg")
 
 
 def code(name):
-    return dict(zip(PROGRAMS, (match["code"] for match in BLOCK.finditer(PAGE.read_text())), strict=True))[name]
+    blocks = (match["code"] for match in BLOCK.finditer(PAGE.read_text()))
+    return dict(zip(PROGRAMS, blocks, strict=False))[name]  # what comes behind them is of simulators
 
 
 @cache

@@ -85,7 +85,8 @@ def test_online_lag_is_the_smoother(kind):
         assert (online["smoothed", "age"][:, lag:] == lag).all()
 
 
-@pytest.mark.parametrize("kind", ["EKF", pytest.param("UKF", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["EKF", "UKF"])
 def test_steps_and_compiled_steps_are_the_sequence(kind):
     filter, data = FixedLag(make(kind), 3), log()
     data["is_init"] = (torch.arange(T) % 8 == 0).reshape(1, T, 1).expand(B, T, 1).clone()

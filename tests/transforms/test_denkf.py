@@ -130,7 +130,7 @@ def test_collector_replay_buffer_loss_gradients():
     collector = Collector(env, policy, frames_per_batch=90, total_frames=180)
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(300),
-        sampler=SliceSampler(slice_len=6, end_key=("next", "done"), strict_length=True),
+        sampler=SliceSampler(slice_len=6, traj_key=("collector", "traj_ids"), strict_length=True),
         batch_size=48,
     )
     for data in collector:

@@ -29,8 +29,9 @@ class Evaluation(NamedTuple):
         coverage: share of the truth inside the central interval of probability ``level``, ``[D]``.
         crps: continuous ranked probability score, ``[D]``, in each component's units: lower is better.
         nees: normalised estimation error squared of the components whose truth is known, over the elements where all of
-            these are: their number for a consistent filter, also where the covariance is that of a sample. ``None``
-            without a covariance, or with fewer than three members more than components.
+            these are: their number for a consistent filter. ``None`` without a covariance, or with no more members
+            than components. Draws that are random (``draws="random"``) make that of E members larger, by
+            (E + 1) (E - 1) / (E (E - D - 2)) for D components. Its bounds take elements to be independent.
         known: elements whose truth is known, ``[D]``.
     """
 
@@ -73,7 +74,8 @@ def evaluate(
     Raises:
         TypeError: for what is no filter.
         KeyError: if an entry is missing.
-        ValueError: if the truth has another shape or is nowhere known, or members are too few for ``level``.
+        ValueError: if the truth has another shape or is nowhere known, members are too few for ``level``, or a belief
+            is NaN.
 
     Example:
         >>> from tensordict import TensorDict
@@ -97,30 +99,34 @@ def evaluate(
     (kind,) = kinds_of([(belief, name) for name in list(held.keys())], space)
     mean, var = (entry_of(held, name, "evaluate", "Keep it in the sequence.") for name in ("mean", "var"))
     truth = _known(filter, data, truth, mean)
+    broken = (mean.isnan() & ~truth.isnan()).any(-1)
+    if broken.any():
+        raise ValueError(
+            f"{(belief, 'mean')!r} is NaN in {int(broken.sum())} of the elements whose truth is known. A step "
+            "names the cause. RejectReadings in front of the filter makes readings that are not finite missing ones."
+        )
     error, known = state_difference(truth, mean, space=space), known_tangents(truth, space)
     dims = (~known.isnan()).flatten(0, -2).any(0).nonzero().flatten()
     if not len(dims):
         raise ValueError("the truth is nowhere known where the filter stepped to")
     covered = interval_coverage(mean, var, truth, level=level, space=space)
-    cov, factor = held.get("cov", None), 1.0
+    cov = held.get("cov", None)
     if isinstance(kind, Ensemble | Particles):
         members = held["ensemble"]
         around = mean.unsqueeze(-2)
         away = members - around if space is None else space.minus(members, around)
     if isinstance(kind, Ensemble):
-        size = away.shape[-2]
         covered = ensemble_interval_coverage(members, truth, level=level, space=space)
-        crps, cov = crps_ensemble(away, error), ensemble_cov(away)
-        factor = size * (size - len(dims) - 2) / ((size + 1) * (size - 1))  # the inverse of a sample's is too large
+        crps, cov = crps_ensemble(away, error), ensemble_cov(away) if away.shape[-2] > len(dims) else None
     elif isinstance(kind, Particles):
         crps = crps_weighted(away, held["log_weight"], error)
         cov = away.mT @ (held["log_weight"].exp().unsqueeze(-1) * away)
     else:
         crps = crps_gaussian(torch.zeros_like(error), var, error)
     consistency = None
-    if cov is not None and factor > 0:
+    if cov is not None:
         rows = ~known[..., dims].isnan().any(-1)
-        error, cov = error[rows][:, dims], cov[rows][:, dims][:, :, dims] / factor
+        error, cov = error[rows][:, dims], cov[rows][:, dims][:, :, dims]
         consistency = nees(torch.zeros_like(error), cov, error, level=level)
     count = (~known.isnan()).flatten(0, -2).sum(0)
     return Evaluation(*state_errors(mean, truth, space=space), covered, mean_of_known(crps, known), consistency, count)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_denkf.functional.linalg import cholesky_of_correlation, semidefinite_solve
+from torch_denkf.functional.linalg import semidefinite_solve, whitened
 
 __all__ = ["exact_draws"]
 
@@ -17,8 +17,9 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
     1 / sqrt(E). An ensemble that adds them up in each step is far from what its Q says. Exact draws do not; for a
     linear Gaussian system such an ensemble is the Kalman filter.
 
-    For all three E must be at least S + 5/4 q + 3. With fewer members mean and covariance are exact, and the draws
-    uncorrelated with as many leading directions of the members as there is room for; with E <= q the mean alone is.
+    For all three E must be at least S + 9/8 q + 3. With fewer members mean and covariance are exact, and the draws
+    uncorrelated with as many leading directions of the members as there is room for; with fewer than 9/8 q + 3 the mean
+    alone is. (q draws in little more than q dimensions are nearly dependent, and to whiten them blows up rounding.)
 
     Args:
         normal: standard-normal draws, ``[*B, E, q]``.
@@ -40,19 +41,16 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
     """
     size, dim = normal.shape[-2:]
     draws = normal - normal.mean(-2, keepdim=True)
-    if dim >= size:
+    room = size - 3 - dim - dim // 8
+    if room < 0:
         return draws
-    room = (
-        size - 1 - dim - (2 + dim // 4)
-    )  # q draws of just q dimensions are nearly dependent: scaling up their rounding
-    if uncorrelated and room > 0:
+    if uncorrelated and room:
         away = torch.cat([members - members.mean(-2, keepdim=True) for members in uncorrelated], -1).to(draws.dtype)
         if away.shape[-1] > room:
             away = _leading(away, room)
         draws = draws - away @ semidefinite_solve(away.mT @ away, away.mT @ draws)
         draws = draws - draws.mean(-2, keepdim=True)  # anomalies far below their mean sum to rounding, not to zero
-    factor, inverse = cholesky_of_correlation(draws.mT @ draws / (size - 1))
-    return torch.linalg.solve_triangular(factor, (draws * inverse.unsqueeze(-2)).mT, upper=False).mT
+    return whitened(draws, draws.mT @ draws / (size - 1))
 
 
 def _leading(away: Tensor, count: int) -> Tensor:

@@ -11,6 +11,7 @@ from torch_denkf.functional.kernels.small_system import (
     LARGEST_FACTOR,
     cholesky_solve_written_out,
     cholesky_written_out,
+    forward_written_out,
     inverse_of,
     on_gpu,
 )
@@ -65,10 +66,13 @@ def semidefinite_root(cov: Tensor) -> Tensor:
     return std.unsqueeze(-1) * cholesky(correlation)
 
 
-def cholesky_of_correlation(cov: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the Cholesky factor of the correlations ``[*B, N, N]``, and 1 / the standard deviations, 0 for none."""
+def whitened(rows: Tensor, cov: Tensor) -> Tensor:
+    """Maps rows ``[*B, E, N]`` by the inverse Cholesky factor of their covariance; components without any become 0."""
     correlation, _, inverse = _correlation(cov)
-    return cholesky(correlation), inverse
+    scaled = (rows * inverse.unsqueeze(-2)).mT
+    if torch.compiler.is_compiling() and cov.shape[-1] <= LARGEST_FACTOR:
+        return forward_written_out(correlation, scaled).mT
+    return torch.linalg.solve_triangular(cholesky(correlation), scaled, upper=False).mT
 
 
 def semidefinite_solve(cov: Tensor, right: Tensor) -> Tensor:

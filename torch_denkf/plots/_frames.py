@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from torch_denkf.deployment.files import name_for_c
-
 _GIF_HEAD = b"GIF89a"
 _GIF_FOREVER = b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"
 
@@ -52,6 +50,8 @@ def write_mp4(file: Path, frames: Iterable[np.ndarray], fps: float) -> None:
             height, width = frame.shape[:2]
             frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             if writer is None:
+                from torch_denkf.deployment.files import name_for_c  # which imports torchrl; pictures need none
+
                 writer = cv2.VideoWriter(name_for_c(file), cv2.VideoWriter.fourcc(*"mp4v"), fps, frame.shape[1::-1])
                 if not writer.isOpened():
                     raise OSError(f"OpenCV cannot write {file}; pass a .gif, or look at the folder's permissions")

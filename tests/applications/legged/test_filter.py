@@ -44,6 +44,7 @@ def test_it_is_a_transform_of_an_environment():
     assert rows["next", *VELOCITY].shape == (5, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not ICUB_FOLDER.exists(), reason="the log is not here")
 def test_a_real_humanoid_walks():
     """Twelve seconds. Plain numbers in an extended Kalman filter: .086 m/s, .66 degrees. Standing still: .207 m/s."""

@@ -1,10 +1,13 @@
 """The program that trained the UR5 table's filter runs, leaves a folder that loads, and scores both."""
 
+import pytest
+
 from tests.envs.opengl import needs_opengl
 from torch_denkf import from_pretrained
 from torch_denkf.applications.ur5.train import evaluate_ur5_table, train_ur5_table, whole_demos
 
 
+@pytest.mark.slow
 def test_ur5_table(tmp_path):
     needs_opengl()
     few = {"demos": 12, "sequences": 10, "sensor_updates": 2, "filter_updates": 2, "progress": False}

@@ -58,6 +58,7 @@ def test_what_is_refused(tmp_path, text, match):
         read(tmp_path, text)
 
 
+@pytest.mark.slow
 def test_many_columns_take_no_longer_than_their_number(tmp_path):
     """A pass over all columns for each of them would take 20 minutes."""
     count = 200_000

@@ -37,7 +37,7 @@ def legged_filter(
     dt: float | NestedKey,
     kind: Literal["DEnKF", "EKF", "UKF"] = "DEnKF",
     ensemble_size: int = 64,
-    threshold: float | None = 2.0,
+    threshold: float | None = None,
     noises: LeggedNoises | None = None,
     contacts: LearnedContacts | None = None,
     gravity: float = 9.81,

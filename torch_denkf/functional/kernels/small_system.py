@@ -143,6 +143,23 @@ def cholesky_solve_written_out(matrix: Tensor, right: Tensor) -> Tensor:
     return torch.stack(_solve(_factor(matrix), _rows(right)), -2)
 
 
+def forward_written_out(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solve L X = Y with the Cholesky factor L of a symmetric M, N x N with N of 1 to 6.
+
+    Args:
+        matrix: M, ``[*B, N, N]``; its lower triangle is read.
+        right: Y, ``[*B, N, K]``.
+
+    Returns:
+        X, ``[*B, N, K]``; NaN where M is not positive definite.
+
+    Examples:
+        >>> forward_written_out(torch.tensor([[4.0, 0.0], [2.0, 2.0]]), torch.tensor([[2.0], [0.0]])).mT
+        tensor([[ 1., -1.]])
+    """
+    return torch.stack(_forward(_factor(matrix), _rows(right)), -2)
+
+
 def _rows(matrix: Tensor) -> Sequence[Tensor]:
     return matrix.unbind(-2)
 

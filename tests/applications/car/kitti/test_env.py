@@ -159,6 +159,7 @@ def test_random_starts_follow_the_seed(drive):
     torch.testing.assert_close(moved, torch.full_like(moved, 0.103))
 
 
+@pytest.mark.slow
 def test_batched_environments(root, drive, tmp_path):
     make = partial(KITTIReplayEnv, root, "town", size=(12, 36), cache=tmp_path)
     frames = drive_frames(drive)

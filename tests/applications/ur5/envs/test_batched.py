@@ -21,7 +21,7 @@ def alone():
     return torch.stack([UR5TableEnv("pick", **OPTIONS, **seed).rollout(6, UR5Expert()) for seed in SEEDS])
 
 
-@pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
+@pytest.mark.parametrize("kind", [SerialEnv, pytest.param(ParallelEnv, marks=pytest.mark.slow)])
 def test_batched(kind):
     needs_opengl()
     env = kind(2, partial(UR5TableEnv, "pick", **OPTIONS), create_env_kwargs=SEEDS)

@@ -113,6 +113,7 @@ def test_pictures_are_of_their_steps(tmp_path, domain):
     assert (data[:]["pixels"].numpy()[:4] == demos_of(tmp_path)[0].pixels.astype(np.float32) / 255).all()
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_with_other_processes(unbroken, tmp_path):
     """SIGKILL in the middle of a run with two workers, then one process: the same bytes as one process alone."""
     root = tmp_path / "killed"
