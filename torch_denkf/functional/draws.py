@@ -18,12 +18,13 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
     linear Gaussian system such an ensemble is the Kalman filter.
 
     For all three E must be at least S + 9/8 q + 3. With fewer members mean and covariance are exact, and the draws
-    uncorrelated with as many leading directions of the members as there is room for; with fewer than 9/8 q + 3 the mean
+    uncorrelated with as many directions of the members as there is room for; with fewer than 9/8 q + 3 the mean
     alone is. (q draws in little more than q dimensions are nearly dependent, and to whiten them blows up rounding.)
 
     Args:
         normal: standard-normal draws, ``[*B, E, q]``.
-        *uncorrelated: members, ``[*B, E, S]`` each, that the draws are uncorrelated with.
+        *uncorrelated: members, ``[*B, E, S]`` each, that the draws are uncorrelated with; those that come first are
+            sooner.
 
     Returns:
         Draws ``[*B, E, q]``; zero where ``normal`` has no spread.
@@ -45,16 +46,19 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
     if room < 0:
         return draws
     if uncorrelated and room:
-        away = torch.cat([members - members.mean(-2, keepdim=True) for members in uncorrelated], -1).to(draws.dtype)
+        away, *others = (members - members.mean(-2, keepdim=True) for members in uncorrelated)
         if away.shape[-1] > room:
             away = _leading(away, room)
+        for more in others:
+            away = torch.cat([away, more], -1) if away.shape[-1] + more.shape[-1] <= room else away
+        away = away.to(draws.dtype)
         draws = draws - away @ semidefinite_solve(away.mT @ away, away.mT @ draws)
         draws = draws - draws.mean(-2, keepdim=True)  # anomalies far below their mean sum to rounding, not to zero
     return whitened(draws, draws.mT @ draws / (size - 1))
 
 
 def _leading(away: Tensor, count: int) -> Tensor:
-    """Returns columns ``[*B, E, count]`` that span what the anomalies vary most in, each in units of its spread."""
+    """Returns columns ``[*B, E, count]`` that lean towards what the anomalies vary most in, in units of their spread."""
     square = away.square().sum(-2, keepdim=True)
     gram = away @ (away / torch.where(square > 0, square, 1)).mT
-    return gram @ gram[..., :count]
+    return gram[..., :count]
