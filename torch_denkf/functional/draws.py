@@ -58,7 +58,7 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
 
 
 def _leading(away: Tensor, count: int) -> Tensor:
-    """Returns columns ``[*B, E, count]`` that lean towards what the anomalies vary most in, in units of their spread."""
+    """Returns columns ``[*B, E, count]`` that lean towards what the anomalies vary most in, whatever their units."""
     square = away.square().sum(-2, keepdim=True)
     gram = away @ (away / torch.where(square > 0, square, 1)).mT
     return gram[..., :count]
