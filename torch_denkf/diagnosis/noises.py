@@ -117,7 +117,7 @@ class WrongNoise(Once):
         text = f"The belief is NaN from row {first} of the sequence on, because of {why}. {cure_of(why)}"
         if "no covariance" in why:
             raise ValueError(text)
-        self.warn("nan", text)
+        self.warn(f"NaN because of {why}", f"{text}RejectReadings in front of the filter makes such a reading missing.")
 
 
 def _found(record: Record, key: NestedKey) -> Tensor | None:
