@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torch_denkf.baselines import IEnKS
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.functional.manifolds import SO3, Circle, Euclidean
 from torch_denkf.functional.moments import ensemble_cov
@@ -132,6 +133,34 @@ def test_a_lag_leaves_the_belief_exact():
     data = frames()
     out, oracle = FixedLag(denkf("perturbed"), 2).sequence(data.copy()), kalman().sequence(data)
     torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_an_iterated_smoother_keeps_what_it_found_of_the_noise(iterations):
+    """Each iteration moves the noise, which is then exact no more: its mean is not zero."""
+    made, data = parts(), frames()
+    options = {"observation_key": "reading", "process_noise": Q, "iterations": iterations}
+    sensor = ConstantNoise(R, in_key="reading")
+    filter = IEnKS(made["transition"], None, made["observation"], sensor, initial=made["initial"], **options)
+    oracle, out = kalman().sequence(data.copy()), filter.sequence(data)
+    torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
+    torch.testing.assert_close(ensemble_cov(out["belief", "ensemble"]), oracle["belief", "cov"], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("hidden", [[False, True], [False, False]])
+def test_a_hidden_prediction_has_no_part_in_perturbed_readings(hidden):
+    """A prediction of NaN where nothing is read, such as the bearing of a landmark that nobody sees."""
+    forecast, seen = torch.randn(E, S, requires_grad=True), ~torch.tensor(hidden)
+    data = TensorDict({"reading": torch.ones(2), "observed": seen})
+    data["sensor", "noise"], data["noise", "self"] = R, torch.randn(E, 2)
+    out = []
+    for value in (0.0, torch.nan):
+        predicted = torch.where(seen, forecast[:, :2], value)
+        data["forecast"] = TensorDict({"ensemble": forecast, "observation": predicted}, [])
+        members = EnsembleAnalysis("perturbed", observation_key="reading")(data.copy())["belief", "ensemble"]
+        out += [members, *torch.autograd.grad(members.square().sum(), forecast)]
+    torch.testing.assert_close(out[2:], out[:2])
+    assert out[3].isfinite().all()
 
 
 def test_noise_of_some_dimensions_before_and_behind_the_motion():

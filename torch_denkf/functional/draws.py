@@ -47,6 +47,8 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
     )  # q draws of just q dimensions are nearly dependent: scaling up their rounding
     if uncorrelated and room > 0:
         away = torch.cat([members - members.mean(-2, keepdim=True) for members in uncorrelated], -1).to(draws.dtype)
+        scale = away.detach().abs().amax(-2, keepdim=True)  # squares and their gradients stay within the numbers
+        away = away * torch.where(scale > torch.finfo(away.dtype).tiny, 1 / scale, 0)
         if away.shape[-1] > room:
             away = _leading(away, room)
         draws = draws - away @ semidefinite_solve(away.mT @ away, away.mT @ draws)
