@@ -20,6 +20,7 @@ from torch_denkf.modules import (
     LearnedTransition,
     NoisyTransition,
 )
+from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import FixedLag
 
 E, S, T = 16, 3, 12
@@ -145,6 +146,28 @@ def test_an_iterated_smoother_keeps_what_it_found_of_the_noise(iterations):
     oracle, out = kalman().sequence(data.copy()), filter.sequence(data)
     torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
     torch.testing.assert_close(ensemble_cov(out["belief", "ensemble"]), oracle["belief", "cov"], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("space", [Circle(), SO3()])
+def test_a_gate_that_never_acts_changes_no_perturbation(space):
+    """Each run of its analysis makes the draws exact for the predictions that are aligned there."""
+    dim, start = space.tangent_dim, torch.zeros(space.point_dim).index_fill(0, torch.tensor([0]), 3.0)
+    start = space.plus(space.normalise(start), torch.zeros(dim))  # beside the turn of a circle
+    filter = DEnKF(
+        LearnedTransition(nn.Identity(), residual=False),
+        None,
+        LearnedObservation(nn.Identity()),
+        ConstantNoise([0.3] * dim, in_key="reading"),
+        EnsembleAnalysis("perturbed", observation_key="reading", space=space, reading_space=space),
+        initial=AroundState([0.2] * dim, ensemble_size=E, space=space),
+        process_noise=[0.1] * dim,
+    )
+    state = space.plus(start.expand(3, 4, -1), 0.1 * torch.randn(3, 4, dim))
+    data = TensorDict({"reading": state, "state": state, "observed": torch.rand(3, 4, dim) < 0.7}, [3, 4])
+    data = filter.draw_noise(data)
+    expected = filter.sequence(data.copy())["belief", "ensemble"]
+    out = Gated(filter, dim, rate=0).sequence(data)["belief", "ensemble"]
+    torch.testing.assert_close(out, expected, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("hidden", [[False, True], [False, False]])

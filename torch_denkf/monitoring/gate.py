@@ -20,7 +20,7 @@ from torch_denkf.monitoring.gating import adapt, disbelief, spread_about_mean
 from torch_denkf.monitoring.innovation_tests import interpolate
 from torch_denkf.running import random_parts
 from torch_denkf.smoothers.past import LaggedAnalysis
-from torch_denkf.submodel import Call, Entries, Update, flat_noise
+from torch_denkf.submodel import Call, Entries, SubModel, Update, flat_noise
 
 __all__ = ["GateOptions", "GatedAnalysis"]
 
@@ -284,7 +284,8 @@ class GatedAnalysis(Around):
             entries[self.noise_variance_key] = self.claimed.expand(*mean.shape[:-1], *self.claimed.shape)
         for place, part in random_parts(self.module, call.place) if call.sample else ():
             values = [self.required(entries, key) for key in part.in_keys]
-            entries.update(flat_noise(part._noise(entries, values, call._replace(place=place)), place))
+            # as it is drawn: each run makes it exact for its own members
+            entries.update(flat_noise(SubModel._noise(part, entries, values, call._replace(place=place)), place))
         return entries
 
     def _parts(self, entries: Entries, nis: Tensor, innovation: Tensor) -> tuple[Tensor, Tensor]:
