@@ -11,6 +11,7 @@ from torch_denkf.functional.manifolds import SO3, Circle, Euclidean
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import FadingBias
+from torch_denkf.imperfect.bias import BiasedBelief
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
@@ -146,6 +147,51 @@ def test_an_iterated_smoother_keeps_what_it_found_of_the_noise(iterations):
     oracle, out = kalman().sequence(data.copy()), filter.sequence(data)
     torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
     torch.testing.assert_close(ensemble_cov(out["belief", "ensemble"]), oracle["belief", "cov"], rtol=0, atol=1e-9)
+
+
+def test_perturbed_members_have_the_covariance_of_the_square_root_filter():
+    """Of predictions that are no linear function of the members: draws are uncorrelated with both."""
+    forecast = torch.randn(5, E, S)
+    forecast = {"ensemble": forecast, "observation": forecast[..., :2].square() + forecast[..., 1:]}
+    td = TensorDict({"forecast": forecast, "reading": torch.ones(5, 2), "sensor": {"noise": R.expand(5, 2)}}, [5])
+    out, expected = (
+        EnsembleAnalysis(scheme, observation_key="reading")(td.copy())["belief"] for scheme in ("perturbed", "etkf")
+    )
+    torch.testing.assert_close(ensemble_cov(out["ensemble"]), ensemble_cov(expected["ensemble"]), rtol=0, atol=1e-9)
+
+
+def test_perturbations_of_as_many_components_as_members_are_plain():
+    td = TensorDict(
+        {"reading": torch.ones(6), "sensor": {"noise": torch.ones(6)}, ("noise", "self"): torch.randn(6, 6)}
+    )
+    td["forecast"] = TensorDict({"ensemble": torch.randn(6, S), "observation": torch.randn(6, 6)}, [])
+    out, expected = (
+        EnsembleAnalysis("perturbed", observation_key="reading", draws=draws)(td.copy())["belief", "ensemble"]
+        for draws in ("exact", "random")
+    )
+    assert out.equal(expected)
+
+
+def test_on_a_circle_members_lie_on_both_sides_of_the_turn():
+    start = AroundState([0.3], ensemble_size=E, space=Circle())(TensorDict({"state": torch.tensor([3.1])}))
+    noise = ConstantNoise([0.2], in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    members = NoisyTransition(Still(), noise, space=Circle())(start)["forecast", "ensemble"]
+    var = Circle().minus(members, torch.tensor([3.1])).var(-2)
+    torch.testing.assert_close(var, torch.tensor([0.13]), rtol=0, atol=1e-9)
+
+
+def test_biases_of_weighted_particles_are_drawn_at_random():
+    class Weighted(nn.Module):
+        in_keys: list = []  # noqa: RUF012
+        out_keys = [("belief", "ensemble"), ("belief", "log_weight")]  # noqa: RUF012
+        ensemble_size = E
+
+        def forward(self, td):
+            return td.set("belief", TensorDict({"ensemble": torch.randn(E, S), "log_weight": torch.zeros(E)}, []))
+
+    bias, noise = FadingBias([0.4], time=5.0, trainable=False), torch.randn(E, 1)
+    td = BiasedBelief(Weighted(), bias)(TensorDict({("noise", "self"): noise}))
+    torch.testing.assert_close(td["belief", "ensemble"][:, S:], 0.4 * noise)
 
 
 @pytest.mark.parametrize("space", [Circle(), SO3()])
