@@ -58,6 +58,7 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
 
 
 def _leading(away: Tensor, count: int) -> Tensor:
-    """Returns columns ``[*B, E, count]`` that span what the anomalies, in units of their spread, vary most in."""
-    gram = away @ away.mT
+    """Returns columns ``[*B, E, count]`` that span what the anomalies vary most in, each in units of its spread."""
+    square = away.square().sum(-2, keepdim=True)
+    gram = away @ (away / torch.where(square > 0, square, 1)).mT
     return gram @ gram[..., :count]

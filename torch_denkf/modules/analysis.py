@@ -138,7 +138,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         forecast, predicted = values[:2]
         observed = entries.get(self.observed_key)
         if observed is not None:  # hidden predictions may be NaN
-            predicted = torch.where(observed.unsqueeze(-2), predicted, 0)
+            predicted = torch.where(observed.unsqueeze(-2) | predicted.isfinite(), predicted, 0)
         if self.space is not None:
             forecast = self.space.minus(forecast, self.space.near(forecast).unsqueeze(-2))
         size = noise.shape[-2]
