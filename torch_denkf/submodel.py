@@ -38,12 +38,14 @@ class Call(NamedTuple):
         place: where the module stands in the filter, e.g. ``"transition"``; its noise is ``("noise", place)``.
         sample: whether random modules draw; if not, they run their deterministic forward.
         time: whether the last dimension of ``batch_size`` is time.
+        raw: whether process noise is added as it is given; who calls has made it exact.
     """
 
     batch_size: torch.Size
     place: str = "self"
     sample: bool = True
     time: bool = False
+    raw: bool = False
 
     def part(self, name: str) -> Call:
         """The call of a part of the module."""

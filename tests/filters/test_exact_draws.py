@@ -5,11 +5,13 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torch_denkf.baselines import IEnKS
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.functional.manifolds import SO3, Circle, Euclidean
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import FadingBias
+from torch_denkf.imperfect.bias import BiasedBelief
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
@@ -19,6 +21,7 @@ from torch_denkf.modules import (
     LearnedTransition,
     NoisyTransition,
 )
+from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import FixedLag
 
 E, S, T = 16, 3, 12
@@ -132,6 +135,101 @@ def test_a_lag_leaves_the_belief_exact():
     data = frames()
     out, oracle = FixedLag(denkf("perturbed"), 2).sequence(data.copy()), kalman().sequence(data)
     torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_an_iterated_smoother_keeps_what_it_found_of_the_noise(iterations):
+    """Each iteration moves the noise, which is then exact no more: its mean is not zero."""
+    made, data = parts(), frames()
+    options = {"observation_key": "reading", "process_noise": Q, "iterations": iterations}
+    sensor = ConstantNoise(R, in_key="reading")
+    filter = IEnKS(made["transition"], None, made["observation"], sensor, initial=made["initial"], **options)
+    oracle, out = kalman().sequence(data.copy()), filter.sequence(data)
+    torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
+    torch.testing.assert_close(ensemble_cov(out["belief", "ensemble"]), oracle["belief", "cov"], rtol=0, atol=1e-9)
+
+
+def test_perturbed_members_have_the_covariance_of_the_square_root_filter():
+    """Of predictions that are no linear function of the members: draws are uncorrelated with both."""
+    forecast = torch.randn(5, E, S)
+    forecast = {"ensemble": forecast, "observation": forecast[..., :2].square() + forecast[..., 1:]}
+    td = TensorDict({"forecast": forecast, "reading": torch.ones(5, 2), "sensor": {"noise": R.expand(5, 2)}}, [5])
+    out, expected = (
+        EnsembleAnalysis(scheme, observation_key="reading")(td.copy())["belief"] for scheme in ("perturbed", "etkf")
+    )
+    torch.testing.assert_close(ensemble_cov(out["ensemble"]), ensemble_cov(expected["ensemble"]), rtol=0, atol=1e-9)
+
+
+def test_perturbations_of_as_many_components_as_members_are_plain():
+    td = TensorDict(
+        {"reading": torch.ones(6), "sensor": {"noise": torch.ones(6)}, ("noise", "self"): torch.randn(6, 6)}
+    )
+    td["forecast"] = TensorDict({"ensemble": torch.randn(6, S), "observation": torch.randn(6, 6)}, [])
+    out, expected = (
+        EnsembleAnalysis("perturbed", observation_key="reading", draws=draws)(td.copy())["belief", "ensemble"]
+        for draws in ("exact", "random")
+    )
+    assert out.equal(expected)
+
+
+def test_on_a_circle_members_lie_on_both_sides_of_the_turn():
+    start = AroundState([0.3], ensemble_size=E, space=Circle())(TensorDict({"state": torch.tensor([3.1])}))
+    noise = ConstantNoise([0.2], in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    members = NoisyTransition(Still(), noise, space=Circle())(start)["forecast", "ensemble"]
+    var = Circle().minus(members, torch.tensor([3.1])).var(-2)
+    torch.testing.assert_close(var, torch.tensor([0.13]), rtol=0, atol=1e-9)
+
+
+def test_biases_of_weighted_particles_are_drawn_at_random():
+    class Weighted(nn.Module):
+        in_keys: list = []  # noqa: RUF012
+        out_keys = [("belief", "ensemble"), ("belief", "log_weight")]  # noqa: RUF012
+        ensemble_size = E
+
+        def forward(self, td):
+            return td.set("belief", TensorDict({"ensemble": torch.randn(E, S), "log_weight": torch.zeros(E)}, []))
+
+    bias, noise = FadingBias([0.4], time=5.0, trainable=False), torch.randn(E, 1)
+    td = BiasedBelief(Weighted(), bias)(TensorDict({("noise", "self"): noise}))
+    torch.testing.assert_close(td["belief", "ensemble"][:, S:], 0.4 * noise)
+
+
+@pytest.mark.parametrize("space", [Circle(), SO3()])
+def test_a_gate_that_never_acts_changes_no_perturbation(space):
+    """Each run of its analysis makes the draws exact for the predictions that are aligned there."""
+    dim, start = space.tangent_dim, torch.zeros(space.point_dim).index_fill(0, torch.tensor([0]), 3.0)
+    start = space.plus(space.normalise(start), torch.zeros(dim))  # beside the turn of a circle
+    filter = DEnKF(
+        LearnedTransition(nn.Identity(), residual=False),
+        None,
+        LearnedObservation(nn.Identity()),
+        ConstantNoise([0.3] * dim, in_key="reading"),
+        EnsembleAnalysis("perturbed", observation_key="reading", space=space, reading_space=space),
+        initial=AroundState([0.2] * dim, ensemble_size=E, space=space),
+        process_noise=[0.1] * dim,
+    )
+    state = space.plus(start.expand(3, 4, -1), 0.1 * torch.randn(3, 4, dim))
+    data = TensorDict({"reading": state, "state": state, "observed": torch.rand(3, 4, dim) < 0.7}, [3, 4])
+    data = filter.draw_noise(data)
+    expected = filter.sequence(data.copy())["belief", "ensemble"]
+    out = Gated(filter, dim, rate=0).sequence(data)["belief", "ensemble"]
+    torch.testing.assert_close(out, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("hidden", [[False, True], [False, False]])
+def test_a_hidden_prediction_has_no_part_in_perturbed_readings(hidden):
+    """A prediction of NaN where nothing is read, such as the bearing of a landmark that nobody sees."""
+    forecast, seen = torch.randn(E, S, requires_grad=True), ~torch.tensor(hidden)
+    data = TensorDict({"reading": torch.ones(2), "observed": seen})
+    data["sensor", "noise"], data["noise", "self"] = R, torch.randn(E, 2)
+    out = []
+    for value in (0.0, torch.nan):
+        predicted = torch.where(seen, forecast[:, :2], value)
+        data["forecast"] = TensorDict({"ensemble": forecast, "observation": predicted}, [])
+        members = EnsembleAnalysis("perturbed", observation_key="reading")(data.copy())["belief", "ensemble"]
+        out += [members, *torch.autograd.grad(members.square().sum(), forecast)]
+    torch.testing.assert_close(out[2:], out[:2])
+    assert out[3].isfinite().all()
 
 
 def test_noise_of_some_dimensions_before_and_behind_the_motion():

@@ -2,9 +2,11 @@
 
 import pytest
 import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.kernels.random_bits import balanced_bytes
+from torch_denkf.modules import StochasticMLP
 
 
 def correlated(members, dim, batch=(50,), scale=1.0):
@@ -67,6 +69,47 @@ def test_members_without_spread_and_draws_without_spread():
     torch.testing.assert_close(exact_draws(half)[:, 0].square().sum() / 31, torch.tensor(1.0), atol=1e-4, rtol=0)
 
 
+@pytest.mark.parametrize("spread", [0.0, 1e-30, 1e-20, 1e-6, 1e20])
+def test_gradients_are_finite_whatever_the_spread(spread):
+    """A component that decays for long has squares that single precision does not hold."""
+    members = (spread * torch.randn(4, 32, 3)).requires_grad_()
+    draws = exact_draws(torch.randn(4, 32, 2), members)
+    torch.testing.assert_close(draws.mT @ draws / 31, torch.eye(2).expand(4, 2, 2), atol=1e-4, rtol=0)
+    assert (draws.mT @ (members / max(spread, 1e-38))).abs().max() < 1e-2
+    assert torch.autograd.grad(draws.pow(3).sum(), members)[0].isfinite().all()
+
+
+def test_what_is_no_number_stays_in_its_row():
+    normal, ensemble = torch.randn(3, 16, 2), torch.randn(3, 16, 14)
+    whole, ensemble[1, 3, 2] = exact_draws(normal, ensemble), torch.nan
+    ensemble.requires_grad_()
+    draws = exact_draws(normal, ensemble)
+    assert draws[[0, 2]].equal(whole[[0, 2]])
+    assert draws[1].isnan().all()
+    assert torch.autograd.grad(draws[[0, 2]].sum(), ensemble)[0][[0, 2]].isfinite().all()
+
+
+@pytest.mark.parametrize(("members", "dim", "state"), [(8, 3, 4), (9, 2, 5), (12, 5, 6), (20, 9, 10)])
+def test_the_covariance_is_exact_where_room_is_scarce(members, dim, state):
+    """Draws that keep just as many dimensions as they have are nearly dependent, and their rounding is scaled up."""
+    draws = exact_draws(torch.randn(2000, members, dim), torch.randn(2000, members, state))
+    assert (draws.mT @ draws / (members - 1) - torch.eye(dim)).abs().max() < 0.015
+    assert draws.mean(-2).abs().max() < 2e-6
+
+
+@pytest.mark.parametrize("dim", [6, 9])
+def test_with_more_dimensions_than_members_the_mean_alone_is_exact(dim):
+    normal = torch.randn(4, 6, dim)
+    torch.testing.assert_close(exact_draws(normal, torch.randn(4, 6, 2)), normal - normal.mean(-2, keepdim=True))
+
+
+@pytest.mark.parametrize("state", [3, 20])
+def test_units_of_the_members_change_nothing(state, float64):
+    normal, ensemble = torch.randn(4, 16, 2), torch.randn(4, 16, state)
+    units = torch.logspace(-6, 6, state)
+    torch.testing.assert_close(exact_draws(normal, ensemble * units), exact_draws(normal, ensemble), rtol=0, atol=1e-6)
+
+
 def test_the_gradient_is_that_of_finite_differences(float64):
     normal, ensemble = torch.randn(2, 8, 2), torch.randn(2, 8, 3, requires_grad=True)
     assert torch.autograd.gradcheck(lambda members: exact_draws(normal, members), ensemble, atol=1e-5)
@@ -97,3 +140,35 @@ def test_units_are_dropped_independently_of_each_other():
     joint = (dropped.mT @ dropped / 32).mean(0)
     off = joint[~torch.eye(8, dtype=torch.bool)]
     assert (off - 1 / 16).abs().max() < 0.004  # of 4000 x 32 pairs, four standard deviations
+
+
+@pytest.mark.parametrize("members", [5, 12, 30, 100, 300])
+def test_no_two_members_are_dropped_in_turn(members):
+    """At a rate of one half two members that always lie half a turn apart would have opposite masks in each unit."""
+    kept = (balanced_bytes((), members, 20_000) < 128).double() * 2 - 1
+    pairs = (kept @ kept.mT / 20_000)[~torch.eye(members, dtype=torch.bool)]
+    assert pairs.min() > -0.45
+    assert abs(pairs.mean() + 1 / members) < 0.02
+    assert pairs.std() < 0.3
+
+
+def test_neighbours_are_not_dropped_together():
+    dropped = (balanced_bytes((), 32, 20_000) < 64).double()
+    assert (dropped[0] * dropped[1]).mean() < 0.1  # at 1/16, and at 0.22 if all units had one order
+
+
+def test_a_network_draws_balanced_masks_for_members_alone():
+    net = StochasticMLP(1, 1, (500,), rate=0.25)
+    assert (net.draw_noise((3,), 32) < 64).sum(-2).eq(8).all()
+    assert not (net.draw_noise((3, 32)) < 64).sum(-2).eq(8).all()
+    assert not (StochasticMLP(1, 1, (500,), rate=0.25, balanced=False).draw_noise((3,), 32) < 64).sum(-2).eq(8).all()
+
+
+def test_masks_of_very_many_members_take_little_memory():
+    assert balanced_bytes((), 100_003, 2).float().mean(0).sub(127.5).abs().max() < 0.5
+
+
+def test_orders_of_tensors_without_memory_are_not_kept():
+    with FakeTensorMode():
+        balanced_bytes((), 29, 2)
+    assert type(balanced_bytes((), 29, 2)) is torch.Tensor

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import cast
 
 import torch
 from tensordict import NestedKey, unravel_key
@@ -12,6 +13,7 @@ from torch import nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import analyse
+from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.inflation import inflate, random_rotation
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.smoothing.iterated import iterated_smoothing
@@ -173,7 +175,7 @@ class IteratedAnalysis(Update):
                 work[key] = members[..., begin : begin + value.shape[-1]]
                 begin += value.shape[-1]
             transition = self.module["transition"]
-            return {**work, **run_module(transition, work, call.part("transition"))}
+            return {**work, **run_module(transition, work, call.part("transition")._replace(raw=True))}
 
         def predict(members: torch.Tensor) -> torch.Tensor:
             observation = self.module["observation"]
@@ -206,7 +208,10 @@ class IteratedAnalysis(Update):
         if not call.sample:
             return noise
         for place, part in random_parts(self.module["transition"], call.part("transition").place):
-            noise.update(flat_noise(part._noise(entries, [ensemble], call._replace(place=place)), place))
+            drawn = part._noise(entries, [ensemble], call._replace(place=place))
+            if cast(NoisyTransition, part).exact:  # here, as what is found afterwards has a mean and a covariance
+                drawn = exact_draws(cast(torch.Tensor, drawn), ensemble, *noise.values())
+            noise.update(flat_noise(drawn, place))
         return noise
 
     def _after(self, smoothed, observed, rotation) -> torch.Tensor:

@@ -43,10 +43,10 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
     size, dim = normal.shape[-2:]
     draws = normal - normal.mean(-2, keepdim=True)
     room = size - 3 - dim - dim // 8
-    if room < 0:
+    if room < 0 or not dim:
         return draws
     if uncorrelated and room:
-        away, *others = (members - members.mean(-2, keepdim=True) for members in uncorrelated)
+        away, *others = map(_anomalies, uncorrelated)
         if away.shape[-1] > room:
             away = _leading(away, room)
         for more in others:
@@ -55,6 +55,13 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
         draws = draws - away @ semidefinite_solve(away.mT @ away, away.mT @ draws)
         draws = draws - draws.mean(-2, keepdim=True)  # anomalies far below their mean sum to rounding, not to zero
     return whitened(draws, draws.mT @ draws / (size - 1))
+
+
+def _anomalies(members: Tensor) -> Tensor:
+    """Returns the deviations from the mean, at most 1, so that squares and their gradients neither vanish nor overflow."""
+    away = members - members.mean(-2, keepdim=True)
+    scale = away.detach().abs().amax(-2, keepdim=True)
+    return away * torch.where(scale > torch.finfo(away.dtype).tiny, 1 / scale, 0)
 
 
 def _leading(away: Tensor, count: int) -> Tensor:

@@ -136,6 +136,9 @@ class EnsembleAnalysis(EnsembleUpdate):
         if noise.shape[-1] >= noise.shape[-2]:  # the mean alone could be exact, and analyse() takes it out
             return noise
         forecast, predicted = values[:2]
+        observed = entries.get(self.observed_key)
+        if observed is not None:  # hidden predictions may be NaN
+            predicted = torch.where(observed.unsqueeze(-2) | predicted.isfinite(), predicted, 0)
         if self.space is not None:
             forecast = self.space.minus(forecast, self.space.near(forecast).unsqueeze(-2))
         size = noise.shape[-2]

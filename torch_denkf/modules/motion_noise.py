@@ -153,7 +153,7 @@ class NoisyTransition(Transition):
         if normal is None:
             return ensemble
         normal = normal[..., :size]  # a point may have more numbers than its tangent
-        if self.exact and self.log_weight_key not in entries:
+        if self.exact and not call.raw and self.log_weight_key not in entries:
             space = self.space
             away = ensemble if space is None else space.minus(ensemble, space.near(ensemble).unsqueeze(-2))
             normal = exact_draws(normal, away)

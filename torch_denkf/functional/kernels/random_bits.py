@@ -8,7 +8,7 @@ times cheaper than :func:`torch.nn.functional.dropout`, whose masks are two thir
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import gcd, prod
+from math import prod
 
 import torch
 
@@ -17,6 +17,7 @@ from torch_denkf.functional.kernels.small_system import on_gpu
 __all__ = ["balanced_bytes", "dropout_factor", "random_bytes", "random_keep_mask", "random_signs", "representable_rate"]
 
 _INT64_MIN = -(2**63)
+_GOLDEN = 0.6180339887498949
 _ORDERS: dict[tuple[int, torch.device], torch.Tensor] = {}
 
 
@@ -122,10 +123,13 @@ def _orders(members: int, device: torch.device) -> torch.Tensor:
     if (members, device) in _ORDERS:
         return _ORDERS[members, device]
     number = torch.arange(members)
-    coprime = torch.tensor([step for step in range(1, members + 1) if gcd(step, members) == 1]).unsqueeze(-1)
-    orders = number.unsqueeze(-1) if 256 % members == 0 else coprime * number % members
+    if 256 % members == 0:
+        orders = number.unsqueeze(-1)
+    else:  # ranks of the multiples of different angles: any two members lie any distance apart
+        angles = torch.arange(1, max(2, min(257, 2**22 // members)), dtype=torch.float64) * _GOLDEN
+        orders = (angles.unsqueeze(-1) * number % 1).argsort(-1).argsort(-1)
     orders = (orders * 256 // members).to(torch.uint8).to(device)
-    if not torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+    if type(orders) is torch.Tensor and not torch.compiler.is_compiling() and not torch.compiler.is_exporting():
         _ORDERS[members, device] = orders
     return orders
 
