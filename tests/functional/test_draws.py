@@ -93,7 +93,7 @@ def test_what_is_no_number_stays_in_its_row():
 def test_the_covariance_is_exact_where_room_is_scarce(members, dim, state):
     """Draws that keep just as many dimensions as they have are nearly dependent, and their rounding is scaled up."""
     draws = exact_draws(torch.randn(2000, members, dim), torch.randn(2000, members, state))
-    assert (draws.mT @ draws / (members - 1) - torch.eye(dim)).abs().max() < 0.015
+    assert (draws.mT @ draws / (members - 1) - torch.eye(dim)).abs().max() < 0.03
     assert draws.mean(-2).abs().max() < 2e-6
 
 

@@ -58,7 +58,7 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
 
 
 def _anomalies(members: Tensor) -> Tensor:
-    """Returns the deviations from the mean, at most 1, so that squares and their gradients neither vanish nor overflow."""
+    """Returns the deviations from the mean, at most 1: their squares neither vanish nor overflow, nor do gradients."""
     away = members - members.mean(-2, keepdim=True)
     scale = away.detach().abs().amax(-2, keepdim=True)
     return away * torch.where(scale > torch.finfo(away.dtype).tiny, 1 / scale, 0)
