@@ -161,7 +161,7 @@ def test_a_network_draws_balanced_masks_for_members_alone():
     net = StochasticMLP(1, 1, (500,), rate=0.25)
     assert (net.draw_noise((3,), 32) < 64).sum(-2).eq(8).all()
     assert not (net.draw_noise((3, 32)) < 64).sum(-2).eq(8).all()
-    assert not (StochasticMLP(1, 1, (500,), rate=0.25, balanced=False).draw_noise((3,), 32) < 64).sum(-2).eq(8).all()
+    assert not (StochasticMLP(1, 1, (500,), rate=0.25, masks="random").draw_noise((3,), 32) < 64).sum(-2).eq(8).all()
 
 
 def test_masks_of_very_many_members_take_little_memory():

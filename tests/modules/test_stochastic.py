@@ -151,7 +151,7 @@ class TestBothKinds:
         assert net(x, noise).equal(net(x, noise))
 
     def test_members_are_uncorrelated(self, layer):
-        net = StochasticMLP(3, 1, (8,), layer=layer, rate=0.3, posterior_std=0.3, balanced=False)
+        net = StochasticMLP(3, 1, (8,), layer=layer, rate=0.3, posterior_std=0.3, masks="random")
         x = torch.randn(3).expand(2, 3)
         with torch.no_grad():
             if layer == "dropout":

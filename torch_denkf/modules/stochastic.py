@@ -124,8 +124,8 @@ class StochasticMLP(nn.Module):
         activation: the non-linearity of hidden layers, ReLU by default.
         output_gain: factor on the last layer's initial weights; a small one starts a residual model near the
             identity, zero starts it there.
-        balanced: whether each unit is dropped in the same share of an ensemble's members, drawn without replacement
-            (``"dropout"``); their mean is then nearer to that of infinitely many. ``False`` for independent draws.
+        masks: ``"balanced"`` drops each unit in the same share of an ensemble's members, drawn without replacement
+            (``"dropout"``): their mean is then nearer to that of infinitely many. ``"random"`` draws independently.
 
     Shapes:
         input ``[*, in_features]``, output ``[*, out_features]``. Noise: for dropout, uint8 random bytes
@@ -154,17 +154,18 @@ class StochasticMLP(nn.Module):
         posterior_std: float = 0.05,
         activation: Callable[[], nn.Module] = nn.ReLU,
         output_gain: float = 1.0,
-        balanced: bool = True,
+        masks: Literal["balanced", "random"] = "balanced",
     ):
         check_number("posterior_std", posterior_std, above=0)
         super().__init__()
         check_choice("layer", layer, ("dropout", "flipout", "none"))
+        check_choice("masks", masks, ("balanced", "random"))
         for name, size in (("in_features", in_features), ("out_features", out_features)):
             check_count(name, size)
         for size in num_cells:
             check_count("num_cells", size, cure=f"It holds the widths of the hidden layers: {list(num_cells)}")
         check_number("output_gain", output_gain)
-        self.layer, self.rate, self.balanced = layer, representable_rate(rate), balanced
+        self.layer, self.rate, self.balanced = layer, representable_rate(rate), masks == "balanced"
         self.sample = True
         sizes = [in_features, *num_cells, out_features]
         self.in_features, self.out_features = in_features, out_features
