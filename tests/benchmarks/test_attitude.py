@@ -119,6 +119,7 @@ def test_the_librarys_filter_is_the_one_in_plain_numpy(float64, up_noise):
     assert_close(out["belief", "cov"], cov, rtol=1e-6, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_both_sensors_are_better_than_the_gyro():
     rows = list(baseline_rows("simulated", simulated(1, 30.0, 7), slice(500, None)))
     best = {name: min(row["tilt"] for row in rows if row["filter"] == name) for name in {row["filter"] for row in rows}}

@@ -424,11 +424,8 @@ def frames_player(env):
     return env.base_env.player()
 
 
-SELDOM = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("EKF", "etkf", "perturbed", "particles")]
-# An EKF's compiled step is that of its package, below.
-
-
-@pytest.mark.parametrize("kind", ["UKF", *SELDOM])
+@pytest.mark.slow  # an EKF's compiled step is that of its package, below
+@pytest.mark.parametrize("kind", ["UKF", "EKF", "etkf", "perturbed", "particles"])
 def test_compiled_is_eager(kind):
     filter, data = make(kind), log(steps=5)
     data = with_noise(filter, data)

@@ -429,7 +429,12 @@ def test_means_of_numbers_and_angles():
 
 @pytest.mark.parametrize(
     "space",
-    [Circle(), SO3(), SE2(), pytest.param(Product(SE23(), Circle(), Euclidean(2)), marks=pytest.mark.slow)],
+    [
+        Circle(),
+        SE2(),
+        pytest.param(SO3(), marks=pytest.mark.slow),
+        pytest.param(Product(SE23(), Circle(), Euclidean(2)), marks=pytest.mark.slow),
+    ],
     ids=repr,
 )
 def test_compiled_is_eager(space):

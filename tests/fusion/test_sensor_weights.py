@@ -239,6 +239,7 @@ def walker(weights):
     )
 
 
+@pytest.mark.slow
 def test_learned_weights_fall_where_a_sensor_is_bad():
     torch.manual_seed(0)
     filter = walker(SensorAttention({"good": 1, "fair": 1}, features={"good": 1}))

@@ -98,6 +98,7 @@ def test_with_whiteness_alarms_of_single_steps_come_at_their_rate_too():
     assert within_binomial_error((p < watch.p_limit).double().mean().item(), rate / 3, p.numel())
 
 
+@pytest.mark.slow
 def test_alarms_of_the_sum_come_after_its_run_length():
     rate = 0.01
     watch = monitor(false_alarm_rate=rate)
@@ -245,6 +246,7 @@ def test_a_marked_beginning_forgets():
     assert torch.allclose(replayed["gps", "cusum"][:, 16:], alone["gps", "cusum"][:, 1:], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_compiled_steps_give_the_same():
     data = simulate(2, 9)
     eager = Monitored(kalman(), monitor(window=3)).sequence(data.clone())
