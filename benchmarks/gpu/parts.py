@@ -1,4 +1,4 @@
-"""What is measured, part by part; each part yields its cases."""
+"""Yields the cases of each part of the measurement."""
 
 from __future__ import annotations
 
@@ -264,7 +264,7 @@ def of_equality(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Cas
 
     for way in ways:
 
-        def anew(way=way):
+        def again(way=way):
             filter = MODELS["DEnKF, perturbed"](5).to(device).compile(**WAYS[way])
             data = frames(5, 3, 6, device)
             first, second = (filter.sequence(data.copy())["belief", "ensemble"].detach() for _ in range(2))
@@ -272,7 +272,7 @@ def of_equality(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Cas
                 raise AssertionError("two runs drew the same members")
             return lambda: None
 
-        yield Case("two runs draw different members", anew, way, 3, 6)
+        yield Case("two runs draw different members", again, way, 3, 6)
 
 
 PARTS: dict[str, Callable[[str, tuple[str, ...], bool], Iterator[Case]]] = {

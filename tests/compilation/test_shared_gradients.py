@@ -1,4 +1,4 @@
-"""Gradients that steps share are those of each step by itself, however the graph is asked for them."""
+"""Compares gradients that steps share with those of each step by itself, for all ways to differentiate a graph."""
 
 import pytest
 import torch

@@ -122,7 +122,7 @@ def frames(space):
 
 
 def filtered(filter, data, key="pose"):
-    """What a filter writes, with one noise for all runs; and the readings, whose gradients can be asked for."""
+    """Runs a filter, with one noise for all runs; returns what it wrote, and the readings, which require gradients."""
     torch.manual_seed(2)
     noise = filter.draw_noise(data[:1, :1].clone()).get("noise", None)
     pose = data[key].clone().requires_grad_()

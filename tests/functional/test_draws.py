@@ -5,7 +5,9 @@ import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from torch_denkf.functional.draws import exact_draws
+from torch_denkf.functional.kernels import small_system
 from torch_denkf.functional.kernels.random_bits import balanced_bytes
+from torch_denkf.functional.kernels.resolvents import sum_of_resolvents
 from torch_denkf.modules import StochasticMLP
 
 
@@ -168,7 +170,11 @@ def test_masks_of_very_many_members_take_little_memory():
     assert balanced_bytes((), 100_003, 2).float().mean(0).sub(127.5).abs().max() < 0.5
 
 
-def test_orders_of_tensors_without_memory_are_not_kept():
+@pytest.mark.parametrize(
+    "use", [lambda: balanced_bytes((), 29, 2), lambda: sum_of_resolvents(torch.eye(2), difference=False)]
+)
+def test_constants_of_tensors_without_memory_are_not_kept(use, monkeypatch):
+    monkeypatch.setattr(small_system, "_MADE", {})
     with FakeTensorMode():
-        balanced_bytes((), 29, 2)
-    assert type(balanced_bytes((), 29, 2)) is torch.Tensor
+        use()
+    assert type(use()) is torch.Tensor

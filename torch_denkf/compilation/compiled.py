@@ -51,7 +51,7 @@ class CompiledSteps:
         self._functions: dict[tuple, tuple[Callable, set]] = {}
 
     def _compiler_options(self) -> dict[str, Any] | None:
-        """Returns what ``torch.compile`` is asked for; ``None`` where it is not asked."""
+        """Returns the arguments of ``torch.compile``; ``None`` where nothing is compiled."""
         return self.options
 
     def _by_inductor(self) -> bool:

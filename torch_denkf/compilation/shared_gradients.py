@@ -105,6 +105,6 @@ class _Product(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient: Tensor):
         x, weight = ctx.saved_tensors
-        if torch._C._will_engine_execute_node(ctx.gather):  # else the layer's gradient is not asked for
+        if torch._C._will_engine_execute_node(ctx.gather):  # else no gradient of the layer is needed
             ctx.kept.add(x, gradient)
         return gradient @ weight if ctx.needs_input_grad[0] else None, None, None, None, None

@@ -98,11 +98,8 @@ class Draws:
         kind = (*sorted(shapes.items(), key=str), *(part.noise_names for _, part in self._random))
         if kind not in self._drawn:
             self._drawn[kind] = self._trial(entries, size)
-        out, like, chosen = (
-            {},
-            self.filter.like(),
-            set(dict(self.filter.structure.modules) if places is None else places),
-        )
+        out: Entries = {}
+        chosen, like = set(dict(self.filter.structure.modules) if places is None else places), self.filter.like()
         where: dict[str, Any] = {} if like is None else {"device": like.device, "dtype": like.dtype}
         for place, (part, sizes) in self._drawn[kind].items():
             keys = [("noise", place, name) if name else ("noise", place) for name in part.noise_names]

@@ -5,9 +5,20 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_denkf._checks import check_choice
 from torch_denkf.functional.linalg import semidefinite_solve, whitened
 
-__all__ = ["exact_draws"]
+__all__ = ["exact_draws", "is_exact"]
+
+
+def is_exact(draws: str) -> bool:
+    """Tells whether draws are to be exact.
+
+    Raises:
+        ValueError: if ``draws`` is neither ``"exact"`` nor ``"random"``.
+    """
+    check_choice("draws", draws, ("exact", "random"))
+    return draws == "exact"
 
 
 def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
@@ -19,12 +30,12 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
 
     For all three E must be at least S + 9/8 q + 3. With fewer members mean and covariance are exact, and the draws
     uncorrelated with as many directions of the members as there is room for; with fewer than 9/8 q + 3 the mean
-    alone is. (q draws in little more than q dimensions are nearly dependent, and to whiten them blows up rounding.)
+    alone is: q draws in little more than q dimensions are nearly dependent, and whitening them would magnify rounding.
 
     Args:
         normal: standard-normal draws, ``[*B, E, q]``.
-        *uncorrelated: members, ``[*B, E, S]`` each, that the draws are uncorrelated with; those that come first are
-            sooner.
+        *uncorrelated: members, ``[*B, E, S]`` each, that the draws are to be uncorrelated with. Where there is no room
+            for all, those that come first have it.
 
     Returns:
         Draws ``[*B, E, q]``; zero where ``normal`` has no spread.

@@ -9,7 +9,7 @@ import torch
 
 from torch_denkf._checks import check_choice, check_values
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
-from torch_denkf.functional.draws import exact_draws
+from torch_denkf.functional.draws import exact_draws, is_exact
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.functional.moments import ensemble_cov
@@ -103,8 +103,7 @@ class EnsembleAnalysis(EnsembleUpdate):
             **keys,
         )
         check_dims("inflated", inflated or [])
-        check_choice("draws", draws, ("exact", "random"))
-        self.exact = draws == "exact"
+        self.exact = is_exact(draws)
         self.inflated = None if inflated is None else list(inflated)
         self.scheme, self.covariance = scheme, covariance
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
@@ -141,10 +140,8 @@ class EnsembleAnalysis(EnsembleUpdate):
             predicted = torch.where(observed.unsqueeze(-2) | predicted.isfinite(), predicted, 0)
         if self.space is not None:
             forecast = self.space.minus(forecast, self.space.near(forecast).unsqueeze(-2))
-        size = noise.shape[-2]
-        return (
-            exact_draws(noise, predicted, forecast) * ((size - 1) / size) ** 0.5
-        )  # analyse() takes a sample of N(0, I)
+        size = noise.shape[-2]  # analyse() makes up for the mean that it takes out of a sample
+        return exact_draws(noise, predicted, forecast) * ((size - 1) / size) ** 0.5
 
     def noise_sizes(self, forecast, predicted, *_):
         """E and O, from the ensemble and its predicted observations."""

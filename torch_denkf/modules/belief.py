@@ -9,10 +9,10 @@ import torch
 from tensordict import NestedKey, unravel_key
 from torch import nn
 
-from torch_denkf._checks import check_choice, check_count, check_values
+from torch_denkf._checks import check_count, check_values
 from torch_denkf.beliefs import moments_on
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.functional.draws import exact_draws
+from torch_denkf.functional.draws import exact_draws, is_exact
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.tensors import (
     as_floating,
@@ -45,8 +45,7 @@ class _InitialEnsemble(Initial):
         if space is not None:
             space.check(tangent=std)
         check_count("ensemble_size", ensemble_size, least=2, cure="One member has no variance")
-        check_choice("draws", draws, ("exact", "random"))
-        self.exact = draws == "exact"
+        self.exact = is_exact(draws)
         self.register_buffer("std", std)
         self.ensemble_size, self.state_dim = ensemble_size, std.numel()
 

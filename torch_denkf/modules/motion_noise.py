@@ -10,8 +10,7 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf._checks import check_choice
-from torch_denkf.functional.draws import exact_draws
+from torch_denkf.functional.draws import exact_draws, is_exact
 from torch_denkf.functional.linalg import as_covariance, semidefinite_root
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.weighted import weighted_mean
@@ -94,8 +93,7 @@ class NoisyTransition(Transition):
         self.log_weight_key, self.space = unravel_key(log_weight_key), check_space("space", space)
         self.before, self.mean_key, self.forecast_mean_key = before, *map(unravel_key, (mean_key, forecast_mean_key))
         check_dims("dims", dims or (), once=True)
-        check_choice("draws", draws, ("exact", "random"))
-        self.exact = draws == "exact"
+        self.exact = is_exact(draws)
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
 
     def draw_noise(self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_):

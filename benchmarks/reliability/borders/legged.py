@@ -54,7 +54,7 @@ def model() -> mujoco.MjModel:
 
 @cache
 def log() -> TensorDict:
-    """What it reads while it stands and sways."""
+    """Returns the readings of a robot that stands and sways."""
     random = torch.Generator().manual_seed(0)
     turn = 0.01 * torch.randn(1, T, 3, generator=random)
     force = torch.tensor([0.0, 0.0, 9.81]) + 0.1 * torch.randn(1, T, 3, generator=random)

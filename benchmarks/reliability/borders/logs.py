@@ -32,7 +32,7 @@ NAN, INF = float("nan"), float("inf")
 
 
 def told(act: Callable[..., Any]) -> Callable[..., Any]:
-    """What is done, with the library's warnings as errors."""
+    """Runs with the library's warnings as errors."""
 
     def do(*args: Any, **given: Any) -> Any:
         with warnings.catch_warnings():
@@ -63,7 +63,7 @@ def _bursts(times: np.ndarray, of: int = 20) -> np.ndarray:
     return times[number // of * of] - 2e-4 * (of - 1 - number % of)
 
 
-#: Times that no sensor writes. Of a table those that go back are refused; of messages all are told of.
+#: Times that no sensor writes. A table raises for those that go back; messages warn of all.
 TIMES: d.Wrong = d.Wrong(
     {
         "in ms": lambda times: 1e3 * times,

@@ -39,7 +39,7 @@ def frames(name: str) -> Frames:
 
 
 def run(kind: str, name: str, change: Change, on_bad: Any = "raise") -> Frames:
-    """What a filter believes of changed frames, behind a module that looks at its readings."""
+    """Runs a filter on changed frames, behind a module that rejects readings."""
     torch.manual_seed(0)
     filter, data = make(kind, SPACES[name]), change(SPACES[name], frames(name).clone())
     front = RejectReadings({"pose": "observed"}, spaces={"pose": SPACES[name]}, on_bad=on_bad)
@@ -48,7 +48,7 @@ def run(kind: str, name: str, change: Change, on_bad: Any = "raise") -> Frames:
 
 
 def stepped(kind: str, name: str, change: Change) -> Frames:
-    """Likewise, of single steps without that module."""
+    """Steps a filter on changed frames, without that module."""
     torch.manual_seed(0)
     filter, data = make(kind, SPACES[name]), change(SPACES[name], frames(name).clone())
     with torch.no_grad():
@@ -214,7 +214,7 @@ def scored(name: str) -> Iterator[Target]:
 
 
 def products() -> Iterator[Target]:
-    """What is no space, where one is due."""
+    """Yields values that are no space, where one is due."""
     wrong = d.Wrong({"nothing": None, "text": "SO3", "a class": Circle, "a number": 3})
     for what, act in (
         ("Product", lambda value, folder: Product(Euclidean(1), value)),

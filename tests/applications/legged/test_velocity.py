@@ -41,7 +41,7 @@ def test_it_is_how_the_base_moves_in_its_own_axes():
 
 
 def test_its_variance_is_that_of_a_linearisation():
-    """Of a covariance in which velocity and bias belong together: a wrong sign of the lever shows there alone."""
+    """Maps a covariance in which velocity and bias are correlated: a wrong sign of the lever shows in that alone."""
     state, gyro, pose, space = states(), torch.randn(5, 3), sensor(), LeggedSpace(FEET)
     root = torch.randn(5, space.tangent_dim, space.tangent_dim)
     cov = root @ root.mT

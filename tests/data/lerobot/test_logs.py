@@ -66,7 +66,7 @@ def announce(root, version, episode, length):
 def test_an_episode_of_no_length_that_has_rows(tmp_path, version):
     with_lengths(tmp_path, version, [4, 5, 3])
     announce(tmp_path, version, 1, 0)
-    with pytest.raises(ValueError, match="has 5 rows of episode 1, but the metadata says 0; download both anew"):
+    with pytest.raises(ValueError, match="has 5 rows of episode 1, but the metadata says 0; download both again"):
         open_all(tmp_path)
     assert len(open_all(tmp_path, episodes=[0, 2])) == 7
 

@@ -361,7 +361,7 @@ def rows_of_episode(table, episode: EpisodeFiles):
     if table.num_rows != episode.length:
         raise ValueError(
             f"{episode.data} has {table.num_rows} rows of episode {episode.number}, but the metadata says "
-            f"{episode.length}; download both anew"
+            f"{episode.length}; download both again"
         )
     if "frame_index" in table.column_names:
         frame = table["frame_index"].to_numpy()

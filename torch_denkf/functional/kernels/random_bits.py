@@ -12,13 +12,12 @@ from math import prod
 
 import torch
 
-from torch_denkf.functional.kernels.small_system import on_gpu
+from torch_denkf.functional.kernels.small_system import made_once, on_gpu
 
 __all__ = ["balanced_bytes", "dropout_factor", "random_bytes", "random_keep_mask", "random_signs", "representable_rate"]
 
 _INT64_MIN = -(2**63)
 _GOLDEN = 0.6180339887498949
-_ORDERS: dict[tuple[int, torch.device], torch.Tensor] = {}
 
 
 def representable_rate(rate: float) -> float:
@@ -116,22 +115,18 @@ def balanced_bytes(
 
 
 def _orders(members: int, device: torch.device) -> torch.Tensor:
-    """Returns the orders in which bytes of one unit can stand, ``[N, E]``, or one order ``[E, 1]`` for its multiples.
+    """Returns the orders in which bytes of one unit can stand, ``[N, E]``, or one ``[E, 1]`` for its multiples."""
 
-    They are made once a device, as no copy to the device is captured.
-    """
-    if (members, device) in _ORDERS:
-        return _ORDERS[members, device]
-    number = torch.arange(members)
-    if 256 % members == 0:
-        orders = number.unsqueeze(-1)
-    else:  # ranks of the multiples of different angles: any two members lie any distance apart
-        angles = torch.arange(1, max(2, min(257, 2**22 // members)), dtype=torch.float64) * _GOLDEN
-        orders = (angles.unsqueeze(-1) * number % 1).argsort(-1).argsort(-1)
-    orders = (orders * 256 // members).to(torch.uint8).to(device)
-    if type(orders) is torch.Tensor and not torch.compiler.is_compiling() and not torch.compiler.is_exporting():
-        _ORDERS[members, device] = orders
-    return orders
+    def make() -> torch.Tensor:
+        number = torch.arange(members)
+        if 256 % members == 0:
+            orders = number.unsqueeze(-1)
+        else:  # ranks of the multiples of different angles: any two members lie any distance apart
+            angles = torch.arange(1, max(2, min(257, 2**22 // members)), dtype=torch.float64) * _GOLDEN
+            orders = (angles.unsqueeze(-1) * number % 1).argsort(-1).argsort(-1)
+        return (orders * 256 // members).to(torch.uint8).to(device)
+
+    return made_once(("orders", members, device), make)
 
 
 def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torch.Tensor:

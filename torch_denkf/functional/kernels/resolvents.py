@@ -13,9 +13,7 @@ from math import cosh, exp, pi, sinh, sqrt
 import torch
 from torch import Tensor
 
-from torch_denkf.functional.kernels.small_system import inverse_of
-
-_TABLES: dict[tuple, Tensor] = {}
+from torch_denkf.functional.kernels.small_system import inverse_of, made_once
 
 
 def nodes(count: int, ratio: float) -> list[tuple[float, float]]:
@@ -73,13 +71,14 @@ def sum_of_resolvents(matrix: Tensor, *, difference: bool) -> Tensor:
 
 
 def _table(like: Tensor) -> Tensor:
-    """Shifts, weights, and those of the difference, ``[3, J]``; made once, as no copy to the device is captured."""
-    key = like.device, like.dtype
-    if key not in _TABLES:
-        count = 22 if like.dtype == torch.float32 else 80  # as the difference asks for near M = 0
+    """Returns shifts, weights, and those of the difference, ``[3, J]``."""
+
+    def make() -> Tensor:
+        count = 22 if like.dtype == torch.float32 else 80  # as the difference needs near M = 0
         found = [(s, w, -w / (1 + s)) for s, w in nodes(count, 1 / torch.finfo(like.dtype).eps)]
-        _TABLES[key] = torch.tensor(found, dtype=like.dtype, device=like.device).mT.contiguous()
-    return _TABLES[key]
+        return torch.tensor(found, dtype=like.dtype, device=like.device).mT.contiguous()
+
+    return made_once(("resolvents", like.device, like.dtype), make)
 
 
 class _SumOfResolvents(torch.autograd.Function):

@@ -8,7 +8,7 @@ or cannot be captured into a CUDA graph, as MAGMA's: :func:`inverse_of` takes th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -19,6 +19,26 @@ LARGEST = 4
 LARGEST_FACTOR = 6
 #: Kinds of devices on which a call costs a launch, and a look at a result waits for all launches before it.
 GPUS = ("cuda",)
+
+
+_MADE: dict[Hashable, Tensor] = {}
+
+
+def made_once(key: Hashable, make: Callable[[], Tensor]) -> Tensor:
+    """Returns a constant tensor that is made in the first call: no copy to the device is captured into a graph later.
+
+    A tensor that holds no numbers, as compilers trace with, is not kept.
+
+    Args:
+        key: of the constant; its device among it.
+        make: makes it.
+    """
+    if key in _MADE:
+        return _MADE[key]
+    made = make()
+    if type(made) is Tensor and not torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+        _MADE[key] = made
+    return made
 
 
 def on_gpu(tensor: Tensor) -> bool:

@@ -114,7 +114,7 @@ def rows(came_from, seen):
 
 
 def test_what_is_remembered_of_a_corner():
-    """Of corners that fit without a flaw the weight is w = (freedom + 3) / freedom, and the variance goes by it.
+    """Gives corners without an error the weight w = (freedom + 3) / freedom, and the variance goes by it.
 
     From row to row it is divided by w, and a walk is added. A corner that is new, or was not seen in the row before,
     starts from its own variance. So does one whose weight was small.
