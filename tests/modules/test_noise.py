@@ -70,6 +70,14 @@ def test_constant(float64, batch):
     assert not list(ConstantNoise([0.1]).parameters())
 
 
+def test_constant_in_the_finer_of_the_two_precisions():
+    """1e-5 squared is zero in float16, which a camera or a log may use."""
+    noise = ConstantNoise([1e-5], in_key="reading")
+    variance = noise(TensorDict({"reading": torch.zeros(3, 1, dtype=torch.float16)}, [3]))["sensor", "noise"]
+    torch.testing.assert_close(variance, torch.full((3, 1), 1e-10), rtol=1e-5, atol=0)
+    assert noise.compute(torch.zeros(3, 1, dtype=torch.float64), batch_size=[3]).dtype == torch.float64
+
+
 def test_constant_trains_the_logarithm(float64):
     model = ConstantNoise([0.1, 2.0], trainable=True)
     variance(model, torch.zeros(2)).sum().backward()

@@ -127,7 +127,7 @@ class ConstantNoise(Sensor):
 
     def compute(self, like, *, batch_size):
         """The variances."""
-        variance = self.log_variance.exp().to(like.dtype if like.is_floating_point() else self.log_variance.dtype)
+        variance = self.log_variance.exp().to(torch.promote_types(like.dtype, self.log_variance.dtype))
         return variance.expand(*batch_size, -1)
 
 

@@ -135,8 +135,7 @@ class CholeskyNoise(SubModel):
     def compute(self, features, *, batch_size):
         """The covariance."""
         if self.constant:
-            dtype = features.dtype if features.is_floating_point() else self.raw.dtype
-            raw = self.raw.to(dtype).expand(*batch_size, -1)
+            raw = self.raw.to(torch.promote_types(features.dtype, self.raw.dtype)).expand(*batch_size, -1)
         else:
             raw = self.module((mean_of_members(features, batch_size) - self.loc) / self.scale)
         row, column = self.rows

@@ -164,6 +164,10 @@ def _rounded(fed: Fed, frames: TensorDict) -> TensorDict:
     return frames.set(fed.reading, frames[fed.reading].round())
 
 
+def _halved(fed: Fed, frames: TensorDict) -> TensorDict:
+    return frames.set(fed.reading, frames[fed.reading].half().float())
+
+
 def _unobserved(fed: Fed, frames: TensorDict) -> TensorDict:
     frames["observed"][AT] = False
     return frames
@@ -269,7 +273,7 @@ READINGS = BROKEN | d.Wrong(
         "too narrow": entry(lambda value: value[..., :1]),
         "a dimension more": entry(lambda value: value[..., None].expand(*value.shape, 3)),
         "float64": entry(Tensor.double, as_of(_sound, tolerance=1e-5, precision=True)),
-        "float16": entry(Tensor.half, as_of(_sound, tolerance=1e-2, precision=True)),
+        "float16": entry(Tensor.half, as_of(_halved, tolerance=1e-6, precision=True)),
         "int64": entry(lambda value: value.round().long(), as_of(_rounded, tolerance=1e-6)),
         **{what: entry(change) for what, change in SHAPES.items()},
     },
