@@ -37,6 +37,7 @@ _FEW = 0.02  # a share of stamps: if more go back, nobody has sorted them
 _ENOUGH = 100  # steps from which on their distribution is judged
 _TINY, _SHORT, _WIDE = 0.01, 0.05, 6.0  # mean steps: of bursts, there are many below the one, and some above the other
 _RESOLVED = 20  # steps of a column have at least so many steps of its dtype
+_NONE = 1e-12  # of a number: moves below are rounding of float64
 _READERS = ("torch_denkf", "torchrl", "tensordict")  # torchrl's data sets are made by a function of its own
 
 
@@ -157,7 +158,7 @@ def look_at_numbers(
     for column, name in zip(values.T, columns, strict=True):
         column = column[np.isfinite(column)]
         moves = np.abs(np.diff(column))
-        moves = moves[moves > 0]
+        moves = moves[moves > _NONE * np.abs(column).max(initial=0.0)]
         if not len(moves):
             continue
         tensor = torch.from_numpy(np.ascontiguousarray(column))
