@@ -21,6 +21,7 @@ __all__ = [
     "look_at_numbers",
     "look_at_repeats",
     "look_at_times",
+    "repeats",
     "warn_of_log",
 ]
 
@@ -200,7 +201,7 @@ def look_at_repeats(values: np.ndarray, columns: Sequence[str], place: object) -
         >>> print(str(said[0].message)[:75])
         run1.csv: 'north' repeats its last reading in 80 % of the rows, and each ro
     """
-    slow = [name for column, name in zip(values.T, columns, strict=True) if _repeats(column)]
+    slow = [name for column, name in zip(values.T, columns, strict=True) if repeats(column)]
     if not slow:
         return
     kept = 1 + int((np.diff(values[:, [name in slow for name in columns]], axis=0) != 0).any(1).sum())
@@ -218,7 +219,8 @@ def look_at_repeats(values: np.ndarray, columns: Sequence[str], place: object) -
     )
 
 
-def _repeats(column: np.ndarray) -> bool:
+def repeats(column: np.ndarray) -> bool:
+    """Tells whether a column repeats its last reading until the next one comes."""
     moves = np.diff(column)
     changes = np.flatnonzero(moves)
     if len(changes) < 5 or np.median(np.diff(changes)) < 2:

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from torch_denkf._checks import check_number
+from torch_denkf.data.earth import to_local
 from torch_denkf.data.recordings.sources import read_numbers
 from torch_denkf.data.recordings.stamps import unit_of
 from torch_denkf.data.times import Way
@@ -72,6 +73,9 @@ class Table:
         origin: what is subtracted from columns, by their names, in float64, before they become float32, which has seven
             digits: of metres of a map, degrees of latitude or encoder ticks the last ones are lost. A warning says
             where.
+        local: latitude and longitude in degrees, and height in m or none of it, of the origin of a local frame: columns
+            of latitude and longitude, and perhaps of height, in this order, become metres ``east``, ``north`` and
+            ``up`` of it, see :mod:`torch_denkf.data.earth`.
         repeats: what a row is in which no column differs from the row before. ``"drop"``: the last reading once more,
             as in a log that repeats a slow sensor until it reads again; the row is left out. ``"keep"``: a reading of
             its own. By default it is kept, and a warning says where a column looks as if it repeats.
@@ -101,6 +105,7 @@ class Table:
     times: str | Path | Sequence[float] | None = None
     topic: str | None = None
     offset: float = 0.0
+    local: Sequence[float] | None = None
 
     def __post_init__(self):
         check_stream(self.sample, ("last", "nearest", "linear"), self.tolerance, self.unit)
@@ -161,6 +166,8 @@ class Table:
         for name, origin in (self.origin or {}).items():
             column = [names.index(name)]
             values[:, column] = in_origin(values[:, column], origin, f"origin of {name!r}")
+        if self.local is not None:
+            values, names = to_local(values, self.local), ("east", "north", "up")[: len(names)]
         look_at_numbers(values, names, self.file)
         if self.repeats != "drop":
             return Readings(times, values, names, arrived)
