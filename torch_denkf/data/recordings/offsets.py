@@ -157,7 +157,8 @@ def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[De
                 # Shifts leave out the ends of a log, where a robot begins to move: the fewer, the more it says.
                 pair = known[early][what], known[late][what]
                 tried = [_delay(*pair, what, limit, _SPANS[0]) for limit in (most, most / 3, most / 9)]
-                best = max(range(3), key=lambda number: abs(tried[number][3]) if tried[number] else 0.0)
+                sizes = [0.0 if one is None else abs(one[3]) for one in tried]
+                best = int(np.argmax(sizes))
                 limit = most / 3**best
                 found = tried[best]
                 if what == "heading" or pair[1].level.ndim == 1:  # a chord of some seconds is shorter than a way
@@ -183,7 +184,7 @@ def changes_of(tables: Mapping[str, Readings], offsets: Mapping[str, float]) -> 
     steps, changes = {name: table.times - begin for name, table in tables.items()}, {}
     known = {name: _signals(table) for name, table in tables.items()}
     for what, title in (("heading", "turn rate, scaled"), ("way", "speed, scaled")):
-        drawn = {}
+        drawn: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         for name in known:
             if what in known[name]:
                 times, level, _ = known[name][what]
