@@ -1,0 +1,6 @@
+from .model import RobotModel, robot_model
+
+__all__ = [
+    "RobotModel",
+    "robot_model",
+]
