@@ -164,13 +164,16 @@ class PositionInBody(_Reading):
     Args:
         space: of the states.
         landmark: where it lies in the world, ``[3]``, in the plane ``[2]``; of several ``[L, 3]`` or ``[L, 2]``.
+        landmark_key: in its place, an entry of the data that says it in each row, ``[*B, 3 L]`` or ``[*B, 2 L]``, as
+            for a landmark that is recognised; what a row lacks is hidden by a mask ``[*B, O]`` of the readings.
+        count: L, of the entry.
         part: the place of the pose, ``SE2()``, ``SE3()`` or ``SE23()``, in a ``Product``.
         in_key: states to observe ``[*B, E, P]``.
         out_key: predicted readings ``[*B, E, 3 L]``, in the plane ``[*B, E, 2 L]``.
 
     Raises:
         TypeError: if the part is no pose.
-        ValueError: if landmarks have another shape.
+        ValueError: if landmarks have another shape, or are given twice or not at all.
 
     Example:
         >>> from tensordict import TensorDict
@@ -186,70 +189,93 @@ class PositionInBody(_Reading):
     def __init__(
         self,
         space: Space,
-        landmark: Sequence[float] | Sequence[Sequence[float]] | Tensor,
+        landmark: Sequence[float] | Sequence[Sequence[float]] | Tensor | None = None,
         *,
+        landmark_key: NestedKey | None = None,
+        count: int = 1,
         part: int = 0,
         in_key: NestedKey = ("forecast", "ensemble"),
         out_key: NestedKey = ("forecast", "observation"),
     ):
         super().__init__(space, part, None, in_key, out_key)
+        if (landmark is None) == (landmark_key is None):
+            raise ValueError(f"{type(self).__name__} takes landmark=, or landmark_key= of an entry that says it.")
         size = 2 if isinstance(self.read_space, SE2) else 3
-        _register_vectors(self, "landmark", landmark, [size], [len(landmark), size])
-        self.reading_space = Euclidean(self.landmark.numel())
+        if landmark is None:
+            check_count("count", count)
+            self.in_keys = [*self.in_keys, landmark_key]
+        else:
+            _register_vectors(self, "landmark", landmark, [size], [len(landmark), size])
+            count = self.landmark.numel() // size
+        self.size, self.count = size, count
+        self.reading_space = self.space_of_reading(count)
+
+    def space_of_reading(self, count: int) -> Space:
+        """The space of readings of so many landmarks."""
+        return Euclidean(self.size * count)
+
+    def compute(self, ensemble, *given):
+        """The predicted readings."""
+        self.space.check(point=ensemble)
+        point, size = ensemble.narrow(-1, self.begin, self.read_space.point_dim), self.size * self.count
+        if not given:
+            return self.observe(point)
+        if given[0].shape[-1] != size:
+            what = f"{self.count} landmarks of {self.size} numbers"
+            raise ValueError(f"{self.in_keys[1]!r} is [*B, {size}], {what}; got {list(given[0].shape)}.")
+        return self.seen(point, given[0].to(ensemble.dtype).unsqueeze(-2).unflatten(-1, (-1, self.size))).flatten(-2)
 
     def observe(self, point):
-        """The landmarks in the body's axes."""
-        size = self.landmark.shape[-1]
-        away = self.landmark.reshape(-1, size) - point[..., -size:].unsqueeze(-2)
-        if size == 3:
-            return rotate(_inverse(point).unsqueeze(-2), away).flatten(-2)
+        """The landmarks that are known beforehand, one after the other."""
+        return self.seen(point, self.landmark.reshape(-1, self.size)).flatten(-2)
+
+    def seen(self, point: Tensor, landmark: Tensor) -> Tensor:
+        """The landmarks ``[*, L, N]`` in the body's axes."""
+        away = landmark - point[..., -self.size :].unsqueeze(-2)
+        if self.size == 3:
+            return rotate(_inverse(point).unsqueeze(-2), away)
         cos, sin = point[..., :1].cos(), point[..., :1].sin()
         x, y = away.unbind(-1)
-        return torch.stack([cos * x + sin * y, cos * y - sin * x], -1).flatten(-2)
+        return torch.stack([cos * x + sin * y, cos * y - sin * x], -1)
 
 
 class RangeBearing(PositionInBody):
-    """How far a landmark in the plane is, and by how much to the left of straight ahead.
+    """How far landmarks in the plane are, and by how much to the left of straight ahead.
 
-    The second number is an angle: the reading is a point of ``Product(Euclidean(1), Circle())``, ``reading_space``.
+    Of each the second number is an angle: the reading is a point of ``Product(Euclidean(1), Circle(), ...)``,
+    ``reading_space``.
 
     Args:
         space: of the states.
-        landmark: where it lies in the world, ``[2]``.
+        landmark: where it lies in the world, ``[2]``; of several ``[L, 2]``.
+        landmark_key: in its place, an entry of the data that says it in each row, ``[*B, 2 L]``, as for a landmark that
+            is recognised by a barcode.
+        count: L, of the entry.
         part: the place of the pose, ``SE2()``, in a ``Product``.
         in_key: states to observe ``[*B, E, P]``.
-        out_key: predicted readings ``[*B, E, 2]``: the unit of length, and rad.
+        out_key: predicted readings ``[*B, E, 2 L]``: of each the unit of length, and rad.
 
     Raises:
         TypeError: if the part is no pose in the plane.
-        ValueError: if the landmark has another shape.
+        ValueError: if landmarks have another shape, or are given twice or not at all.
 
     Example:
         >>> from tensordict import TensorDict
         >>> pose = torch.tensor([[0.0, 1.0, 0.0]])
-        >>> RangeBearing(SE2(), [1.0, 5.0])(TensorDict({("forecast", "ensemble"): pose}))["forecast", "observation"]
+        >>> td = TensorDict({("forecast", "ensemble"): pose, "post": torch.tensor([1.0, 5.0])})
+        >>> RangeBearing(SE2(), landmark_key="post")(td)["forecast", "observation"]
         tensor([[5.0000, 1.5708]])
     """
 
     kinds = (SE2,)
 
-    def __init__(
-        self,
-        space: Space,
-        landmark: Sequence[float] | Tensor,
-        *,
-        part: int = 0,
-        in_key: NestedKey = ("forecast", "ensemble"),
-        out_key: NestedKey = ("forecast", "observation"),
-    ):
-        super().__init__(space, landmark, part=part, in_key=in_key, out_key=out_key)
-        if self.landmark.ndim != 1:
-            raise ValueError(f"landmark is one, [2]; got {list(self.landmark.shape)}.")
-        self.reading_space = Product(Euclidean(1), Circle())
+    def space_of_reading(self, count):
+        """Of each a length and an angle."""
+        return Product(*[Euclidean(1), Circle()] * count)
 
-    def observe(self, point):
-        """Range and bearing; at the landmark itself zero, and so is their gradient."""
-        away = super().observe(point)
+    def seen(self, point, landmark):
+        """Ranges and bearings; at a landmark itself zero, and so is their gradient."""
+        away = super().seen(point, landmark)
         there = (away == 0).all(-1, keepdim=True)
         away = torch.where(there, torch.ones_like(away), away)
         polar = torch.stack([torch.linalg.vector_norm(away, dim=-1), torch.atan2(away[..., 1], away[..., 0])], -1)

@@ -119,8 +119,8 @@ def _of_message(columns: Mapping[str, np.ndarray], values: np.ndarray, cov: np.n
     if turned := [name for name in columns if re.search(r"orientation\.w$", name)]:
         stem = turned[0][:-1]
         values[:, 3:6] = _angles(*(columns[stem + axis] for axis in ("w", *_XYZ)))
-    blocks = (("pose.covariance", 0, 6), ("twist.covariance", 6, 6), ("orientation_covariance", 3, 3))
-    blocks += (("angular_velocity_covariance", 9, 3), ("linear_acceleration_covariance", 12, 3))
+    blocks = [("pose.covariance", 0, 6), ("twist.covariance", 6, 6), ("orientation_covariance", 3, 3)]
+    blocks += [("angular_velocity_covariance", 9, 3), ("linear_acceleration_covariance", 12, 3)]
     for stem, begin, size in blocks:
         if f"{stem}.0" in columns:
             block = np.stack([columns[f"{stem}.{place}"] for place in range(size * size)], -1)
@@ -137,7 +137,7 @@ def _of_names(
 ) -> None:
     """Fills in columns with usual names."""
     if places := find(table.columns, "latitude", "longitude"):
-        values[:, :2] = to_local(table.values[:, places], origin if origin is not None else table.values[0, places])
+        values[:, :2] = to_local(table.values[:, places], origin or table.values[0, places].tolist())
     elif places := find(table.columns, "east", "north"):
         values[:, :2] = table.values[:, places]
     for name, column in columns.items():
