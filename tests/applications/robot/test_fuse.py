@@ -122,8 +122,30 @@ def test_noises_that_are_learned_are_those_of_the_log(tmp_path):
     fixes = scale_of(model, "pose0_pose").detach().exp()
     assert ((fixes > 0.1) & (fixes < 0.9)).all()
     assert scale_of(model, "imu0_twist").exp() < 0.2
-    with pytest.raises(ValueError, match=r"fewer than 4 segments of 200: pass --steps 0"):
-        learn_noises(model, rows, steps=1, shown=False)
+    torch.testing.assert_close(fixes[0], fixes[1])  # x and y alike
+    with pytest.raises(ValueError, match=r"fewer than 4 segments of 30: pass --steps 0"):
+        learn_noises(model, rows, steps=1, length=30, shown=False)
+
+
+def test_what_was_learned_is_kept_when_it_is_interrupted(tmp_path, monkeypatch):
+    write_log(tmp_path / "log.csv", 20.0)
+    settings = {"two_d_mode": True, "frequency": 2.0, "initial_estimate_covariance": [1.0] * 15}
+    settings |= {"pose0": "gps", "pose0_config": flags(0, 1), "imu0": "imu", "imu0_config": flags(11)}
+    model = robot_model(settings)
+    log = read_log(tmp_path / "log.csv", model.config, log_streams(tmp_path / "log.csv"))
+    rows, calls = rows_of_log(log, model), []
+
+    def likelihood(model, segments):
+        calls.append(1)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return -scale_of(model, "imu0_twist").sum().square() + scale_of(model, "imu0_twist").sum()
+
+    monkeypatch.setattr("torch_denkf.applications.robot.learning._likelihood", likelihood)
+    learned = learn_noises(model, rows, steps=5, length=5, shown=False)
+    assert learned.interrupted
+    assert (learned.before, learned.after) == (0.0, pytest.approx(0.4 - 0.4**2))  # a step of Adam
+    assert scale_of(model, "imu0_twist").item() == pytest.approx(0.4)
 
 
 def test_the_command(tmp_path, capsys):

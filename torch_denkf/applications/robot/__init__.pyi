@@ -1,6 +1,5 @@
-from .model import RobotModel, robot_model
+from .model import robot_model
 
 __all__ = [
-    "RobotModel",
     "robot_model",
 ]

@@ -39,26 +39,28 @@ class Learned(NamedTuple):
 
 
 def learn_noises(
-    model: RobotModel, rows: TensorDict, *, steps: int = 8, length: int = 200, shown: bool = True
+    model: RobotModel, rows: TensorDict, *, steps: int = 8, length: int | None = None, shown: bool = True
 ) -> Learned:
     """Learns how large the noises are, so that the readings of a log are likely.
 
     The log is cut into segments. Each starts from the filter's belief at that time, and is used twice: as it is, and
-    without poses in most of it, so that what the motion does not know shows. Errors of poses that follow each other
-    within a second are alike: one of them is used, and the noise that is learned becomes that of all. First the noises
-    of sensors are learned, then that of the motion, then all; what is kept is the best on segments that are held out.
+    without poses in most of it, where the forecast is to be likely at those that are hidden. Errors of poses that
+    follow each other within a second are alike: one of them is used, and the noise that is learned becomes that of all.
+    First the noises of sensors are learned, then that of the motion, then all; what is kept is the best on segments
+    that are held out.
 
     Args:
         model: its parameters change.
         rows: of the log ``[T]``, see :func:`~torch_denkf.applications.robot.log.rows_of_log`.
         steps: of a stage.
-        length: rows of a segment.
+        length: rows of a segment; by default 200, or an eighth of a short log.
         shown: whether progress is.
 
     Raises:
         ValueError: if the log is shorter than four segments.
     """
     filter = model.filter
+    length = min(200, max(len(rows) // (2 * _HELD_OUT), 20)) if length is None else length
     count = len(rows) // length
     if count < _HELD_OUT:
         raise ValueError(f"the log has {len(rows)} rows, fewer than {_HELD_OUT} segments of {length}: pass --steps 0")
@@ -68,6 +70,8 @@ def learn_noises(
     if model.config.two_d:  # what does not move has no noise to learn
         for parameter in motion:
             parameter.register_hook(lambda gradient: gradient.index_fill(0, torch.tensor(PLANE), 0.0))
+    for parameter in [*motion, *(scale_of(model, name) for name in _positions(model))]:
+        parameter.register_hook(_alike)
     best = [value.detach().clone() for value in (*sensors, *motion)]
     before, reached, stages, interrupted = None, -torch.inf, [], False
     with progress_bar("learning noises", 3 * (steps + 1), unit=" steps", shown=shown) as bar:
@@ -97,6 +101,11 @@ def learn_noises(
     for name, each in thinned.items():
         scale_of(model, name).data += 0.5 * math.log(each)
     return Learned(before if before is not None else float("nan"), reached, stages, interrupted)
+
+
+def _alike(gradient: Tensor) -> Tensor:
+    """A gradient that keeps the noises of x and y in the ratio in which they were."""
+    return torch.cat([gradient[:2].mean().expand(2), gradient[2:]])
 
 
 def scale_of(model: RobotModel, name: str) -> Tensor:
@@ -132,14 +141,31 @@ def _segments(model: RobotModel, rows: TensorDict, count: int, length: int) -> t
         whole = model.filter.sequence(rows.clone(), keep=keys)[: count * length]
     cut = whole.reshape(count, length).clone()
     silent = cut.clone()
-    for name in model.reads:
-        if name.endswith("_pose"):
-            silent[f"{name}_observed"][:, length // 8 : 7 * length // 8] = False
+    for name in _positions(model):
+        seen = silent[f"{name}_observed"]
+        between = torch.zeros_like(seen)
+        between[:, length // 8 : 7 * length // 8] = True
+        cut[f"{name}_hidden"], silent[f"{name}_hidden"] = torch.zeros_like(seen), seen & between
+        silent[f"{name}_observed"] = seen & ~between
     held = torch.arange(count) % _HELD_OUT == _HELD_OUT - 1
     return torch.cat([cut[~held], silent[~held]]), torch.cat([cut[held], silent[held]])
 
 
+def _positions(model: RobotModel) -> list[str]:
+    """The sensors that read x and y first."""
+    return [name for name, reads in model.reads.items() if tuple(reads[:2]) == (0, 1)]
+
+
 def _likelihood(model: RobotModel, segments: TensorDict) -> Tensor:
-    """Mean log-likelihood of a row."""
-    out = model.filter.sequence(segments.clone(), keep=[("info", "log_likelihood")])
-    return out["info", "log_likelihood"].mean()
+    """Mean log-likelihood of a row, of what is observed and of places that are hidden."""
+    keys = [("info", "log_likelihood"), ("belief", "mean"), ("belief", "cov")]
+    out = model.filter.sequence(segments.clone(), keep=keys)
+    total = out["info", "log_likelihood"].mean()
+    for name in _positions(model):
+        scale = scale_of(model, name)[:2].exp()
+        cov = out["belief", "cov"][..., :2, :2] + out[f"{name}_noise"][..., :2, :2] * scale * scale.unsqueeze(-1)
+        error = (out[name] - out["belief", "mean"][..., : out[name].shape[-1]])[..., :2]
+        distance = (error * torch.linalg.solve(cov, error)).sum(-1)
+        score = -0.5 * (distance + torch.logdet(cov)) - math.log(2 * math.pi)
+        total = total + torch.where(out[f"{name}_hidden"][..., 0], score, 0.0).mean()
+    return total

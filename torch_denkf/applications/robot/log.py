@@ -105,7 +105,7 @@ def _found(topic: str, streams: Mapping[str, Stream], file: Path) -> str:
 
 
 def rows_of_log(log: RobotLog, model: RobotModel, hidden: np.ndarray | None = None) -> TensorDict:
-    """Makes rows ``[T]`` of all poses, and of ``frequency`` where none is near.
+    """Makes rows ``[T]`` of all poses, of fast ones of every so many, and of ``frequency`` where none is near.
 
     Readings of other sensors that are as fast stand in the row that is nearest to them, as their mean; those of slow
     ones have rows of their own.
@@ -116,13 +116,12 @@ def rows_of_log(log: RobotLog, model: RobotModel, hidden: np.ndarray | None = No
         hidden: intervals in s ``[N, 2]`` in which poses are not observed, after the first row.
     """
     rate = model.config.frequency
-    own = {
-        name: (name.endswith("_pose") and model.reads[name][0] < 6) or _rate(seen) < 0.7 * rate
-        for name, seen in log.seen.items()
-    }
-    exact = np.unique(np.concatenate([[], *(seen.times for name, seen in log.seen.items() if own[name])]))
-    begin = min(seen.times[0] for seen in log.seen.values())
-    end = max(seen.times[-1] for seen in log.seen.values())
+    poses = {name for name in log.seen if name.endswith("_pose") and model.reads[name][0] < 6}
+    streams = {name: seen.every(int(_rate(seen) / rate)) if name in poses else seen for name, seen in log.seen.items()}
+    own = {name: name in poses or _rate(seen) < 0.7 * rate for name, seen in streams.items()}
+    exact = np.unique(np.concatenate([[], *(seen.times for name, seen in streams.items() if own[name])]))
+    begin = min(seen.times[0] for seen in streams.values())
+    end = max(seen.times[-1] for seen in streams.values())
     ticks = np.arange(begin, end, 1 / rate)
     if len(exact):
         begin = exact[0]
@@ -132,7 +131,7 @@ def rows_of_log(log: RobotLog, model: RobotModel, hidden: np.ndarray | None = No
     times = np.unique(np.concatenate([[begin], exact, ticks]))
     rows = {"stamp": times[:, None], "dt": np.diff(times, prepend=begin)[:, None]}
     edges = (times[1:] + times[:-1]) / 2
-    for name, seen in log.seen.items():
+    for name, seen in streams.items():
         place = np.searchsorted(times, seen.times) if own[name] else np.searchsorted(edges, seen.times)
         inside = (seen.times >= begin) & (seen.times <= times[-1] + 0.5 / rate)
         place, values, noise = place[inside], seen.values[inside], seen.noise[inside]

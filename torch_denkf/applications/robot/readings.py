@@ -35,6 +35,11 @@ class Seen(NamedTuple):
     noise: np.ndarray
     stated: bool
 
+    def every(self, count: int) -> Seen:
+        """Each of so many readings; all for a count of one or less."""
+        kept = slice(None, None, max(count, 1))
+        return Seen(self.times[kept], self.values[kept], self.noise[kept], self.stated)
+
 
 def seen_by(
     sensor: SensorConfig, group: str, config: Config, table: Readings, origin: Sequence[float] | None, kmh: bool
