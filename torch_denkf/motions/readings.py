@@ -240,7 +240,7 @@ class PositionInBody(_Reading):
 
 
 class RangeBearing(PositionInBody):
-    """How far landmarks in the plane are, and by how much to the left of straight ahead.
+    """Range and bearing of landmarks in the plane: how far, and by how much to the left of straight ahead.
 
     Of each the second number is an angle: the reading is a point of ``Product(Euclidean(1), Circle(), ...)``,
     ``reading_space``.
@@ -270,7 +270,7 @@ class RangeBearing(PositionInBody):
     kinds = (SE2,)
 
     def space_of_reading(self, count):
-        """Of each a length and an angle."""
+        """A length and an angle for each."""
         return Product(*[Euclidean(1), Circle()] * count)
 
     def seen(self, point, landmark):

@@ -123,6 +123,7 @@ def test_noises_that_are_learned_are_those_of_the_log(tmp_path):
     assert ((fixes > 0.1) & (fixes < 0.9)).all()
     assert scale_of(model, "imu0_twist").exp() < 0.2
     torch.testing.assert_close(fixes[0], fixes[1])  # x and y alike
+    assert scale_of(model, "twist0_twist")[1] == 0  # sideways all readings are zero, and say nothing of their noise
     with pytest.raises(ValueError, match=r"fewer than 4 segments of 30: pass --steps 0"):
         learn_noises(model, rows, steps=1, length=30, shown=False)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -72,6 +73,10 @@ def learn_noises(
             parameter.register_hook(lambda gradient: gradient.index_fill(0, torch.tensor(PLANE), 0.0))
     for parameter in [*motion, *(scale_of(model, name) for name in _positions(model))]:
         parameter.register_hook(_alike)
+    for name in model.reads:  # a reading that is always the same, such as zero, would be taken for one without noise
+        seen = rows[name][rows[f"{name}_observed"][:, 0]]
+        varies = (seen != seen[:1]).any(0)[: len(scale_of(model, name))]
+        scale_of(model, name).register_hook(partial(torch.mul, varies.to(rows[name].dtype)))
     best = [value.detach().clone() for value in (*sensors, *motion)]
     before, reached, stages, interrupted = None, -torch.inf, [], False
     with progress_bar("learning noises", 3 * (steps + 1), unit=" steps", shown=shown) as bar:

@@ -17,6 +17,7 @@ __all__ = ["Seen", "seen_by"]
 
 _ROTATING = 7.0  # rad, or rad/s: beyond are degrees
 _XYZ = ("x", "y", "z")
+_SLIP = 0.1  # m/s: standard deviation of a vehicle's speed sideways and upwards, which is read as zero
 _FIRST = 1.0  # m of standard deviation for each unit of hdop, and of what nothing is known
 
 
@@ -155,6 +156,7 @@ def _of_names(
             values[:, 11] = np.radians(column) if turned else column
         elif what == "speed" and np.isnan(values[:, 6]).all():
             values[:, 6], values[:, 7:9] = column / 3.6 if kmh else column, 0.0
+            cov[:, 7, 7] = cov[:, 8, 8] = _SLIP**2
         elif what == "acceleration":
             begin = table.columns.index(name)
             values[:, 12 : 12 + min(3, len(columns) - begin)] = table.values[:, begin : begin + 3]

@@ -1,4 +1,4 @@
-"""What the robots of robot_localization add to the library's registers."""
+"""Adds the robots of robot_localization to the library's registers."""
 
 BUILDERS: dict[str, str] = {}
 COMMANDS = {

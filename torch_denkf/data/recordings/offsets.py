@@ -205,7 +205,7 @@ def changes_of(tables: Mapping[str, Readings], offsets: Mapping[str, float]) -> 
 
 
 def _signals(table: Readings) -> dict[str, _Signal]:
-    """What a stream knows of heading and way."""
+    """Lists the headings and ways that a stream knows."""
     columns, times, values = table.columns, table.times, table.values
     known = [place for place, name in enumerate(columns) if quantity(name)]
     if any(repeats(values[:, place]) for place in known):

@@ -43,7 +43,7 @@ class Source:
         return np.zeros(len(self.column(name)), bool)
 
     def cell(self, name: str, row: int) -> Any:
-        """What stands in a place, for messages."""
+        """The content of a cell, for messages."""
         return self.column(name)[row]
 
     def place(self, row: int) -> str:
