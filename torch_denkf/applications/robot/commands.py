@@ -73,7 +73,7 @@ class Fuse(Command):
                 error, held, count = gap_errors(out, full, model)
                 lines.append(
                     f"In {self.gaps} gaps of {self.gap_seconds:g} s, {count} fixes that were hidden: {error:.2f} m off "
-                    f"(root mean square), {held:.0%} within the 95 % intervals."
+                    f"(root mean square), {held:.0%} within the 95 % intervals of a fix."
                 )
             lines += ["", *sensor_lines(model, log, out), "", *(f"Not honoured: {text}" for text in model.unheeded)]
             names = write_path(self.out, model, log, out)

@@ -62,8 +62,8 @@ def _chi_square(dof: int) -> float:
 
 
 def gap_errors(out: TensorDict, full: TensorDict, model: RobotModel) -> tuple[float, float, int]:
-    """Root mean square error of the place at fixes that were hidden, the share of x and y in their 95 % intervals, and
-    how many there are.
+    """Root mean square error of the place at fixes that were hidden, the share of their x and y that lie in the 95 %
+    intervals of such a fix, its own noise included, and how many there are.
     """
     errors, held = [], []
     for name, reads in model.reads.items():
@@ -71,7 +71,10 @@ def gap_errors(out: TensorDict, full: TensorDict, model: RobotModel) -> tuple[fl
             hidden = (full[f"{name}_observed"] & ~out[f"{name}_observed"])[:, 0]
             error = (full[name][:, :2] - out["smoothed", "mean"][:, :2])[hidden]
             errors.append(error.square().sum(-1))
-            held.append(error.abs() < 1.96 * out["smoothed", "var"][hidden][:, :2].sqrt())
+            noise = (
+                full[f"{name}_noise"][hidden][:, range(2), range(2)] * scale_of(model, name).detach()[:2].exp().square()
+            )
+            held.append(error.abs() < 1.96 * (out["smoothed", "var"][hidden][:, :2] + noise).sqrt())
     every = torch.cat(errors) if errors else torch.zeros(0)
     if not len(every):
         return math.nan, math.nan, 0
