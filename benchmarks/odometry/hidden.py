@@ -31,7 +31,7 @@ class Hidden:
 def main() -> None:
     """Prints the table."""
     study = parse(Hidden)
-    print(f"`{command('odometry.hidden')}`\n")
+    print(f"`{command('odometry.hidden')}`: one draw of the filter's noise, seed 0.\n")
     columns = "drive", "camera", "end-point error (m)", "mean error (m)", "speed error meanwhile (m/s)"
     print("\n".join(head(*columns, "90 % coverage of the speed (%)", "of the turn rate (%)")))
     for name in list_kitti_drives(study.root):
