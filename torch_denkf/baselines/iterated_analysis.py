@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number
+from torch_denkf.beliefs import moments_of
 from torch_denkf.functional import analyse
 from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.inflation import inflate, random_rotation
@@ -22,7 +23,6 @@ from torch_denkf.modules.gaussian import further_keys
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.modules.spaces import mean_reading, told
 from torch_denkf.running import check_module, random_parts, run_module
-from torch_denkf.smoothers.past import moments_of
 from torch_denkf.submodel import Call, Entries, Initial, Update, flat_noise, role
 
 __all__ = ["IteratedAnalysis", "with_smoothed"]

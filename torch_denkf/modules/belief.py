@@ -10,8 +10,7 @@ from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf._checks import check_count, check_values
-from torch_denkf.beliefs import moments_on
-from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.beliefs import moments_of
 from torch_denkf.functional.draws import exact_draws, is_exact
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.tensors import (
@@ -62,11 +61,9 @@ class _InitialEnsemble(Initial):
             noise = self.draw_noise(batch_size, device=center.device, dtype=center.dtype)
         noise = noise.to(center.dtype)
         away = std.unsqueeze(-2) * (exact_draws(noise) if self.exact else noise)
-        if self.space is not None:
-            ensemble = self.space.plus(center.unsqueeze(-2), away)
-            return ensemble, *moments_on(self.space, ensemble)
-        ensemble = center.unsqueeze(-2) + away
-        return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)
+        center = center.unsqueeze(-2)
+        ensemble = center + away if self.space is None else self.space.plus(center, away)
+        return ensemble, *moments_of(ensemble, space=self.space)
 
 
 _BELIEF_KEYS = (("belief", "ensemble"), ("belief", "mean"), ("belief", "var"))

@@ -21,11 +21,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_choice, check_count, check_number
-from torch_denkf.beliefs import moments_on
+from torch_denkf.beliefs import moments_of
 from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.resampling import effective_sample_size, jitter_copies
-from torch_denkf.functional.weighted import weighted_innovation, weighted_mean, weighted_var
+from torch_denkf.functional.weighted import weighted_innovation
 from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.likelihood import GaussianLikelihood
 from torch_denkf.modules.spaces import told
@@ -331,15 +331,10 @@ class ParticleAnalysis(Update):
         # particle can explain the reading, in this precision, Bayes' rule is 0 / 0; the log-likelihood, -inf, tells.
         seen = (log_likelihood != 0).any(-1, keepdim=True) & (total != -math.inf)
         log_weights = torch.where(seen, joint - total, prior)
-        moments = (
-            (weighted_mean(particles, log_weights), weighted_var(particles, log_weights))
-            if self.space is None
-            else moments_on(self.space, particles, log_weights)
-        )
         return (
             particles,
             log_weights,
-            *moments,
+            *moments_of(particles, log_weights, self.space),
             effective_sample_size(log_weights).unsqueeze(-1),
             torch.where(seen | (total == -math.inf), total, torch.zeros_like(total)),
             *(self._innovation(prior, *of_reading) if of_reading else ()),

@@ -19,10 +19,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_shape
-from torch_denkf.beliefs import moments_on
-from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.beliefs import moments_of
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules.around import Around, AugmentedBelief
 from torch_denkf.submodel import Entries, Initial, SubModel, Update, role
 
@@ -241,15 +239,3 @@ class LaggedBelief(SubModel):
 def check_age(age: torch.Tensor, batch_size: Sequence[int]) -> None:
     """Raise unless the age of the oldest state that is carried is ``[*B, 1]``."""
     check_shape("the age of what is smoothed", age, (*batch_size, 1), "[*B, 1]")
-
-
-def moments_of(
-    ensemble: torch.Tensor, log_weight: torch.Tensor | None, space: Space | None = None
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean and variance ``[*B, S]`` of members, or of weighted particles."""
-    if space is not None:
-        return moments_on(space, ensemble, log_weight)
-    if log_weight is not None:
-        return weighted_mean(ensemble, log_weight), weighted_var(ensemble, log_weight)
-    mean = ensemble_mean(ensemble)
-    return mean, ensemble_var(ensemble, mean)

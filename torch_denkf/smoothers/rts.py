@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch_denkf.filters import Filter
 from torch_denkf.functional.smoothing.rts import rts_smooth
 from torch_denkf.smoothers.base import Smoother
-from torch_denkf.smoothers.fixed_lag import kind_of, rebuilt
+from torch_denkf.smoothers.fixed_lag import prefix_of
 from torch_denkf.smoothers.past_moments import CrossTransition
 
 __all__ = ["RTSSmoother"]
@@ -44,11 +44,7 @@ class RTSSmoother(Smoother):
     """
 
     def __init__(self, filter: Filter, lag: int | None = None):
-        kind, prefix = kind_of(filter)
-        if kind != "moments":
-            raise TypeError(
-                f"RTSSmoother takes a filter with a mean and a covariance; {type(filter).__name__} has none."
-            )
+        prefix = prefix_of(filter, "moments", self)
         self.place = filter.structure.transition[0]
         forecast = filter.structure.forecast_of[prefix, "mean"][0]
         self.link_keys = {"cross_key": (forecast, "cross"), "open_key": (forecast, "open")}
@@ -58,7 +54,7 @@ class RTSSmoother(Smoother):
 
     def _extended(self, lag):
         own = CrossTransition(self.filter.transition_module, **self.link_keys)
-        return rebuilt(self.filter, {self.place: own})
+        return self.filter.with_modules({self.place: own})
 
     def _smooth(self, entries, follows, out):
         space = self.filter.structure.space
