@@ -75,15 +75,11 @@ def spread_skill_ratio(
         >>> spread_skill_ratio(members.mean(1), members.var(1), truth, 8).round(decimals=1)
         tensor([1.])
     """
-    space = check_space("space", space)
-    shape = mean.shape if space is None else (*mean.shape[:-1], space.tangent_dim)
-    if mean.shape != truth.shape or variance.shape != shape:
-        shapes = [list(part.shape) for part in (mean, variance, truth)]
-        kind = "one shape" if space is None else f"shapes of points of {space}, tangents and points"
-        raise ValueError(f"mean, variance and truth need {kind}; got {shapes}.")
+    difference = state_difference(mean, truth, space=space)
+    _check_variance(variance, difference)
+    truth = known_tangents(truth, space)
     factor = 1.0 if ensemble_size is None else (ensemble_size + 1) / ensemble_size
-    square, truth = state_difference(mean, truth, space=space).square(), known_tangents(truth, space)
-    spread, error = (mean_of_known(values, truth) for values in (variance, square))
+    spread, error = (mean_of_known(values, truth) for values in (variance, difference.square()))
     return (factor * spread).sqrt() / error.sqrt()
 
 

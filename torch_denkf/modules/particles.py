@@ -346,4 +346,4 @@ class ParticleAnalysis(Update):
             predicted, reading = self.reading_space.align(predicted, reading, observed)
         if reading.ndim == predicted.ndim:
             reading = reading.mean(-2)
-        return weighted_innovation(predicted, prior, reading, variance, observed=observed)
+        return weighted_innovation(predicted, prior, reading, variance, observed=observed)[:2]
