@@ -123,7 +123,7 @@ class Belief:
         return out
 
     def _factor(self, held: Mapping[str, Tensor], ceiling: float) -> Tensor:
-        return (held["var"].detach() / ceiling).clamp_(min=1).rsqrt_()  # a constant to the gradient
+        return (held["var"].detach() / ceiling).clamp(min=1).rsqrt()  # a constant to the gradient
 
     def _within_reach(self, mean: Tensor, ceiling: float) -> Tensor:
         farthest = _FARTHEST * sqrt(ceiling)

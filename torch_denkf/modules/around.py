@@ -40,6 +40,7 @@ class Wrapper(SubModel):
         in_keys: of the wrapper; those of the module by default.
         out_keys: likewise.
         optional_keys: likewise.
+        further_keys: what the wrapper reads beside ``in_keys``.
 
     Attributes:
         place: name of the module inside, where its noise has a place inside of the wrapper's, ``("noise",
@@ -55,12 +56,13 @@ class Wrapper(SubModel):
         out_keys: Sequence[NestedKey] | None = None,
         *,
         optional_keys: Sequence[NestedKey] | None = None,
+        further_keys: Sequence[NestedKey] = (),
     ):
-        check_module("module", module)
+        check_module(self.place or "module", module)
         needed, optional = reads(module)
         super().__init__(
             module,
-            needed if in_keys is None else in_keys,
+            list(dict.fromkeys(map(unravel_key, [*(needed if in_keys is None else in_keys), *further_keys]))),
             writes(module) if out_keys is None else out_keys,
             optional_keys=optional if optional_keys is None else optional_keys,
         )
@@ -195,7 +197,6 @@ class AugmentedBelief(AroundInitial):
         follow: Callable[[Entries], Iterable[torch.Tensor]] | None = None,
         nested: bool = False,
     ):
-        check_module("initial", initial)
         out_keys = dict.fromkeys(map(unravel_key, (*initial.out_keys, *keys, *follow_keys)))
         super().__init__(initial, out_keys=list(out_keys))
         self.keys, self.begin = list(map(unravel_key, keys)), begin

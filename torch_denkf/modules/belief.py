@@ -18,7 +18,7 @@ from torch_denkf.modules.tensors import (
     as_standard_deviations,
     check_dims,
     mean_of_members,
-    register_location,
+    register_constant,
 )
 from torch_denkf.submodel import Initial
 
@@ -194,7 +194,8 @@ class FromSensor(_InitialEnsemble):
         super().__init__(
             std, ensemble_size, [observation_key, noise_variance_key], out_keys, [observed_key], draws=draws
         )
-        register_location(self, "mean", mean)
+        register_constant(self, "mean", mean)
+        check_values("mean", self.mean)
         check_dims("dims", dims, once=True, size=self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
         self.input_dim, self.observed_key = len(self.dims), unravel_key(observed_key)

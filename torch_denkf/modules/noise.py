@@ -10,15 +10,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number, check_values
+from torch_denkf.modules.around import Wrapper
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import (
     as_standard_deviations,
     mean_of_members,
-    register_location,
-    register_scale,
+    register_location_and_scale,
     variance_and_floor,
 )
-from torch_denkf.running import check_module, reads, run_module
 from torch_denkf.submodel import Sensor, SubModel
 
 __all__ = ["ConstantNoise", "DiagonalNoise", "ScaledNoise", "MemberGain"]
@@ -77,8 +76,9 @@ class DiagonalNoise(Sensor):
         variance, floor = variance_and_floor("DiagonalNoise", observation_dim, r, floor)
         self.register_buffer("variance", variance)
         self.register_buffer("floor", floor)
-        register_location(self, "loc", torch.zeros(in_features) if loc is None else loc)
-        register_scale(self, "scale", torch.ones(in_features) if scale is None else scale)
+        register_location_and_scale(
+            self, torch.zeros(in_features) if loc is None else loc, torch.ones(in_features) if scale is None else scale
+        )
 
     def compute(self, features, *, batch_size):
         """The variances."""
@@ -131,7 +131,7 @@ class ConstantNoise(Sensor):
         return variance.expand(*batch_size, -1)
 
 
-class ScaledNoise(Sensor):
+class ScaledNoise(Wrapper, Sensor):
     r"""Multiplies the variances of another noise module by the square of a factor that is set by hand after training.
 
     A filter that is too sure of itself needs more spread. Scaling Q and R by one factor widens its intervals and
@@ -155,20 +155,16 @@ class ScaledNoise(Sensor):
         tensor([ 0.0900, 36.0000])
     """
 
-    def __init__(self, noise: TensorDictModuleBase, factor: float = 1.0):
-        check_module("noise", noise)
-        check_number("factor", factor, least=0)
-        needed, optional = reads(noise)
-        super().__init__(noise, needed, noise.out_keys, optional_keys=optional)
-        self.factor = factor
+    place = "noise"
 
-    def parts(self):
-        """The noise module."""
-        return {"noise": self.module}
+    def __init__(self, noise: TensorDictModuleBase, factor: float = 1.0):
+        check_number("factor", factor, least=0)
+        super().__init__(noise)
+        self.factor = factor
 
     def on_entries(self, entries, call):
         """The scaled variances or covariance."""
-        out, key = run_module(self.module, entries, call.part("noise")), self.out_keys[0]
+        out, key = self.run_inside(entries, call), self.out_keys[0]
         return {**out, key: self.factor**2 * out[key]}
 
 

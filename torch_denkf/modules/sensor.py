@@ -13,7 +13,7 @@ from torch import nn
 from torch_denkf._checks import check_count, has_values
 from torch_denkf.modules._trunk import activation_bytes, couples_frames, in_chunks, reduced_precision
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.modules.tensors import as_vector, register_location, register_scale
+from torch_denkf.modules.tensors import as_vector, register_location_and_scale
 from torch_denkf.submodel import Sensor
 
 __all__ = ["ImageSensor", "VectorSensor", "convolutional_trunk"]
@@ -85,8 +85,7 @@ class _Sensor(StochasticSensor):
         )
         self.ensemble_size, self.event_ndim, self.observation_dim = ensemble_size, event_ndim, head.out_features
         check_count("ensemble_size", ensemble_size)
-        register_location(self, "loc", 0.0 if loc is None else loc)
-        register_scale(self, "scale", 1.0 if scale is None else scale)
+        register_location_and_scale(self, 0.0 if loc is None else loc, 1.0 if scale is None else scale)
 
     def _prepare(self, measurement: torch.Tensor) -> torch.Tensor:
         return measurement

@@ -9,7 +9,7 @@ from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.modules.tensors import register_location, register_scale
+from torch_denkf.modules.tensors import register_location_and_scale
 from torch_denkf.running import check_network
 from torch_denkf.submodel import SubModel, Transition
 
@@ -93,10 +93,8 @@ class LearnedTransition(MemberNetwork, Transition):
             raise ValueError(f"dt_key={dt_key!r} scales a change: it needs residual=True.")
         super().__init__(network, [in_key, *(key for key in (action_key, dt_key) if key is not None)], [out_key])
         self.residual, self.action_key, self.dt_key = residual, action_key, dt_key
-        register_location(self, "loc", loc)
-        register_scale(self, "scale", scale)
-        register_location(self, "action_loc", action_loc)
-        register_scale(self, "action_scale", action_scale)
+        register_location_and_scale(self, loc, scale)
+        register_location_and_scale(self, action_loc, action_scale, "action_")
 
     def compute(self, state, action=None, dt=None, *, noise):
         """The forecast ensemble."""

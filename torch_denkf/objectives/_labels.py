@@ -80,7 +80,7 @@ class Reading(NamedTuple):
         """Finds the reading of the sensor that ``keys`` name, or of the only one; no model where there are several."""
         found: dict[NestedKey, Update] = {}
         default, observed = cls(), keys.observed
-        for module in filter.update_modules:
+        for _, module in filter.structure.update:
             for part in in_role(module, Update):
                 found.update((key, part) for key in map(unravel_key, part.reading_keys[:1]) if key not in found)
         names = [key for key in filter.structure.frame_keys if is_samples(key)] or [default.samples]
@@ -91,7 +91,7 @@ class Reading(NamedTuple):
         parts = [found[key] for key in read] or list(found.values())
         if len(parts) > 1:
             return default if observed is None else cls(names[0], observed)
-        part, owners = parts[0] if parts else role(None, Update), filter.update_modules
+        part, owners = parts[0] if parts else role(None, Update), [module for _, module in filter.structure.update]
         if len(found) > 1:
             owners = [part, *(module for module in owners if unravel_key(part.predicted_key) in writes(module))]
         model = next((part for module in owners for part in module.modules() if hasattr(part, "observe")), None)

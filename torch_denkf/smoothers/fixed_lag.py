@@ -72,7 +72,7 @@ class FixedLag(Filter):
         space = filter.structure.space
         if kind == "moments":
             forecast = filter.structure.forecast_of[prefix, "mean"][0]
-            modules[names[place]] = CrossTransition(modules[names[place]], (forecast, "cross"), (forecast, "open"))
+            modules[names[place]] = CrossTransition(modules[names[place]], with_open=True)
             past = MomentsPast(belief_prefix=prefix, forecast_prefix=forecast)
             last = LaggedMoments(belief_prefix=prefix, forecast_prefix=forecast, space=space)
             initial = with_past(filter.initial, lag, MOMENTS_PAST, age=age, belief_prefix=prefix)

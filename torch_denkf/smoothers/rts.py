@@ -47,14 +47,12 @@ class RTSSmoother(Smoother):
         prefix = prefix_of(filter, "moments", self)
         self.place = filter.structure.transition[0]
         forecast = filter.structure.forecast_of[prefix, "mean"][0]
-        self.link_keys = {"cross_key": (forecast, "cross"), "open_key": (forecast, "open")}
         CrossTransition(filter.transition_module)  # refuses what gives no cross-covariance
         keys = [(prefix, "mean"), (prefix, "cov"), *((forecast, name) for name in ("mean", "cov", "cross", "open"))]
         super().__init__(filter, lag, keys, ("mean", "cov", "var"))
 
     def _extended(self, lag):
-        own = CrossTransition(self.filter.transition_module, **self.link_keys)
-        return self.filter.with_modules({self.place: own})
+        return self.filter.with_modules({self.place: CrossTransition(self.filter.transition_module, with_open=True)})
 
     def _smooth(self, entries, follows, out):
         space = self.filter.structure.space

@@ -11,7 +11,7 @@ from torch import nn
 from torch_denkf.applications.car.modules.pairs import within_pair
 from torch_denkf.applications.car.unicycle import unicycle_move
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.modules.tensors import register_location, register_scale
+from torch_denkf.modules.tensors import register_location_and_scale
 from torch_denkf.modules.transition import MemberNetwork
 from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
 from torch_denkf.running import check_network
@@ -76,8 +76,7 @@ class UnicycleTransition(MemberNetwork, Transition):
         super().__init__(velocity, [in_key, *histories, *keys_of_dt(dt)], [out_key])
         self.dt, self.drift = dt, drift
         self.raw_trend = None if history_key is None else nn.Parameter(torch.full((2,), -2.0))
-        register_location(self, "loc", loc)
-        register_scale(self, "scale", scale)
+        register_location_and_scale(self, loc, scale)
 
     def compute(self, state, *others, noise):
         """The forecast ensemble."""
