@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torch_denkf._registered import diagnosis
+from torch_denkf._slices import one_earlier
 from torch_denkf.filters.structure import KNOWN, RESUMES, Structure, previous_key
 from torch_denkf.submodel import Call, Entries
 
@@ -101,8 +102,7 @@ def gather_rows(
         if previous_key(key) in entries:
             inputs[key] = entries[previous_key(key)]
         elif key in inputs:
-            value = inputs[key]
-            inputs[key] = torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, size[-1] - 1)], time)
+            inputs[key] = one_earlier(inputs[key], time)
     before = {key: starts[key].select(time, 0) for key in carry}
     return Rows(size, inputs, begins, starts, stored, before)
 

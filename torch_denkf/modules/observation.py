@@ -2,7 +2,7 @@ r"""Observation models: predicted observations :math:`H X_{t|t-1} = [h_\psi(x^1)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey
@@ -11,7 +11,6 @@ from torch import nn
 from torch_denkf.functional.linalg import product_of_known
 from torch_denkf.modules.tensors import check_dims, register_location_and_scale, register_matrix
 from torch_denkf.modules.transition import MemberNetwork
-from torch_denkf.running import check_network
 from torch_denkf.submodel import SubModel
 
 __all__ = ["LearnedObservation", "LinearObservation", "Select"]
@@ -37,14 +36,13 @@ class LearnedObservation(MemberNetwork):
 
     def __init__(
         self,
-        network: nn.Module,
+        network: Callable[..., torch.Tensor],
         *,
         loc: torch.Tensor | Sequence[float] | None = None,
         scale: torch.Tensor | Sequence[float] | None = None,
         in_key: NestedKey = ("forecast", "ensemble"),
         out_key: NestedKey = ("forecast", "observation"),
     ):
-        check_network("network", network)
         super().__init__(network, [in_key], [out_key])
         register_location_and_scale(self, loc, scale)
 

@@ -129,7 +129,7 @@ class ResampledTransition(Transition):
         if ess_threshold is not None:
             check_number("ess_threshold", ess_threshold, least=0, most=1, cure="It is a share of E")
         check_number("jitter", jitter, least=0)
-        if jitter and (scheme not in ("systematic", "soft") or jitter < 0):
+        if jitter and scheme not in ("systematic", "soft"):
             raise ValueError(
                 f'jitter moves the copies apart that "systematic" and "soft" resampling make, 0 or more; got {jitter} '
                 f"with {scheme!r}."
@@ -199,14 +199,11 @@ class ResampledTransition(Transition):
 
     def with_past(self, past_key: NestedKey, out_past_key: NestedKey) -> ResampledTransition:
         """Returns the transition for particles with a lag window; the motion is shared, not copied."""
+        options = ("alpha", "epsilon", "iterations", "ess_threshold", "jitter")
         return ResampledTransition(
             self.module,
             self.scheme,
-            alpha=self.alpha,
-            epsilon=self.epsilon,
-            iterations=self.iterations,
-            ess_threshold=self.ess_threshold,
-            jitter=self.jitter,
+            **{name: getattr(self, name) for name in options},
             log_weight_key=self.in_keys[1],
             out_log_weight_key=self.out_keys[1],
             observed_key=self.mask_key,

@@ -102,10 +102,10 @@ def register_location_and_scale(
     Raises:
         ValueError: if a number is not of these.
     """
-    for name, value, limits in (("loc", loc, {}), ("scale", scale, {"above": 0, "infinite": True})):
+    for name, value, above in (("loc", loc, None), ("scale", scale, 0)):
         register_constant(module, prefix + name, value)
         if value is not None:
-            check_values(prefix + name, getattr(module, prefix + name), **limits)
+            check_values(prefix + name, getattr(module, prefix + name), above=above, infinite=above is not None)
 
 
 def as_standard_deviations(name: str, value: Any) -> Tensor:

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch_denkf._checks import check_mask
 from torch_denkf._registered import diagnosis
 from torch_denkf.beliefs import is_samples
-from torch_denkf.functional.manifolds import Space, is_flat, whole_parts
+from torch_denkf.functional.manifolds import Euclidean, Space, is_flat, whole_parts
 from torch_denkf.running import writes
 from torch_denkf.submodel import Initial, Update, in_role, role
 
@@ -266,25 +266,17 @@ class Truth:
         space = {"state": self.loss.space, "target": self.loss.reading_space}.get(name)
         if space is not None and size != space.point_dim:
             raise ValueError(f"a point of {space} has {space.point_dim} numbers, but what is scored has {size}")
-        if space is not None and space.flat is None:
-            return self._points(space, values, size, dims)
-        known = self._known(name, values, size, dims)
-        dims = range(min(values.shape[-1], size)) if dims is None else dims
-        counting = torch.zeros(size, dtype=torch.bool, device=known.device)
+        on: Space = space or Euclidean(size)
+        flat = is_flat(space)
+        known = self._known(name, values, size, dims if flat else None)
+        whole, mask = whole_parts(on, ~known.isnan())
+        if dims is None:
+            given = torch.arange(size) < values.shape[-1]
+            dims = range(int(whole_parts(on, given)[1].sum()))
+        counting = torch.zeros(on.tangent_dim, dtype=torch.bool, device=known.device)
         counting[list(dims)] = True
-        mask = ~known.isnan() & counting
-        return Labels(torch.where(mask, known, 0), mask, dims, space=space)
-
-    def _points(self, space: Space, values: Tensor, size: int, dims: Sequence[int] | None) -> Labels:
-        """True points, and which components of tangents they have labels for."""
-        known = self._known("state", values, size, None)
-        whole, mask = whole_parts(space, ~known.isnan())
-        given = torch.arange(size) < values.shape[-1]
-        dims = range(int(whole_parts(space, given)[1].sum())) if dims is None else dims
-        counting = torch.zeros(space.tangent_dim, dtype=torch.bool, device=known.device)
-        counting[list(dims)] = True
-        points = space.normalise(torch.where(whole, known, space.neutral(known)))
-        return Labels(points, mask & counting, dims, space=space)
+        points = torch.where(whole, known, on.neutral(known))
+        return Labels(points if flat else on.normalise(points), mask & counting, dims, space=space)
 
     def _known(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None) -> Tensor:
         """Labels ``[*B, N]`` in the places of their components, ``[*B, size]``, NaN where there is none.

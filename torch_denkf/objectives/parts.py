@@ -15,6 +15,7 @@ from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
 
 from torch_denkf._arguments import check_key
 from torch_denkf._checks import check_count, check_values, flag_value
+from torch_denkf._slices import one_earlier
 from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record
 from torch_denkf.filters.structure import previous_key
@@ -378,9 +379,3 @@ def _belief_at(truth: Tensor, belief: str, spread: Tensor, members: int | None, 
         (belief, "mean"): truth,
         (belief, "var"): std.square(),
     }
-
-
-def one_earlier(value: Tensor, time: int) -> Tensor:
-    """Every element from one step before; the first stays where it is."""
-    count = value.shape[time]
-    return torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, count - 1)], time)

@@ -2,7 +2,7 @@ r"""A vehicle whose pose follows from its velocities: the motion is known, their
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey
@@ -14,7 +14,6 @@ from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules.tensors import register_location_and_scale
 from torch_denkf.modules.transition import MemberNetwork
 from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
-from torch_denkf.running import check_network
 from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["UnicycleMotion", "UnicycleTransition"]
@@ -60,7 +59,7 @@ class UnicycleTransition(MemberNetwork, Transition):
 
     def __init__(
         self,
-        velocity: nn.Module,
+        velocity: Callable[..., torch.Tensor],
         dt: float | NestedKey,
         *,
         loc: Sequence[float] | torch.Tensor = (0.0, 0.0),
@@ -70,7 +69,6 @@ class UnicycleTransition(MemberNetwork, Transition):
         in_key: NestedKey = ("belief", "ensemble"),
         out_key: NestedKey = ("forecast", "ensemble"),
     ):
-        check_network("velocity", velocity)
         check_dt(dt)
         histories = [] if history_key is None else [history_key]
         super().__init__(velocity, [in_key, *histories, *keys_of_dt(dt)], [out_key])
