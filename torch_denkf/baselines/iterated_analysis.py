@@ -12,12 +12,12 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number
+from torch_denkf.baselines.iterated_smoothing import iterated_smoothing
 from torch_denkf.beliefs import moments_of
 from torch_denkf.functional import analyse
 from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.inflation import inflate, random_rotation
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.functional.smoothing.iterated import iterated_smoothing
 from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.gaussian import further_keys
 from torch_denkf.modules.motion_noise import NoisyTransition
@@ -69,7 +69,7 @@ class IteratedAnalysis(Update):
     r"""Finds from where the reading says that the last step began, and makes the step anew from there.
 
     Gauss-Newton steps in the space of the members, each with a run of transition and observation; see
-    :func:`~torch_denkf.functional.smoothing.iterated.iterated_smoothing`. Where the motion has Gaussian noise, the
+    :func:`~torch_denkf.baselines.iterated_smoothing.iterated_smoothing`. Where the motion has Gaussian noise, the
     noise of each member is part of what is looked for (Sakov, Haussaire & Bocquet 2018).
 
     Args:
