@@ -95,8 +95,6 @@ def neighbours(
         >>> neighbours(places, places, 0.5, period=torch.tensor([5.0])).index.sort().values.tolist()
         [[0, 1, 4], [0, 1, 2], [1, 2, 3], [2, 3, 4], [0, 3, 4]]
     """
-    if not radius > 0:
-        raise ValueError(f"radius must be positive, got {radius}")
     reach = 2 * math.sqrt(10 / 3) * radius
 
     def around(offset: Tensor, circle: Tensor | None) -> Tensor:

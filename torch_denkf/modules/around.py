@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
-from typing import Protocol, Self, TypeVar
+from typing import Self, TypeVar
 
 import torch
 from tensordict import NestedKey, unravel_key
@@ -14,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf.running import check_module, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, Initial, SubModel, Update, role
 
-__all__ = ["Around", "AroundInitial", "AugmentedBelief", "Stateful", "Wrapper", "passes_on", "with_state"]
+__all__ = ["Around", "AroundInitial", "AugmentedBelief", "Wrapper", "passes_on"]
 
 W = TypeVar("W", bound="Wrapper")
 
@@ -152,19 +151,6 @@ class AroundInitial(Wrapper, Initial):
     """Goes around an initial belief, and passes on all that it declares."""
 
 
-class Stateful(Protocol):
-    """A module that carries entries of its own from step to step.
-
-    Attributes:
-        state_keys: their keys.
-    """
-
-    state_keys: Sequence[NestedKey]
-
-    def initial_state(self, batch_size, *, device=None, dtype=None) -> list[torch.Tensor]:
-        """Their values at the start of an episode, in the order of the keys."""
-
-
 class AugmentedBelief(AroundInitial):
     """An initial belief, and further entries that begin with the episode.
 
@@ -215,30 +201,3 @@ class AugmentedBelief(AroundInitial):
 
     def _following(self, entries: Entries) -> Entries:
         return {} if self.follow is None else dict(zip(self.follow_keys, self.follow(entries), strict=True))
-
-
-def with_state(initial: TensorDictModuleBase, owners: Sequence[Stateful]) -> AugmentedBelief:
-    """An initial belief, and the entries that other modules carry on.
-
-    Args:
-        initial: the initial belief.
-        owners: such as :class:`InnovationMonitor` and :class:`GatedAnalysis`.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> from torch_denkf.modules import GaussianPrior
-        >>> from torch_denkf.monitoring import InnovationMonitor, MonitoredSensor
-        >>> monitor = InnovationMonitor({"gps": MonitoredSensor("info", 2)})
-        >>> start = with_state(GaussianPrior([0.0], [1.0], ensemble_size=4), [monitor])
-        >>> start(TensorDict({}, [3]))["monitor", "gps", "p_value"].flatten()
-        tensor([1., 1., 1.])
-    """
-    # In a tuple the owners are not modules of the belief: the filter has them already.
-    keys = [key for owner in owners for key in owner.state_keys]
-    return AugmentedBelief(initial, keys, partial(_states, tuple(owners)))
-
-
-def _states(owners: Sequence[Stateful], belief: Entries, batch_size: torch.Size) -> list[torch.Tensor]:
-    like = next(value for value in belief.values() if value.is_floating_point())
-    states = (owner.initial_state(batch_size, device=like.device, dtype=like.dtype) for owner in owners)
-    return [value for state in states for value in state]

@@ -81,8 +81,6 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         **keys: Unpack[EnsembleAnalysisKeys],
     ):
         check_count("tile", tile)
-        if isinstance(near, torch.Tensor) and near.ndim != 2:
-            raise ValueError(f"near is Neighbours, or a taper; a taper must be [S, O], got {list(near.shape)}")
         if not isinstance(near, (Neighbours, torch.Tensor)):
             raise TypeError(f"near is Neighbours, or a taper [S, O]; got {near!r}")
         super().__init__(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_denkf.beliefs import moments_of
 from torch_denkf.filters import Filter
-from torch_denkf.filters.structure import previous_key
+from torch_denkf.filters.gather import controls_of
 from torch_denkf.functional.linalg import as_covariance, cholesky
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing.particles import backward_smooth
@@ -102,11 +102,7 @@ class ParticleSmoother(Smoother):
         # A step reads the belief before it, the action that led out of there, and what else there is at its own time.
         work = {name: after(value) for name, value in entries.items() if value.ndim > time}
         work.update({name: before(entries[name]) for name in structure.belief if name in entries})
-        for control in structure.controls:
-            if control in entries:
-                work[control] = before(entries[control])
-            if previous_key(control) in entries:
-                work[control] = after(entries[previous_key(control)])
+        work.update({name: after(value) for name, value in controls_of(structure, entries, time).items()})
         old, weights = before(particles), before(log_weights)
         work.update({key: old, motion.mean_key: mean(old)})
         call = Call(old.shape[:-2], sample=False)

@@ -197,9 +197,14 @@ class Product(_Made):
         """Returns a point near those of each part."""
         return self._each("near", points, weights=weights)
 
+    def points(self, point: Tensor) -> Sequence[Tensor]:
+        """Returns the numbers of each part."""
+        return point.split([part.point_dim for part in self.parts], -1)
+
     def _apart(self, name: str, value: Tensor) -> Sequence[Tensor]:
-        of_tangents = name in ("exp", "right_jacobian")
-        return value.split([part.tangent_dim if of_tangents else part.point_dim for part in self.parts], -1)
+        if name not in ("exp", "right_jacobian"):
+            return self.points(value)
+        return value.split([part.tangent_dim for part in self.parts], -1)
 
     def _each(self, name, *values, **options):
         apart = zip(self.parts, *(self._apart(name, value) for value in values), strict=True)
