@@ -14,7 +14,7 @@ from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.spaces import told
 from torch_denkf.submodel import Call, Entries, Update
 
-__all__ = ["EnsembleAnalysisKeys", "EnsembleUpdate"]
+__all__ = ["EnsembleAnalysisKeys", "EnsembleOptions", "EnsembleUpdate"]
 
 
 class EnsembleAnalysisKeys(TypedDict, total=False):
@@ -43,19 +43,33 @@ class EnsembleAnalysisKeys(TypedDict, total=False):
     info_prefix: str
 
 
+class EnsembleOptions(EnsembleAnalysisKeys, total=False):
+    """What every update of an ensemble takes beside its keys.
+
+    Attributes:
+        inflation: factor on the analysis anomalies, where anything is observed; 1, by default, for none.
+        relaxation: relaxation to prior spread in [0, 1]; 0, by default, for none.
+        rotate: random mean-preserving rotation of the anomalies.
+        reading_space: of the reading; ``None`` for plain numbers.
+        localisation: ``"significance"`` or ``None``.
+        threshold: of ``"significance"``, in standard deviations; 3 by default.
+    """
+
+    inflation: float
+    relaxation: float
+    rotate: bool
+    reading_space: Space | None
+    localisation: Literal["significance"] | None
+    threshold: float | Tensor
+
+
 class EnsembleUpdate(Update):
     """Reads a forecast ensemble, its predicted observations and a reading, writes the belief and the diagnostics.
 
     Args:
-        inflation: factor on the analysis anomalies, where anything is observed; 1 for none.
-        relaxation: relaxation to prior spread in [0, 1]; 0 for none.
-        rotate: random mean-preserving rotation of the anomalies.
         space: of the state; ``None`` for plain numbers.
-        reading_space: of the reading; ``None`` for plain numbers.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
-        localisation: ``"significance"`` or ``None``.
-        threshold: of ``"significance"``, in standard deviations.
-        **keys: see :class:`EnsembleAnalysisKeys`.
+        **options: see :class:`EnsembleOptions`.
 
     Raises:
         ValueError: if ``inflation`` or ``threshold`` is not positive, ``relaxation`` is outside [0, 1], or
@@ -65,9 +79,9 @@ class EnsembleUpdate(Update):
     def __init__(
         self,
         *,
-        inflation: float,
-        relaxation: float,
-        rotate: bool,
+        inflation: float = 1.0,
+        relaxation: float = 0.0,
+        rotate: bool = False,
         space: Space | None = None,
         reading_space: Space | None = None,
         covariance: bool = False,
