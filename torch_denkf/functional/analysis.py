@@ -27,7 +27,7 @@ from torch_denkf._checks import (
 )
 from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
 from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
-from torch_denkf.functional.kernels.small_system import LARGEST, on_gpu, solve_written_out
+from torch_denkf.functional.kernels.small_system import WrittenOut, is_written_out, on_gpu
 from torch_denkf.functional.linalg import Solver, inverse_square_root_difference
 
 Scheme = Literal["sensor", "perturbed", "etkf", "sakov"]
@@ -262,11 +262,8 @@ def _observation_space(
     transformed = None
     if square_root:
         transformed = anomalies + normalised @ (inverse_square_root_difference(gram) @ cross)
-    if torch.compiler.is_compiling() and gram.shape[-1] <= LARGEST:
-        increment, square, log_det = solve_written_out(gram, cross, acted_on, mean_shift)
-        return increment, transformed, square, log_det
-    solver = Solver(gram, ridge=1)  # with S, eq. 9
-    increment = acted_on @ solver.solve(cross)  # by the gain K, eq. 11
+    solver = (WrittenOut if is_written_out(gram) else Solver)(gram, ridge=1)  # with S, eq. 9
+    increment = solver.between(acted_on, cross)  # by the gain K, eq. 11
     return increment, transformed, solver.square(mean_shift.mT), solver.log_det()
 
 

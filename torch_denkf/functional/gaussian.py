@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_observed, check_one_dtype, check_shape, check_shapes
-from torch_denkf.functional.kernels.small_system import LARGEST, gain_written_out
+from torch_denkf.functional.kernels.small_system import WrittenOut, is_written_out
 from torch_denkf.functional.linalg import Solver, as_covariance
 
 
@@ -207,9 +207,7 @@ def solve_for_gain(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Ten
     Returns:
         Cᵀ M⁻¹, ``[*B, S, O]``; rᵀ M⁻¹ r and log det M, ``[*B, 1]`` each. NaN where M is not positive definite.
     """
-    if torch.compiler.is_compiling() and 0 < matrix.shape[-1] <= LARGEST:
-        return gain_written_out(matrix, cross, residual)
-    solver = Solver(matrix)
+    solver = (WrittenOut if is_written_out(matrix) else Solver)(matrix)
     return solver.solve(cross).mT, solver.square(residual.unsqueeze(-1)), solver.log_det()
 
 
