@@ -10,7 +10,7 @@ import torch
 from torch_denkf._checks import check_choice, check_values
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.functional.draws import exact_draws, is_exact
-from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
+from torch_denkf.functional.inflation import inflate, relax_to_prior_spread
 from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.modules.ensemble import EnsembleOptions, EnsembleUpdate
@@ -100,18 +100,16 @@ class EnsembleAnalysis(EnsembleUpdate):
     @property
     def noise_names(self) -> tuple[str, ...]:
         """Perturbations or rotations, where the scheme needs any."""
-        return ("",) if self.rotate or self.scheme == "perturbed" else ()
+        return ("",) if self.scheme == "perturbed" else super().noise_names
 
-    def draw_noise(
-        self, batch_size, *, members=None, observation_dim=None, device=None, dtype=None, generator=None, **_
-    ):
+    def draw_noise(self, batch_size, *, members=None, observation_dim=None, generator=None, **where):
         """Draws standard-normal perturbations ``[*B, E, O]`` or rotations ``[*B, E, E]``."""
-        if self.rotate and members is not None:
-            return random_rotation(members, tuple(batch_size), device=device, dtype=dtype, generator=generator)
-        if self.scheme == "perturbed" and None not in (members, observation_dim):
-            shape = (*batch_size, members, observation_dim)
-            return torch.randn(shape, device=device, dtype=dtype, generator=generator)
-        return None
+        if self.scheme != "perturbed":
+            return super().draw_noise(batch_size, members=members, generator=generator, **where)
+        if None in (members, observation_dim):
+            return None
+        where = {name: where.get(name) for name in ("device", "dtype")}
+        return torch.randn((*batch_size, members, observation_dim), generator=generator, **where)
 
     def _noise(self, entries, values, call):
         """Makes perturbations exact here, so that :meth:`compute` and :meth:`move_past` have the same ones."""
@@ -132,7 +130,7 @@ class EnsembleAnalysis(EnsembleUpdate):
     def noise_sizes(self, forecast, predicted, *_):
         """E and O, from the ensemble and its predicted observations."""
         size = predicted.shape[-1] if self.reading_space is None else self.reading_space.tangent_dim
-        return {"members": forecast.shape[-2], "observation_dim": size}
+        return {**super().noise_sizes(forecast), "observation_dim": size}
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""

@@ -10,11 +10,12 @@ from tensordict import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_choice, check_number, check_values
+from torch_denkf.functional.inflation import random_rotation
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.spaces import told
 from torch_denkf.submodel import Call, Entries, Update
 
-__all__ = ["EnsembleAnalysisKeys", "EnsembleOptions", "EnsembleUpdate"]
+__all__ = ["EnsembleAnalysisKeys", "EnsembleOptions", "EnsembleUpdate", "Rotated"]
 
 
 class EnsembleAnalysisKeys(TypedDict, total=False):
@@ -63,7 +64,39 @@ class EnsembleOptions(EnsembleAnalysisKeys, total=False):
     threshold: float | Tensor
 
 
-class EnsembleUpdate(Update):
+class Rotated(Update):
+    """An update of an ensemble that may rotate its anomalies at random.
+
+    Attributes:
+        rotate: whether it does.
+    """
+
+    rotate: bool = False
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Rotations, where wanted."""
+        return ("",) if self.rotate else ()
+
+    def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
+        """Draws rotations ``[*B, E, E]``, which keep the mean."""
+        if not self.rotate or members is None:
+            return None
+        return random_rotation(members, tuple(batch_size), device=device, dtype=dtype, generator=generator)
+
+    def noise_sizes(self, ensemble, *_):
+        """E, from the ensemble."""
+        return {"members": ensemble.shape[-2]}
+
+    def rotated(self, ensemble: Tensor, rotation: Tensor | None) -> Tensor:
+        """Returns the ensemble with its anomalies rotated; as it is without a rotation."""
+        if rotation is None:
+            return ensemble
+        mean = ensemble.mean(-2, keepdim=True)
+        return mean + rotation @ (ensemble - mean)
+
+
+class EnsembleUpdate(Rotated):
     """Reads a forecast ensemble, its predicted observations and a reading, writes the belief and the diagnostics.
 
     Args:

@@ -9,7 +9,7 @@ import torch
 
 from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import ensemble_mean, ensemble_var, letkf, neighbours
-from torch_denkf.functional.inflation import random_rotation, relax_to_prior_spread
+from torch_denkf.functional.inflation import relax_to_prior_spread
 from torch_denkf.functional.localisation import Neighbours, neighbours_of_taper
 from torch_denkf.modules.ensemble import EnsembleOptions, EnsembleUpdate
 from torch_denkf.modules.tensors import mean_of_members, refuse_trained
@@ -116,21 +116,6 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         period = None if period is None else torch.as_tensor(period, dtype=states.dtype)
         return cls(neighbours(states, observations, radius, period=period), **kwargs)
 
-    @property
-    def noise_names(self) -> tuple[str, ...]:
-        """Rotations, if any."""
-        return ("",) if self.rotate else ()
-
-    def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
-        """Draws rotations ``[*B, E, E]``; ``None`` without, or where E is not known."""
-        if not self.rotate or members is None:
-            return None
-        return random_rotation(members, tuple(batch_size), device=device, dtype=dtype, generator=generator)
-
-    def noise_sizes(self, forecast, *_):
-        """E, from the ensemble."""
-        return {"members": forecast.shape[-2]}
-
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
         observation = mean_of_members(observation, predicted.shape[:-2])
@@ -165,11 +150,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
             index, taper = index.repeat(copies, 1), taper.repeat(copies, 1)
         near = Neighbours(index, taper)
         options: dict[str, Any] = {"observed": observed, "significance": self.significance, "tile": self.tile}
-        ensemble = letkf(ensemble, predicted, observation, variance, near, **options)
-        if noise is None:
-            return ensemble
-        mean = ensemble.mean(-2, keepdim=True)
-        return mean + noise @ (ensemble - mean)
+        return self.rotated(letkf(ensemble, predicted, observation, variance, near, **options), noise)
 
     def _reached(self, observed: torch.Tensor | None, variance: torch.Tensor) -> torch.Tensor:
         """Marks components near which anything is observed, ``[S]`` or ``[*B, S]``."""
