@@ -17,7 +17,7 @@ from torch_denkf.metrics import (
     spread_skill_ratio,
     state_errors,
 )
-from torch_denkf.metrics.calibration import histogram_band, rank_histogram, spread_error
+from torch_denkf.plots.histograms import histogram_band, rank_histogram, spread_error
 
 COUNT, E = 600, 9
 
