@@ -28,8 +28,8 @@ def look_at_brightness(key: NestedKey, pixels: torch.Tensor) -> bool:
     if largest > _TOO_BRIGHT:
         warnings.warn(
             f"ImageSensor reads {key!r} in floating point up to {largest:.0f}; it expects [0, 1]. Give it uint8 "
-            "images, which it divides by 255, or divide them; with pixel_loc and pixel_scale in the units of the pixels "
-            "any range will do. Said once.",
+            "images, which it divides by 255, or divide them; with pixel_loc and pixel_scale in the units of the "
+            "pixels any range will do. Said once.",
             stacklevel=3,
         )
     return largest > 0  # specs are tried out on zeros
