@@ -72,10 +72,6 @@ class PairObservation(SubModel):
     ``EnsembleAnalysis(forecast_key=("forecast", "clone"), observed_key=("forecast", "observed"),
     belief_prefix="analysis")`` and an initial belief :func:`with_history`.
 
-    An optional entry ``"steps"`` ``[*B, 1]``, int, is the number of steps n between the frames: 0 where there is no
-    pair, 1 where the entry is not there. ``kitti.gaps.bridge_gaps`` counts them. ``("forecast", "observed")``
-    ``[*B, 1]`` is written: the mask of what can be read.
-
     Args:
         reach: largest speed and turn rate of a whole pair ``[2]`` (m/s, rad/s) that the sensor can read, on both sides
             of zero: where the forecast says more over a gap, by two standard deviations, the frame counts as not
@@ -84,9 +80,12 @@ class PairObservation(SubModel):
         in_key: forecast ensemble ``[*B, E, 5]``, or with the past ``[*B, E, 5 + 2L]``.
         history_key: see :func:`with_history`; ``None`` where the past is part of the state, see
             :class:`ClonedTransition`.
+        steps_key: optional number of steps n between the frames ``[*B, 1]``, int; 0 where there is no pair, 1 where
+            the key is not there. ``kitti.gaps.bridge_gaps`` counts them.
         observed_key: optional mask ``[*B, 1]``.
         out_key: predicted observations ``[*B, E, 2]``.
         clone_key: forecast and history side by side, ``[*B, E, 5 + 2L]``.
+        out_observed_key: the mask of what can be read, ``[*B, 1]``.
 
     Source:
         Roumeliotis & Burdick 2002, "Stochastic cloning: a generalized framework for processing relative state
@@ -107,14 +106,16 @@ class PairObservation(SubModel):
         curve: nn.Module | None = None,
         in_key: NestedKey = ("forecast", "ensemble"),
         history_key: NestedKey | None = ("belief", "history"),
+        steps_key: NestedKey = "steps",
         observed_key: NestedKey = "observed",
         out_key: NestedKey = ("forecast", "observation"),
         clone_key: NestedKey = ("forecast", "clone"),
+        out_observed_key: NestedKey = ("forecast", "observed"),
     ):
-        out_keys = [out_key, clone_key, ("forecast", "observed")]
+        out_keys = [out_key, clone_key, out_observed_key]
         in_keys = [in_key] if history_key is None else [in_key, history_key]
         super().__init__(
-            nn.Identity() if curve is None else curve, in_keys, out_keys, optional_keys=["steps", observed_key]
+            nn.Identity() if curve is None else curve, in_keys, out_keys, optional_keys=[steps_key, observed_key]
         )
         reach = [torch.inf, torch.inf] if reach is None else reach
         register_constant(self, "reach", reach)

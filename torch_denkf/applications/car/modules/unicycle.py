@@ -107,15 +107,16 @@ class UnicycleMotion(SubModel):
     ``smooth`` on all steps of the history, whatever the sensor has read: a turn that shows late, because readings are
     noisy, is then in the path where it was.
 
-    Use with ``EnsembleAnalysis(..., belief_prefix="analysis")``, and not with ``update_at_reset``. It reads
-    ``("belief", "ensemble")`` of t-1 ``[*B, E, 5]``, ``("analysis", "ensemble")`` of t, with a history
-    ``[*B, E, 5 + 2L]``, and with a history ``"steps"``, see :class:`PairObservation`.
+    Use with ``EnsembleAnalysis(..., belief_prefix="analysis")``, and not with ``update_at_reset``.
 
     Args:
         dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step; a number
             with a history, whose steps must all be alike.
+        before_key: ensemble of the belief at t-1, ``[*B, E, 5]``, see :class:`UnicycleTransition`.
+        analysis_key: ensemble of the analysis at t, ``[*B, E, 5]``, with a history ``[*B, E, 5 + 2L]``.
         belief_prefix: prefix of what is written: ``ensemble`` ``[*B, E, 5]``, ``mean`` and ``var`` ``[*B, 5]``.
         history_key: velocities of the past steps ``[*B, E, L, 2]``, see :func:`with_history`; ``None`` for none.
+        steps_key: optional, with a history: see :class:`PairObservation`.
         smooth: correct the path by each analysis of the history, as a fixed-lag smoother does. The first L innovations
             move the first pose along with it, by a share of the doubt about the first velocity.
 
@@ -137,8 +138,11 @@ class UnicycleMotion(SubModel):
         self,
         dt: float | NestedKey,
         *,
+        before_key: NestedKey = ("belief", "ensemble"),
+        analysis_key: NestedKey = ("analysis", "ensemble"),
         belief_prefix: str = "belief",
         history_key: NestedKey | None = None,
+        steps_key: NestedKey = "steps",
         smooth: bool = False,
     ):
         check_dt(dt)
@@ -148,8 +152,8 @@ class UnicycleMotion(SubModel):
         if histories and keys_of_dt(dt):
             raise ValueError(f"UnicycleMotion with a history needs steps of one length; got dt={dt!r}, a key.")
         out_keys = [(belief_prefix, name) for name in ("ensemble", "mean", "var")] + histories
-        in_keys = [("belief", "ensemble"), ("analysis", "ensemble"), *histories, *keys_of_dt(dt)]
-        super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=["steps"] if histories else [])
+        in_keys = [before_key, analysis_key, *histories, *keys_of_dt(dt)]
+        super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=[steps_key] if histories else [])
         self.dt, self.history_key, self.smooth = dt, history_key, smooth
 
     def compute(self, before, analysis, *others):

@@ -25,11 +25,9 @@ class UnicyclePose(SubModel):
     \Sigma_t)`. To first order, and as if errors of the velocities at different times were independent: where they are
     not (a biased network), the pose is less certain than this says.
 
-    The velocities (v m/s, theta_dot rad/s) of t are ``("velocity", "mean")`` ``[*B, 2]`` and ``("velocity", "cov")``
-    ``[*B, 2, 2]``.
-
     Args:
         dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step.
+        velocity_prefix: prefix of ``mean`` ``[*B, 2]`` and ``cov`` ``[*B, 2, 2]`` of (v m/s, theta_dot rad/s) at t.
         forecast_prefix: prefix of ``mean`` ``[*B, 5]`` and ``cov`` of [x m, y m, theta rad, v, theta_dot] at t-1, as
             :class:`LSTMTransition` hands them on.
         belief_prefix: prefix of ``mean``, ``cov`` and ``var`` at t, written.
@@ -51,11 +49,14 @@ class UnicyclePose(SubModel):
         self,
         dt: float | NestedKey,
         *,
+        velocity_prefix: str = "velocity",
         forecast_prefix: str = "forecast",
         belief_prefix: str = "belief",
     ):
         check_dt(dt)
-        in_keys = [(key, name) for key in (forecast_prefix, "velocity") for name in ("mean", "cov")] + keys_of_dt(dt)
+        in_keys = [(key, name) for key in (forecast_prefix, velocity_prefix) for name in ("mean", "cov")] + keys_of_dt(
+            dt
+        )
         super().__init__(nn.Identity(), in_keys, [(belief_prefix, name) for name in ("mean", "cov", "var")])
         self.dt = dt
 
