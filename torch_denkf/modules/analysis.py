@@ -100,7 +100,7 @@ class EnsembleAnalysis(EnsembleUpdate):
     @property
     def noise_names(self) -> tuple[str, ...]:
         """Perturbations or rotations, where the scheme needs any."""
-        return ("",) if self.scheme == "perturbed" else super().noise_names
+        return ("",) if self.rotate or self.scheme == "perturbed" else ()
 
     def draw_noise(self, batch_size, *, members=None, observation_dim=None, generator=None, **where):
         """Draws standard-normal perturbations ``[*B, E, O]`` or rotations ``[*B, E, E]``."""
