@@ -203,7 +203,7 @@ class PositionInBody(_Reading):
         size = 2 if isinstance(self.read_space, SE2) else 3
         if landmark is None:
             check_count("count", count)
-            self.in_keys = [*self.in_keys, landmark_key]
+            self.in_keys = [in_key, landmark_key]
         else:
             _register_vectors(self, "landmark", landmark, [size], [len(landmark), size])
             count = self.landmark.numel() // size

@@ -71,8 +71,8 @@ def learn_noises(
     if model.config.two_d:  # what does not move has no noise to learn
         for parameter in motion:
             parameter.register_hook(lambda gradient: gradient.index_fill(0, torch.tensor(PLANE), 0.0))
-    for parameter in [*motion, *(scale_of(model, name) for name in _positions(model))]:
-        parameter.register_hook(_alike)
+    for scale in [*motion, *(scale_of(model, name) for name in _positions(model))]:
+        scale.register_hook(_alike)
     for name in model.reads:  # a reading that is always the same, such as zero, would be taken for one without noise
         seen = rows[name][rows[f"{name}_observed"][:, 0]]
         varies = (seen != seen[:1]).any(0)[: len(scale_of(model, name))]
