@@ -121,7 +121,10 @@ class Contaminated(MixedUpdate):
         self.register_buffer("claimed", claimed)
         self.kind, self.quantities = kind, nn.ModuleDict(quantities)
         self.noise_key = unravel_key(analysis.in_keys[5 if kind == "particles" else 3])
-        self.reading_keys = [key for key in analysis.reading_keys if key != _CLAIMED]
+        # What entries say of a reading comes and goes with it; of a Kalman analysis it would be taken for the noise.
+        entries = {one.key: name for name, one in quantities.items() if one.key is not None and one.head is None}
+        self.said_by_entries = {} if claimed is not None else entries
+        self.reading_keys = [*(key for key in analysis.reading_keys if key != _CLAIMED), *self.said_by_entries]
         if kind == "particles":
             predicted, reading, variance = analysis.in_keys[3:6]
             self.likelihood = GaussianLikelihood(
@@ -140,7 +143,8 @@ class Contaminated(MixedUpdate):
 
     def reading_dims(self, entries, call):
         """Returns how many numbers each of ``reading_keys`` has, as the analysis says."""
-        return self.module.reading_dims(entries, call)[: len(self.reading_keys)]
+        dims = [*self.module.reading_dims(entries, call)][: len(self.reading_keys)]
+        return [*dims, *(dims[-1] if name == "noise" else 1 for name in self.said_by_entries.values())]
 
     def on_entries(self, entries, call):
         """The belief and the diagnostics."""
