@@ -213,7 +213,8 @@ def contaminated(make):
 
     def doubts(turn):
         filter = make(turn)
-        return filter.with_modules(analysis=Contaminated(filter["analysis"], 0.3, width=3.0))
+        divergence = 0.0 if isinstance(filter, ParticleFilter) else 0.1
+        return filter.with_modules(analysis=Contaminated(filter["analysis"], 0.3, width=3.0, divergence=divergence))
 
     return doubts
 

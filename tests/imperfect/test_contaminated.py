@@ -24,6 +24,7 @@ from torch_denkf.modules import (
     UKFAnalysis,
 )
 from torch_denkf.modules.particles import ParticleAnalysis
+from torch_denkf.smoothers.past import LaggedAnalysis
 
 EYE = torch.eye(1, dtype=torch.float64)
 SCORES = ("innovation", "nis", "log_likelihood")
@@ -52,12 +53,13 @@ def normal(value, std):
     return torch.exp(-0.5 * (value / std) ** 2) / (std * math.sqrt(2 * math.pi))
 
 
-def on_line(reading, share, outlier_std):
+def on_line(reading, share, outlier_std, divergence=0.0):
     """Mean, variance, log-likelihood and probability of an outlier of the exact posterior, on a fine grid."""
-    x = torch.linspace(MEAN - 12 * STD, MEAN + 12 * STD, 200_001, dtype=torch.float64)
+    x = torch.linspace(MEAN - 30 * STD, MEAN + 30 * STD, 400_001, dtype=torch.float64)
     step = float(x[1] - x[0])
     prior, outlier = normal(x - MEAN, STD), share * normal(reading - x, outlier_std)
-    joint = prior * ((1 - share) * normal(reading - x, R) + outlier)
+    lost = (1 - divergence) * prior + divergence * normal(x - MEAN, 3 * STD)
+    joint = lost * (1 - share) * normal(reading - x, R) + prior * outlier
     total = float(joint.sum()) * step
     mean = float((joint * x).sum()) * step / total
     variance = float((joint * (x - mean) ** 2).sum()) * step / total
@@ -83,6 +85,31 @@ def test_one_step_is_that_of_a_fine_grid(name, reading, share, wide):
     atol = 2e-2 if name == "particles" and reading == -4 else 2e-3 if name == "particles" else 1e-6
     found = [td["belief", "mean"], td["belief", "var"], td["info", "log_likelihood"], td["info", "outlier"]]
     assert [value.item() for value in found] == pytest.approx(expected, abs=atol)
+
+
+@pytest.mark.parametrize("name", [name for name in ONE if name != "particles"])
+@pytest.mark.parametrize(("reading", "divergence"), [(1.0, 0.3), (6.0, 0.05)])
+def test_a_forecast_that_has_diverged_is_a_third_part_of_the_mixture(name, reading, divergence):
+    torch.manual_seed(0)
+    td = update_of(ONE[name](), 0.2, width=8.0, divergence=divergence)(forecast(reading, 1.0, 40))
+    found = [td["belief", "mean"], td["belief", "var"], td["info", "log_likelihood"], td["info", "outlier"]]
+    expected = on_line(reading, 0.2, 8 * R, divergence)
+    assert [value.item() for value in found] == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_past_diverges_with_the_present(float64):
+    """The smoother's past and the present, as one state of both."""
+    torch.manual_seed(0)
+    members, past = torch.randn(12, 2), torch.randn(12, 3, 2)
+    analysis = EnsembleAnalysis("etkf", observation_key=KEY)
+    td = TensorDict({"forecast": {"ensemble": members, "observation": members[:, :1], "past": past}})
+    td[KEY], td["sensor", "noise"] = torch.tensor([4.0]), torch.tensor([0.2])
+    whole = td.clone().set(("forecast", "ensemble"), torch.cat([members, past.flatten(1)], -1))
+    options = {"share": 0.3, "width": 5.0, "divergence": 0.2}
+    apart = Contaminated(analysis, **options).around(LaggedAnalysis(analysis))(td)
+    whole = Contaminated(analysis, **options)(whole)
+    both = torch.cat([apart["belief", "ensemble"], apart["forecast", "past"].flatten(1)], -1)
+    assert_close(both, whole["belief", "ensemble"], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["etkf", "EKF", "UKF", "EKF, correlated"])
@@ -391,6 +418,8 @@ def test_what_cannot_be_raises():
     for other in (Contaminated(inner), Visible(inner), ParticleAnalysis(), Select([0]), LearnedLikelihood(4, 2)):
         with pytest.raises(TypeError, match="Contaminated goes around"):
             Contaminated(other)
+    with pytest.raises(ValueError, match="divergence is for"):
+        update_of("particles", divergence=0.1)
     with pytest.raises(TypeError, match="share must be a TensorDict module"):
         Contaminated(inner, nn.Linear(1, 1))
     with pytest.raises(KeyError, match="share"):

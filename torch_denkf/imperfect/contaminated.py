@@ -20,9 +20,16 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from torch_denkf._checks import check_values
+from torch_denkf._checks import check_number, check_values
 from torch_denkf.functional.mixture import log_mixture, responsibility
-from torch_denkf.imperfect.mixed import MixedUpdate, kind_of_update, with_draws, with_noise_from
+from torch_denkf.imperfect.mixed import (
+    MixedUpdate,
+    kind_of_update,
+    wider_forecast,
+    wider_past,
+    with_draws,
+    with_noise_from,
+)
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.modules.likelihood import GaussianLikelihood
 from torch_denkf.modules.spaces import told
@@ -33,6 +40,7 @@ from torch_denkf.submodel import Call, Entries, Update
 __all__ = ["Contaminated"]
 
 _CLAIMED = ("contaminated", "claimed")  # the noise that a Kalman analysis holds itself
+_DIVERGED = 3.0  # times as wide as the forecast says
 
 
 class Contaminated(MixedUpdate):
@@ -68,11 +76,15 @@ class Contaminated(MixedUpdate):
         share: :math:`\epsilon` in [0, 1], ``[*B, 1]`` in an entry.
         width: w, by how much outliers are wider than R says, ``[*B, 1]`` in an entry.
         noise: W, in the place of ``width``: standard deviations ``[O]``; in an entry variances ``[*B, O]``.
+        divergence: probability that the filter has diverged, 0.01 for example: a sound reading then is expected from a
+            forecast of three times the standard deviations. One Gaussian for a mixture forgets the smaller peak; where
+            that was the true one, it may take many sound readings for outliers. It costs a third run.
         trainable: whether those that are numbers are parameters: the logit of the share, logarithms of the others.
 
     Raises:
         TypeError: for another analysis, whose forecast or reading is not known, or a module that is none.
-        ValueError: if the share is outside [0, 1], or at its ends and trained; if width or noise is not positive.
+        ValueError: if the share is outside [0, 1], or at its ends and trained; if width or noise is not positive; for a
+            divergence outside [0, 1), or of particles.
         KeyError: if an entry is missing.
 
     Example:
@@ -96,6 +108,7 @@ class Contaminated(MixedUpdate):
         *,
         width: float | NestedKey | TensorDictModuleBase = 10.0,
         noise: Sequence[float] | Tensor | NestedKey | TensorDictModuleBase | None = None,
+        divergence: float = 0.0,
         trainable: bool = False,
     ):
         kind, claimed = kind_of_update(analysis, "Contaminated"), None
@@ -119,7 +132,10 @@ class Contaminated(MixedUpdate):
             optional_keys=list(dict.fromkeys([*analysis.optional_keys, *optional])),
         )
         self.register_buffer("claimed", claimed)
-        self.kind, self.quantities = kind, nn.ModuleDict(quantities)
+        check_number("divergence", divergence, least=0, below=1)
+        if divergence and kind == "particles":
+            raise ValueError("divergence is for beliefs that keep mean and covariance: particles keep several peaks.")
+        self.kind, self.quantities, self.divergence = kind, nn.ModuleDict(quantities), divergence
         self.noise_key = unravel_key(analysis.in_keys[5 if kind == "particles" else 3])
         # What entries say of a reading comes and goes with it; of a Kalman analysis it would be taken for the noise.
         entries = {one.key: name for name, one in quantities.items() if one.key is not None and one.head is None}
@@ -152,31 +168,55 @@ class Contaminated(MixedUpdate):
             mean = self.required(entries, self.module.in_keys[0])
             entries = {**entries, _CLAIMED: self.claimed.expand(*mean.shape[:-1], *self.claimed.shape)}
         entries = with_draws(self.module, self.with_mask(entries, call), call)
+        if self.kind == "members":
+            entries = self.module.aligned(entries)
         mask = None if self.observed_key is None else told(self.reading_space, entries.get(self.observed_key))
         seen = None if mask is None else mask.any(-1, keepdim=True)
-        out = self.run_inside(entries, call)
-        nis, inlier = (out[self.info_prefix, name] for name in ("nis", "log_likelihood"))
-        told_so = {**entries, **out}
-        sound = 1 - self._said("share", told_so, call, seen, nis).expand_as(nis)
-        wide = self._with(entries, self._outlier_noise(told_so, call, seen))
-        other = self.run_inside(wide, call)
-        other_nis, outlier = (other[self.info_prefix, name] for name in ("nis", "log_likelihood"))
-        share = responsibility(sound, inlier, outlier)
+        out = self._of_sound(entries, call, seen)
+        known, like = {**entries, **out}, out[self.info_prefix, "nis"]
+        sound = 1 - self._said("share", known, call, seen, like).expand_as(like)
+        wide = self._with(entries, self._outlier_noise(known, call, seen))
+        other = self._run(wide, call)
+        both, share = self._either(entries, sound, out, other, seen)
         if self.kind == "particles":
             key = self.module.in_keys[2]
-            both = log_mixture(sound, entries[key], wide[key])
-            both = both if seen is None else torch.where(seen, both, entries[key])  # nothing, not even rounding
-            mixed = self.run_inside({**entries, key: both}, call)
-        else:
-            mixed = self.mixed(entries, sound, share, out, other, seen)
+            mixed = log_mixture(sound, entries[key], wide[key])
+            mixed = mixed if seen is None else torch.where(seen, mixed, entries[key])  # nothing, not even rounding
+            both = {**self._run({**entries, key: mixed}, call), **both}
+        outlier = 1 - share if seen is None else torch.where(seen, 1 - share, 0)
+        return {**out, **both, (self.info_prefix, "outlier"): outlier}
+
+    def _run(self, entries: Entries, call: Call) -> Entries:
+        """Returns what the analysis writes; an ensemble's predictions and reading are plain numbers already."""
+        return (self.module.on_aligned if self.kind == "members" else self.module.on_entries)(entries, call)
+
+    def _of_sound(self, entries: Entries, call: Call, seen: Tensor | None) -> Entries:
+        """Returns what the analysis writes with R, of the forecast and of the one that has diverged."""
+        out = self._run(entries, call)
+        if not self.divergence:
+            return out
+        like, members = out[self.info_prefix, "nis"], self.kind == "members"
+        factor = torch.full_like(like, _DIVERGED**2)
+        wide = wider_past(self.module, wider_forecast(self.module, entries, factor, members=members), factor)
+        known = torch.full_like(like, 1 - self.divergence)
+        return {**out, **self._either(entries, known, out, self._run(wide, call), seen)[0]}
+
+    def _either(
+        self, entries: Entries, probability: Tensor, out: Entries, other: Entries, seen: Tensor | None
+    ) -> tuple[Entries, Tensor]:
+        """Returns belief and scores of a mixture of two runs, and the share of the first; of particles no belief."""
+        (nis, first), (other_nis, second) = (
+            (run[self.info_prefix, "nis"], run[self.info_prefix, "log_likelihood"]) for run in (out, other)
+        )
+        share = responsibility(probability, first, second)
         scores = {
             "nis": share * nis + (1 - share) * other_nis,
-            "log_likelihood": log_mixture(sound, inlier, outlier),
-            "outlier": 1 - share,
+            "log_likelihood": log_mixture(probability, first, second),
         }
         if seen is not None:
             scores = {name: torch.where(seen, value, 0) for name, value in scores.items()}
-        return {**out, **mixed, **{(self.info_prefix, name): value for name, value in scores.items()}}
+        belief = {} if self.kind == "particles" else self.mixed(entries, probability, share, out, other, seen)
+        return {**belief, **{(self.info_prefix, name): value for name, value in scores.items()}}, share
 
     def _said(self, name: str, entries: Entries, call: Call, seen: Tensor | None, like: Tensor) -> Tensor:
         """Returns share, width or noise, the latter as variances; 0, and 1, where nothing is observed."""

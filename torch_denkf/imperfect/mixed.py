@@ -14,9 +14,10 @@ from torch_denkf.functional.mixture import mix_members, mix_moments
 from torch_denkf.modules.around import Around
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.running import random_parts
+from torch_denkf.smoothers.past import LaggedAnalysis
 from torch_denkf.submodel import Call, Entries, SubModel, Update, flat_noise
 
-__all__ = ["MixedUpdate", "kind_of_update", "with_draws", "with_noise_from"]
+__all__ = ["MixedUpdate", "kind_of_update", "wider_forecast", "wider_past", "with_draws", "with_noise_from"]
 
 
 class MixedUpdate(Around):
@@ -119,6 +120,47 @@ def kind_of_update(analysis: Update, name: str) -> str:
         "with a GaussianLikelihood, or around one of your own that updates an ensemble and writes innovation, nis and "
         "log_likelihood under its info_prefix."
     )
+
+
+def wider_forecast(analysis: Update, entries: Entries, factor: Tensor, *, members: bool) -> Entries:
+    """Returns the entries with the forecast's covariance times a factor ``[*B, 1]``.
+
+    Args:
+        analysis: whose forecast it is.
+        entries: of an ensemble as :meth:`Update.aligned` gives them.
+        factor: on variances; bit-equal for 1.
+        members: whether it updates an ensemble, and not a mean and a covariance.
+    """
+    if not members:
+        key = analysis.in_keys[1]
+        return {**entries, key: entries[key] * factor.unsqueeze(-1)}
+    keys = analysis.in_keys[:2]  # states, and what is predicted of them, in plain numbers
+    spaces = (analysis.space, None)
+    wider = {key: spread_about_mean(entries[key], factor.sqrt(), on) for key, on in zip(keys, spaces, strict=True)}
+    return {**entries, **wider}
+
+
+def wider_past(analysis: Update, entries: Entries, factor: Tensor) -> Entries:
+    """Returns the entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
+    if not isinstance(analysis, LaggedAnalysis):
+        return entries
+    key, space = analysis.in_keys[-1], analysis.space
+    past = entries[key]
+    if space is not None:
+        of_times = spread_about_mean(past.movedim(-2, -3), factor.sqrt().unsqueeze(-2), space)
+        return {**entries, key: of_times.movedim(-3, -2)}
+    wider = spread_about_mean(past.flatten(-2), factor.sqrt())
+    return {**entries, key: wider.unflatten(-1, past.shape[-2:])}
+
+
+def spread_about_mean(members: Tensor, factor: Tensor, space: Space | None = None) -> Tensor:
+    """Members ``[*B, E, N]``, their distances from the mean times ``factor`` ``[*B, 1]``; bit-equal for 1."""
+    factor = factor.unsqueeze(-2)
+    if space is not None:
+        center = space.mean(members).unsqueeze(-2)
+        return torch.where(factor == 1, members, space.plus(center, factor * space.minus(members, center)))
+    mean = members.mean(-2, keepdim=True)
+    return torch.where(factor == 1, members, mean + factor * (members - mean))
 
 
 def with_draws(module: nn.Module, entries: Entries, call: Call) -> Entries:

@@ -12,14 +12,13 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.imperfect import Visible
-from torch_denkf.imperfect.mixed import with_draws, with_noise_from
+from torch_denkf.imperfect.mixed import wider_forecast, wider_past, with_draws, with_noise_from
 from torch_denkf.modules.around import Around
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.monitoring._calibration import IDENTITY, check_observation_dim, chi_square_table, empirical_quantile
 from torch_denkf.monitoring.chi_square import chi_square_quantile
-from torch_denkf.monitoring.gating import adapt, disbelief, spread_about_mean
+from torch_denkf.monitoring.gating import adapt, disbelief
 from torch_denkf.monitoring.innovation_tests import interpolate
-from torch_denkf.smoothers.past import LaggedAnalysis
 from torch_denkf.submodel import Call, Entries, Update
 
 __all__ = ["GateOptions", "GatedAnalysis"]
@@ -255,7 +254,8 @@ class GatedAnalysis(Around):
             if rejects:
                 seen = seen & ~doubted  # an outlier is no measure of the noise
                 wider = torch.where(seen.any(-1, keepdim=True), wider, 1)
-            spread = self._with_past(self._wider(plain, wider), reach)
+            inside = self.module.module if isinstance(self.module, Visible) else self.module
+            spread = wider_past(inside, self._wider(plain, wider), reach)
             out = (
                 self._without(spread, call, doubted) if rejects else self._analyse(self._noisier(spread, factor), call)
             )
@@ -308,26 +308,7 @@ class GatedAnalysis(Around):
 
     def _wider(self, entries: Entries, factor: Tensor) -> Entries:
         """The entries with the forecast's covariance times a factor ``[*B, 1]``."""
-        if not self.of_ensemble:
-            key = self.module.in_keys[1]
-            return {**entries, key: entries[key] * factor.unsqueeze(-1)}
-        keys = self.module.in_keys[:2]  # states, and what is predicted of them, in plain numbers
-        spaces = (self.module.space, None)
-        wider = {key: spread_about_mean(entries[key], factor.sqrt(), on) for key, on in zip(keys, spaces, strict=True)}
-        return {**entries, **wider}
-
-    def _with_past(self, entries: Entries, factor: Tensor) -> Entries:
-        """The entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
-        inside = self.module.module if isinstance(self.module, Visible) else self.module
-        if not isinstance(inside, LaggedAnalysis):
-            return entries
-        key = inside.in_keys[-1]
-        past, space = entries[key], self.module.space
-        if space is not None:
-            of_times = spread_about_mean(past.movedim(-2, -3), factor.sqrt().unsqueeze(-2), space)
-            return {**entries, key: of_times.movedim(-3, -2)}
-        wider = spread_about_mean(past.flatten(-2), factor.sqrt())
-        return {**entries, key: wider.unflatten(-1, past.shape[-2:])}
+        return wider_forecast(self.module, entries, factor, members=self.of_ensemble)
 
     def _without(self, entries: Entries, call: Call, rejected: Tensor) -> Entries:
         """What the analysis writes without what is rejected ``[*B, K]``."""
