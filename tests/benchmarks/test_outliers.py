@@ -28,7 +28,7 @@ def test_the_contaminated_update_is_near_what_can_be_known():
     assert 0.8 < truth["held"] < 0.97
     told = data.clone().set("sound", torch.full((*data.shape, 1), 1 - SHARE))
     found = {name: score(around(known("DEnKF")), told, 0) for name, around in UPDATES.items()}
-    contaminated = found.pop("`Contaminated`, told share and width")
-    assert all(contaminated["rmse_x"] < other["rmse_x"] for other in found.values())
-    assert all(contaminated[name] < 1.4 * truth[name] for name in ("rmse_x", "rmse_v", "crps_x", "crps_v"))
-    assert contaminated["held"] > 0.8
+    for contaminated in [found[name] for name in found if "gence" in name or "width" in name]:
+        assert all(contaminated[name] < 1.4 * truth[name] for name in ("rmse_x", "rmse_v", "crps_x", "crps_v"))
+        assert contaminated["held"] > 0.85
+        assert contaminated["rmse_x"] < min(found["plain"]["rmse_x"], found['gate, "student"']["rmse_x"]) / 2

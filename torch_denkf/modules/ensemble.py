@@ -72,7 +72,7 @@ class EnsembleUpdate(Update):
         reading_space: Space | None = None,
         covariance: bool = False,
         localisation: Literal["significance"] | None = None,
-        threshold: float | Tensor = 3.0,
+        threshold: float | Tensor = 1.5,
         forecast_key: NestedKey = ("forecast", "ensemble"),
         predicted_key: NestedKey = ("forecast", "observation"),
         observation_key: NestedKey = ("sensor", "ensemble"),

@@ -76,7 +76,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         rotate: bool = False,
         tile: int = 4096,
         localisation: Literal["significance"] | None = None,
-        threshold: float | torch.nn.Parameter = 3.0,
+        threshold: float | torch.nn.Parameter = 1.5,
         reading_space: Space | None = None,
         **keys: Unpack[EnsembleAnalysisKeys],
     ):
