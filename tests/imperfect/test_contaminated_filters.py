@@ -8,15 +8,24 @@ from tensordict.nn import TensorDictModule
 from torch.testing import assert_close
 from torchrl.envs import TransformedEnv
 
+from tests.filters import test_spaces as spaces
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import FixedEnsemble, linear_denkf, linear_kalman, linear_system
 from tests.imperfect.test_visible_filters import CERTAIN, KINDS, MAKERS, certain, frames
 from torch_denkf import DEnKFTransform
 from torch_denkf.deployment import export_step, load_step
+from torch_denkf.functional.manifolds import SO3
 from torch_denkf.functional.mixture import log_mixture, mix_moments
 from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
 from torch_denkf.imperfect import Contaminated
-from torch_denkf.modules import LearnedTransition, LinearObservation, LinearTransition, MomentPrior
+from torch_denkf.modules import (
+    AroundState,
+    GaussianAround,
+    LearnedTransition,
+    LinearObservation,
+    LinearTransition,
+    MomentPrior,
+)
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss
 from torch_denkf.smoothers import EnRTS, FixedLag, RTSSmoother
 
@@ -219,3 +228,50 @@ def test_losses_train_share_width_and_head(float64, name, term):
         for gradient in torch.autograd.grad(loss(td)[f"loss_{term}"], parameters):
             assert gradient.isfinite().all()
             assert gradient.abs().max() > 0
+
+
+def late_on_space(kind):
+    """Orientations whose readings come two steps late."""
+
+    def analysis(*args, **keys):
+        return Contaminated(
+            KINDS["ensemble" if kind == "etkf" else kind](*args, **keys), 0.3, width=5.0, divergence=0.1
+        )
+
+    space = {"state_key": "start", "space": spaces.SPACE}
+    start = (
+        AroundState(spaces.STD, ensemble_size=24, **space) if kind == "etkf" else GaussianAround(spaces.STD, **space)
+    )
+    options = {"reading_space": SO3(), "observed_key": "observed", "delay": 2, "analysis": analysis}
+    sensor = FusedSensor(spaces.Orientation(), spaces.R, **options)
+    return FusedFilter(spaces.Turning(), {"pose": sensor}, initial=start, process_noise=spaces.Q)
+
+
+@pytest.mark.parametrize("kind", ["EKF", "UKF", "etkf", "particles", "late EKF", "late etkf"])
+def test_orientations_turn_with_the_world_and_steps_are_the_sequence(float64, kind):
+    """Readings of which a share is wrong: a world that is turned changes nothing else, a past included."""
+    divergence = 0.0 if kind == "particles" else 0.1
+    filter = (
+        late_on_space(kind.split()[-1])
+        if "late" in kind
+        else contaminated(spaces.make(kind), 0.3, width=5.0, divergence=divergence)
+    )
+    data = spaces.log()
+    wrong = torch.rand(*data.shape, 1) < 0.3
+    data["pose"] = torch.where(wrong, SO3().plus(data["pose"], 0.5 * torch.randn(*data.shape, 3)), data["pose"])
+    data = spaces.with_noise(filter, data)
+    turn = SO3().exp(torch.randn(3))
+    here, there = spaces.turned_beliefs(filter, turn, data)
+    outlier = here["info", "outlier"]
+    assert ((outlier > 0.1) & (outlier < 0.9)).sum() > 3
+    tolerance = 1e-6 if kind == "particles" else 1e-7
+    moved = spaces.turned(turn, here["belief", "mean"])
+    assert spaces.SPACE.minus(there["belief", "mean"], moved).abs().max() < tolerance
+    assert_close(there["belief", "var"], here["belief", "var"], rtol=0, atol=tolerance)
+    assert_close(there["info", "log_likelihood"], here["info", "log_likelihood"], rtol=0, atol=1e-5)
+    belief = None
+    for t in range(5):
+        row = data[:, t].copy().set("action", data["action"][:, max(t - 1, 0)])  # that led here
+        out = filter.initialise(row) if belief is None else filter.step(row.update(belief))
+        belief = out.select(*filter.belief_keys)
+        assert_close(out["belief", "mean"], here["belief", "mean"][:, t], rtol=0, atol=1e-10)
