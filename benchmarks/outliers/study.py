@@ -40,7 +40,8 @@ class Study:
     runs: int = 100  # of the test
     particles: int = 100_000  # of what can be known at best
     training: int = 500  # runs to learn from
-    draws: int = 5  # of ensembles, and trainings
+    draws: int = 5  # of ensembles
+    trainings: int = 5
     updates: tuple[int, int] = (100, 700)  # of the ensemble, and of the LSTM
     smoke: bool = False  # two runs, two updates: does it run?
 
@@ -111,7 +112,7 @@ def planned(study: Study, test: TensorDict) -> dict[tuple, Callable[[], dict]]:
                 jobs["known", kind, update, draw] = lambda kind=kind, around=around, draw=draw: score(
                     around(known(kind)), told, draw
                 )
-    for draw in range(study.draws):
+    for draw in range(study.trainings):
         for kind, update in (("DEnKF", "`Contaminated`, trained"), ("LSTM", "")):
             jobs["learned", kind, update, draw] = lambda kind=kind, draw=draw: score(
                 trained(kind, study, draw, training), test, draw
@@ -127,15 +128,15 @@ def page(rows: list[dict], study: Study) -> str:
         "",
         f"Errors and CRPS over those of {study.particles:,} particles with the true model ({truth['rmse_x']:.3f} m and "
         f"{truth['rmse_v']:.3f} m/s; {truth['crps_x']:.3f} m and {truth['crps_v']:.3f} m/s; {truth['held']:.0%} held). "
-        f"{study.runs} runs of 2 s. What draws: mean, and range, of {study.draws} draws. Ensembles have 32 members.",
+        f"{study.runs} runs of 2 s. What draws: mean, and range, of the draws. Ensembles have 32 members.",
         "",
-        *head("model", "filter", "update", "RMSE, position", "speed", "CRPS, position", "speed", "held", "ms"),
+        *head("model", "filter", "update", "RMSE, position", "speed", "CRPS, position", "speed", "held", "ms", "draws"),
     ]
     for name in dict.fromkeys((row["model"], row["filter"], row["update"]) for row in rows if row["model"]):
         own = [row for row in rows if (row["model"], row["filter"], row["update"]) == name]
         cells = [span([row[key] / truth[key] for row in own], "{:.2f}") for key in SCORES[:4]]
         held = span([100 * row["held"] for row in own], "{:.0f}")
-        lines.append(line(*name, *cells, f"{held} %", span([own[0]["ms"]], "{:.0f}")))
+        lines.append(line(*name, *cells, f"{held} %", f"{own[0]['ms']:.1f}", len(own)))
     lines += ["", "ms: processor time of a step of all runs, one thread.", "", *made_by("outliers")]
     return "\n".join(lines) + "\n"
 
@@ -150,7 +151,7 @@ def main() -> None:
     """Runs the study."""
     study = parse(Study)
     if study.smoke:
-        study = replace(study, out=None, runs=2, particles=500, training=4, draws=1, updates=(2, 2))
+        study = replace(study, out=None, runs=2, particles=500, training=4, draws=1, trainings=1, updates=(2, 2))
     torch.set_num_threads(1)
     file = None if study.out is None else study.out / "outliers.csv"
     rows = COLUMNS.read(file) if file is not None and file.exists() else []
