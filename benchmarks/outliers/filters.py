@@ -61,7 +61,7 @@ UPDATES: dict[str, Callable[[Filter], Filter]] = {
     'gate, "student"': lambda filter: Gated(filter, 1),
     "`Visible`, told the share": _around(lambda analysis: Visible(analysis, visible_key="sound")),
     "`Contaminated`, told share and width": _around(lambda analysis: Contaminated(analysis, SHARE, noise=[WRONG])),
-    "the same, `divergence=0.01`": _around(
+    "`Contaminated`, `divergence=0.01`": _around(
         lambda analysis: Contaminated(analysis, SHARE, noise=[WRONG], divergence=DIVERGENCE)
     ),
 }
