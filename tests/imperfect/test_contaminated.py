@@ -11,8 +11,8 @@ from torch.testing import assert_close
 
 from tests.imperfect.test_visible import BELIEF, KEY, MEAN, SEVERAL, STD, R, forecast, several
 from torch_denkf.functional.manifolds import SO3, Circle, Euclidean, Product
-from torch_denkf.functional.mixture import mix_moments
 from torch_denkf.imperfect import Contaminated, Visible
+from torch_denkf.imperfect.mixture import mix_moments
 from torch_denkf.modules import (
     EKFAnalysis,
     EnsembleAnalysis,

@@ -15,9 +15,9 @@ from tests.imperfect.test_visible_filters import CERTAIN, KINDS, MAKERS, certain
 from torch_denkf import DEnKFTransform
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.functional.manifolds import SO3
-from torch_denkf.functional.mixture import log_mixture, mix_moments
 from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
 from torch_denkf.imperfect import Contaminated
+from torch_denkf.imperfect.mixture import log_mixture, mix_moments
 from torch_denkf.modules import (
     AroundState,
     GaussianAround,

@@ -21,7 +21,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_number, check_values
-from torch_denkf.functional.mixture import log_mixture, responsibility
 from torch_denkf.imperfect.mixed import (
     MixedUpdate,
     kind_of_update,
@@ -30,6 +29,7 @@ from torch_denkf.imperfect.mixed import (
     with_draws,
     with_noise_from,
 )
+from torch_denkf.imperfect.mixture import log_mixture, responsibility
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.modules.likelihood import GaussianLikelihood
 from torch_denkf.modules.spaces import told
@@ -55,7 +55,7 @@ class Contaminated(MixedUpdate):
     mean and covariance    the mixture's, that of both means' distance included; on a space those of the tangents at the
                            forecast's mean. For a linear Gaussian system that is the exact posterior's
     ensemble               members with the mixture's mean and sample covariance, see
-                           :func:`~torch_denkf.functional.mixture.mix_members`; a past that is corrected, too
+                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a past that is corrected, too
     particles              the exact posterior: each particle's likelihood is the mixture. The analysis runs three times
     =====================  =============================================================================================
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torch_denkf.beliefs import Ensemble, complete
 from torch_denkf.functional.manifolds import Space, is_flat
-from torch_denkf.functional.mixture import mix_members, mix_moments
+from torch_denkf.imperfect.mixture import mix_members, mix_moments
 from torch_denkf.modules.around import Around
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.running import random_parts
