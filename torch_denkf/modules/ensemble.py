@@ -53,7 +53,7 @@ class EnsembleOptions(EnsembleAnalysisKeys, total=False):
         rotate: random mean-preserving rotation of the anomalies.
         reading_space: of the reading; ``None`` for plain numbers.
         localisation: ``"significance"`` or ``None``.
-        threshold: of ``"significance"``, in standard deviations; 3 by default.
+        threshold: of ``"significance"``, in standard deviations; 1.5 by default.
     """
 
     inflation: float
