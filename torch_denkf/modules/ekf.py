@@ -6,13 +6,14 @@ from collections.abc import Callable
 from typing import Unpack
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_denkf.functional import kalman_update
 from torch_denkf.functional.manifolds import Euclidean, Space, is_flat
 from torch_denkf.modules.gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
-from torch_denkf.running import reads
+from torch_denkf.running import linearise, reads
 from torch_denkf.submodel import Call, Entries, Update, role
 
 __all__ = ["EKFAnalysis", "EKFTransition"]
@@ -60,11 +61,11 @@ class EKFTransition(GaussianTransition):
         def move(rows, states, call):
             return self._move(rows, states, call), None
 
-        entries = _needed(self, entries)
-        if self.space is None or self.space.flat is not None:
-            forecast, jacobian, _ = _linearise(move, entries, call, mean, mean.shape[-1])
-        else:
-            forecast, jacobian, _ = _linearise_on(move, entries, call, mean, self.space, self.space)
+        entries = {**entries, self.ensemble_key: mean.unsqueeze(-2)}
+        spaces = None if is_flat(self.space) else (self.space, self.space)
+        forecast, jacobian, _ = _linearise(
+            self, move, entries, call, mean, mean.shape[-1], self.forecast_ensemble_key, spaces
+        )
         if self.stop_jacobian_gradient:
             jacobian = jacobian.detach()
         moved = jacobian @ cov @ jacobian.mT
@@ -96,40 +97,66 @@ class EKFAnalysis(GaussianAnalysis):
     """
 
     def _update(self, entries, mean, cov, observation, noise, call):
-        entries, size = _needed(self, entries), observation.shape[-1]
-        if is_flat(self.space, self.reading_space):
-            predicted, jacobian, observed = _linearise(self._observe, entries, call, mean, size)
-        else:
-            space, reading_space = self.space or Euclidean(mean.shape[-1]), self.reading_space or Euclidean(size)
-            predicted, jacobian, observed = _linearise_on(self._observe, entries, call, mean, space, reading_space)
+        size, spaces = observation.shape[-1], None
+        if not is_flat(self.space, self.reading_space):
+            spaces = self.space or Euclidean(mean.shape[-1]), self.reading_space or Euclidean(size)
+        entries = {**entries, self.ensemble_key: mean.unsqueeze(-2)}
+        predicted, jacobian, observed = _linearise(
+            self, self._observe, entries, call, mean, size, self.predicted_key, spaces
+        )
         innovation = self._innovation(observation, predicted, observed)
         # In deviations from the mean: H m would cost digits where the state is far from zero.
         update = kalman_update(torch.zeros_like(cov[..., 0]), cov, innovation, jacobian, noise, observed=observed)
         return self._moved(mean, update), observed
 
 
-def _needed(module, entries: Entries) -> Entries:
-    """Lists the keys that the model inside reads, and the mask."""
-    needed, optional = reads(module.module)
-    keys = dict.fromkeys([*needed, *optional, role(module, Update).observed_key])
-    return {key: entries[key] for key in keys if key in entries}
-
-
-def _linearise_on(
+def _linearise(
+    step: GaussianTransition | GaussianAnalysis,
     model: Callable[[Entries, Tensor, Call], tuple[Tensor, Tensor | None]],
     entries: Entries,
     call: Call,
     mean: Tensor,
-    space: Space,
-    image_space: Space,
+    size: int,
+    key: NestedKey,
+    spaces: tuple[Space, Space] | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The image of a point ``[*B, P]``, and the Jacobian ``[*B, N, D]`` between the tangents of both."""
-    image, jacobian, mask = _linearise(model, entries, call, mean, image_space.point_dim)
-    space.check(point=mean)
-    return image, image_space.dual_basis(image) @ jacobian @ space.basis(mean), mask
+    """Value, Jacobian and mask of the model inside a step, which knows its Jacobian or is differentiated.
+
+    Args:
+        step: around the model.
+        model: see :func:`_differentiated`.
+        entries: what the model may read, the mean ``[*B, 1, P]`` among it.
+        call: how it is called.
+        mean: where, ``[*B, P]``.
+        size: numbers of the image, N.
+        key: of the image.
+        spaces: of ``mean`` and image, between whose tangents the Jacobian is to lead; ``None`` for plain numbers.
+    """
+    found = linearise(step.module, entries, call)
+    if found is None or found[0][key].shape[-1] != size or not _fit(found[2], spaces):
+        needed, optional = reads(step.module)
+        keys = dict.fromkeys([*needed, *optional, role(step, Update).observed_key])
+        image, jacobian, mask = _differentiated(
+            model, {name: entries[name] for name in keys if name in entries}, call, mean, size
+        )
+        between = None
+    else:
+        written, jacobian, between = found
+        image, mask = written[key].squeeze(-2), step.mask_of(entries, written)
+        jacobian = jacobian if jacobian.ndim == 2 else jacobian.squeeze(-3)
+    if spaces is not None and between is None:
+        spaces[0].check(point=mean)
+        jacobian = spaces[1].dual_basis(image) @ jacobian @ spaces[0].basis(mean)
+    return image, jacobian, mask
 
 
-def _linearise(
+def _fit(known: tuple[Space, Space] | None, wanted: tuple[Space, Space] | None) -> bool:
+    """Tells whether a Jacobian between the tangents of some spaces is one between those of others, or of numbers."""
+    pairs = zip(known or (), wanted or (None, None), strict=False)
+    return all(one is other or one == other or is_flat(one, other) for one, other in pairs)
+
+
+def _differentiated(
     model: Callable[[Entries, Tensor, Call], tuple[Tensor, Tensor | None]],
     entries: Entries,
     call: Call,

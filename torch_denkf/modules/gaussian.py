@@ -96,6 +96,9 @@ class GaussianTransition(Transition):
         noise = as_covariance(written[unravel_key(self.process_noise.out_keys[0])], mean)
         return {self.out_keys[0]: mean, self.out_keys[1]: cov + noise}, (*(link or ()), noise)
 
+    def mask_of(self, entries: Entries, written: Entries) -> None:
+        """Returns that a forecast has no mask."""
+
     def _forecast(
         self, entries: Entries, mean, cov, call: Call, wanted: bool
     ) -> tuple[torch.Tensor, torch.Tensor, Sequence[torch.Tensor] | None]:
@@ -238,9 +241,12 @@ class GaussianAnalysis(Update):
         """Predicted observations ``[*B, E, O]`` of an ensemble, and the mask after the model ran."""
         with deterministic(self.module):
             written = run_module(self.module, {**entries, self.ensemble_key: states}, call)
+        return written[self.predicted_key], self.mask_of(entries, written)
+
+    def mask_of(self, entries: Entries, written: Entries) -> torch.Tensor | None:
+        """Returns the mask of what the observation model was given, and of what it wrote."""
         given, made = entries.get(self.observed_key), written.get(self.observed_key)
-        mask = given if made is None else made if given is None else made & given
-        return written[self.predicted_key], told(self.reading_space, mask)
+        return told(self.reading_space, given if made is None else made if given is None else made & given)
 
 
 def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: float = 1.0) -> tuple[torch.Tensor, ...]:
