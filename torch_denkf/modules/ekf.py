@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Unpack
 
 import torch
@@ -10,7 +11,7 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torch_denkf.functional import kalman_update
+from torch_denkf.functional.gaussian import check_update, innovation_update, sandwich
 from torch_denkf.functional.manifolds import Euclidean, Space, is_flat
 from torch_denkf.modules.gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
 from torch_denkf.running import linearise, reads
@@ -68,7 +69,7 @@ class EKFTransition(GaussianTransition):
         )
         if self.stop_jacobian_gradient:
             jacobian = jacobian.detach()
-        moved = jacobian @ cov @ jacobian.mT
+        moved = sandwich(jacobian, cov)
         link = (torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device), cov, jacobian) if wanted else None
         return forecast, (moved + moved.mT) / 2, link
 
@@ -99,15 +100,19 @@ class EKFAnalysis(GaussianAnalysis):
     def _update(self, entries, mean, cov, observation, noise, call):
         size, spaces = observation.shape[-1], None
         if not is_flat(self.space, self.reading_space):
-            spaces = self.space or Euclidean(mean.shape[-1]), self.reading_space or Euclidean(size)
+            spaces = self.space or _plain(mean.shape[-1]), self.reading_space or _plain(size)
         entries = {**entries, self.ensemble_key: mean.unsqueeze(-2)}
         predicted, jacobian, observed = _linearise(
             self, self._observe, entries, call, mean, size, self.predicted_key, spaces
         )
         innovation = self._innovation(observation, predicted, observed)
-        # In deviations from the mean: H m would cost digits where the state is far from zero.
-        update = kalman_update(torch.zeros_like(cov[..., 0]), cov, innovation, jacobian, noise, observed=observed)
+        check_update(mean if is_flat(self.space) else cov[..., 0], cov, innovation, jacobian, noise)
+        update = innovation_update(cov, innovation, jacobian, noise, observed=observed)
         return self._moved(mean, update), observed
+
+
+#: A space of plain numbers, of each size one.
+_plain = cache(Euclidean)
 
 
 def _linearise(
@@ -152,8 +157,10 @@ def _linearise(
 
 def _fit(known: tuple[Space, Space] | None, wanted: tuple[Space, Space] | None) -> bool:
     """Tells whether a Jacobian between the tangents of some spaces is one between those of others, or of numbers."""
-    pairs = zip(known or (), wanted or (None, None), strict=False)
-    return all(one is other or one == other or is_flat(one, other) for one, other in pairs)
+    if known is None or known == wanted:
+        return True
+    pairs = zip(known, wanted or (None, None), strict=True)
+    return all(one == other or is_flat(one, other) for one, other in pairs)
 
 
 def _differentiated(

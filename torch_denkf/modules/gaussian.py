@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_number
-from torch_denkf.functional.gaussian import GaussianUpdate
+from torch_denkf.functional.gaussian import GaussianUpdate, sandwich
 from torch_denkf.functional.linalg import as_covariance
 from torch_denkf.functional.manifolds import Space, check_space, is_flat
 from torch_denkf.modules.spaces import mean_reading, told
@@ -213,7 +213,7 @@ class GaussianAnalysis(Update):
         cov = update.cov
         if not is_flat(self.space):
             turn = self.space.right_jacobian(update.mean)
-            cov = turn @ cov @ turn.mT
+            cov = sandwich(turn, cov)
             cov = (cov + cov.mT) / 2
         return update._replace(mean=self.space.plus(mean, update.mean), cov=cov)
 
