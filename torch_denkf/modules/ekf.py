@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Unpack
 
 import torch
@@ -100,7 +99,7 @@ class EKFAnalysis(GaussianAnalysis):
     def _update(self, entries, mean, cov, observation, noise, call):
         size, spaces = observation.shape[-1], None
         if not is_flat(self.space, self.reading_space):
-            spaces = self.space or _plain(mean.shape[-1]), self.reading_space or _plain(size)
+            spaces = self.space, self.reading_space
         entries = {**entries, self.ensemble_key: mean.unsqueeze(-2)}
         predicted, jacobian, observed = _linearise(
             self, self._observe, entries, call, mean, size, self.predicted_key, spaces
@@ -111,10 +110,6 @@ class EKFAnalysis(GaussianAnalysis):
         return self._moved(mean, update), observed
 
 
-#: A space of plain numbers, of each size one.
-_plain = cache(Euclidean)
-
-
 def _linearise(
     step: GaussianTransition | GaussianAnalysis,
     model: Callable[[Entries, Tensor, Call], tuple[Tensor, Tensor | None]],
@@ -123,7 +118,7 @@ def _linearise(
     mean: Tensor,
     size: int,
     key: NestedKey,
-    spaces: tuple[Space, Space] | None,
+    spaces: tuple[Space | None, Space | None] | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Value, Jacobian and mask of the model inside a step, which knows its Jacobian or is differentiated.
 
@@ -135,7 +130,8 @@ def _linearise(
         mean: where, ``[*B, P]``.
         size: numbers of the image, N.
         key: of the image.
-        spaces: of ``mean`` and image, between whose tangents the Jacobian is to lead; ``None`` for plain numbers.
+        spaces: of ``mean`` and image, between whose tangents the Jacobian is to lead; ``None`` for plain numbers, of
+            one or both.
     """
     found = linearise(step.module, entries, call)
     if found is None or found[0][key].shape[-1] != size or not _fit(found[2], spaces):
@@ -150,12 +146,13 @@ def _linearise(
         image, mask = written[key].squeeze(-2), step.mask_of(entries, written)
         jacobian = jacobian if jacobian.ndim == 2 else jacobian.squeeze(-3)
     if spaces is not None and between is None:
-        spaces[0].check(point=mean)
-        jacobian = spaces[1].dual_basis(image) @ jacobian @ spaces[0].basis(mean)
+        space, image_space = spaces[0] or Euclidean(mean.shape[-1]), spaces[1] or Euclidean(size)
+        space.check(point=mean)
+        jacobian = image_space.dual_basis(image) @ jacobian @ space.basis(mean)
     return image, jacobian, mask
 
 
-def _fit(known: tuple[Space, Space] | None, wanted: tuple[Space, Space] | None) -> bool:
+def _fit(known: tuple[Space, Space] | None, wanted: tuple[Space | None, Space | None] | None) -> bool:
     """Tells whether a Jacobian between the tangents of some spaces is one between those of others, or of numbers."""
     if known is None or known == wanted:
         return True
