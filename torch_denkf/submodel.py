@@ -26,7 +26,7 @@ R = TypeVar("R", bound="SubModel")
 
 #: The methods that decide what a sub-model computes, and those that know its Jacobian.
 _COMPUTES = frozenset({"compute", "on_entries", "forward", "observe", "move", "features", "_run"})
-_JACOBIANS = ("jacobian", "linearised", "gradient")
+_JACOBIANS = ("jacobian", "linearised", "gradient", "move_and_gradient")
 
 #: Tensors by unravelled key: what a step of a filter works on.
 Entries: TypeAlias = dict[NestedKey, Tensor]

@@ -221,6 +221,10 @@ def solve_for_gain(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Ten
     Returns:
         Cᵀ M⁻¹, ``[*B, S, O]``; rᵀ M⁻¹ r and log det M, ``[*B, 1]`` each. NaN where M is not positive definite.
     """
+    if matrix.shape[-1] == 1:
+        total = torch.where(matrix > 0, matrix, torch.nan)
+        of_one = total.squeeze(-1)
+        return cross.mT / total, residual.square() / of_one, of_one.log()
     if torch.compiler.is_compiling() and 0 < matrix.shape[-1] <= LARGEST:
         return gain_written_out(matrix, cross, residual)
     solver = Solver(matrix)

@@ -210,12 +210,11 @@ class GaussianAnalysis(Update):
         """An update of the tangents at ``mean``, as a point and the covariance of the tangents there."""
         if self.space is None:
             return update._replace(mean=mean + update.mean)
-        cov = update.cov
-        if not is_flat(self.space):
-            turn = self.space.right_jacobian(update.mean)
-            cov = sandwich(turn, cov)
-            cov = (cov + cov.mT) / 2
-        return update._replace(mean=self.space.plus(mean, update.mean), cov=cov)
+        if is_flat(self.space):
+            return update._replace(mean=self.space.plus(mean, update.mean))
+        move, turn = self.space.exp_and_jacobian(update.mean)
+        cov = sandwich(turn, update.cov)
+        return update._replace(mean=self.space.compose(mean, move), cov=(cov + cov.mT) / 2)
 
     def reading_dims(self, entries, call):
         """O, as the model predicts it."""

@@ -13,7 +13,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf._checks import check_number, check_shape
-from torch_denkf.functional.manifolds import SE3, SE23, SO3, Euclidean, Product, rotate, skew
+from torch_denkf.functional.manifolds import SE3, SE23, SO3, Euclidean, Product, rotate, rotation_matrix, skew
 from torch_denkf.functional.manifolds.rotations import (
     Function,
     bend,
@@ -23,7 +23,7 @@ from torch_denkf.functional.manifolds.rotations import (
     one_minus_sinc,
     series,
 )
-from torch_denkf.motions.motion import Motion, carried, corner, densities, integrated, walked
+from torch_denkf.motions.motion import Motion, corner, densities, integrated, walked
 
 __all__ = ["AttitudeMotion", "InertialMotion", "move_inertially"]
 
@@ -173,10 +173,14 @@ class AttitudeMotion(Motion):
         orientation, bias = self.space.points(state)
         return torch.cat([SO3().plus(orientation, (gyro - bias) * dt), bias], -1)
 
-    def gradient(self, state, gyro, *, dt):
-        """That of the orientation by itself and by the bias, which stays."""
-        by_turn, by_rate = carried(SO3(), (gyro - self.space.points(state)[1]) * dt, dt)
-        return corner(torch.cat([by_turn, -by_rate], -1), torch.eye(3).to(state))
+    def move_and_gradient(self, state, gyro, *, dt):
+        """By the orientation itself, and by the bias, which stays."""
+        orientation, bias = self.space.points(state)
+        turn, by_rate = SO3().exp_and_jacobian((gyro - bias) * dt)
+        moved = torch.cat([SO3().compose(orientation, turn), bias], -1)
+        by_rate = -by_rate * (dt.unsqueeze(-1) if isinstance(dt, Tensor) else dt)
+        by_turn = rotation_matrix(SO3().inverse(turn))
+        return moved, corner(torch.cat([by_turn, by_rate], -1), torch.eye(3, dtype=state.dtype, device=state.device))
 
     def noise_of_step(self, dt):
         """Of orientation and bias."""

@@ -59,6 +59,10 @@ class Motion(Transition):
         """The Jacobian ``[*, D, D]`` of :meth:`move`, between tangents, from the same values; it may be left out."""
         raise NotImplementedError
 
+    def move_and_gradient(self, *values: Any, dt: Any) -> tuple[Tensor, Tensor]:
+        """Both, which may share what they need."""
+        return self.move(*values, dt=dt), self.gradient(*values, dt=dt)
+
     def noise_of_step(self, dt: Any) -> list:
         """The standard deviations ``[D]`` that a step of ``dt`` seconds adds, in the space's tangents.
 
@@ -91,7 +95,7 @@ class Motion(Transition):
     def jacobian(self, ensemble, *others):
         """The forecast ensemble, and the Jacobian between tangents."""
         actions, dt = self._drivers(ensemble, *others)
-        return self.move(ensemble, *actions, dt=dt), self.gradient(ensemble, *actions, dt=dt)
+        return self.move_and_gradient(ensemble, *actions, dt=dt)
 
     def _drivers(self, ensemble: Tensor, *others: Tensor) -> tuple[list[Tensor], Any]:
         """The actions and the length of the step, beside an ensemble."""

@@ -61,7 +61,7 @@ class _Reading(SubModel):
         """Zero but for the part that is read."""
         reading = self.compute(ensemble)
         matrix = self.gradient(ensemble.narrow(-1, self.begin, self.read_space.point_dim), reading)
-        return reading, nn.functional.pad(matrix, self._beside)
+        return reading, nn.functional.pad(matrix, self._beside) if any(self._beside) else matrix
 
 
 class PoseOf(_Reading):
@@ -144,7 +144,8 @@ class Magnetic(_Reading):
 
     def gradient(self, point, reading):
         """A turn of the body turns the direction back."""
-        return nn.functional.pad(skew(reading), (0, self.read_space.tangent_dim - 3))
+        others = self.read_space.tangent_dim - 3
+        return nn.functional.pad(skew(reading), (0, others)) if others else skew(reading)
 
 
 class Gravity(Magnetic):

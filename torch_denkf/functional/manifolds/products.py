@@ -151,6 +151,12 @@ class Product(Space):
         """Blocks on the diagonal."""
         return blocks([part.right_jacobian(own) for part, own in zip(self.parts, self.tangents(tangent), strict=True)])
 
+    def exp_and_jacobian(self, tangent):
+        """Part by part, and blocks on the diagonal."""
+        pairs = [part.exp_and_jacobian(own) for part, own in zip(self.parts, self.tangents(tangent), strict=True)]
+        points, jacobians = zip(*pairs, strict=True)
+        return torch.cat(points, -1), blocks(jacobians)
+
     def adjoint(self, point):
         """Blocks on the diagonal."""
         return blocks([part.adjoint(own) for part, own in zip(self.parts, self.points(point), strict=True)])

@@ -208,6 +208,15 @@ class _RotationAndVectors(Space):
         low = low + series(square, fifth) * (around @ turn + turn @ around)
         return self._matrix(block, low)
 
+    def exp_and_jacobian(self, tangent):
+        """For a rotation alone from three functions of its angle."""
+        if self.vectors or torch.compiler.is_compiling():
+            return super().exp_and_jacobian(tangent)
+        w, share, third = several(tangent.square().sum(-1, keepdim=True), cos_half, sinc_half, one_minus_sinc)
+        share, turn = 0.5 * share, skew(tangent)
+        half = torch.addcmul(eye(tangent, 3), (share * share).unsqueeze(-1), turn, value=-2)  # 1 - cos = 2 sin^2
+        return torch.cat([w, share * tangent], -1), torch.addcmul(half, third.unsqueeze(-1), turn @ turn)
+
     def adjoint(self, point):
         """Solà et al., eq. 175."""
         turn = rotation_matrix(point[..., :4])
