@@ -116,7 +116,8 @@ class SubModel(Checked, TensorDictModule):
         cls._wants = frozenset({"noise", "batch_size"} & inspect.signature(cls.compute).parameters.keys())
         if vars(cls).keys().isdisjoint(_JACOBIANS) and not _COMPUTES.isdisjoint(vars(cls)):
             # What is inherited is that of another function.
-            cls.jacobian, cls.linearised = SubModel.jacobian, SubModel.linearised
+            for name in ("jacobian", "linearised"):
+                setattr(cls, name, getattr(SubModel, name))
 
     def __init__(
         self,

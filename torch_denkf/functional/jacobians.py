@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -60,6 +61,7 @@ def jacobian_of_layers(
     """Does what :func:`jacobian_of_network` does for layers in their order; those of types ``linear`` are W x + b."""
     if any(not (type(layer) in linear or type(layer) in _SLOPES) or _hooked(layer) for layer in layers):
         return None
+    layer: Any
     rows: Tensor | None = None  # the Jacobian's transpose, [*, S, H]
     for layer in layers:
         if type(layer) in linear:

@@ -266,12 +266,13 @@ class JoinedObservation(SubModel):
     def on_entries(self, entries, call):
         """The predicted observations, and the mask."""
         pairs = [model.seen(entries, call.part(name)) for name, model in self.module.items()]
-        return self._joined(*zip(*pairs, strict=True))
+        return self._joined([predicted for predicted, _ in pairs], [mask for _, mask in pairs])
 
     def linearised(self, entries, call):
         """Their Jacobians below each other, where all are of plain numbers."""
-        found = [linearise(model, entries, call) for model in self.module.values()]
-        if any(each is None or not is_flat(*each[2] or ()) for each in found):
+        given = [linearise(model, entries, call) for model in self.module.values()]
+        found = [each for each in given if each is not None and is_flat(*each[2] or ())]
+        if len(found) < len(given):
             return None
         predicted = [
             written[model.predicted_key] for (written, *_), model in zip(found, self.module.values(), strict=True)
@@ -283,7 +284,7 @@ class JoinedObservation(SubModel):
         masks = [entries.get(model.observed_key) for model in self.module.values()]
         return self._joined(predicted, masks), torch.cat(rows, -2), None
 
-    def _joined(self, predicted: Sequence[Tensor], masks: Sequence[Tensor | None]) -> Entries:
+    def _joined(self, predicted: list[Tensor], masks: Sequence[Tensor | None]) -> Entries:
         seen = []
         for values, mask, space in zip(predicted, masks, self.spaces, strict=True):
             like = values[..., 0, : None if space is None else space.tangent_dim]

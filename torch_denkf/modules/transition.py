@@ -3,6 +3,7 @@ r"""Transition models: forecast :math:`x^i_{t|t-1} \sim f_\theta(x^i_{t-1|t-1})`
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey
@@ -103,7 +104,7 @@ class LearnedTransition(MemberNetwork, Transition):
         """The forecast ensemble."""
         return self._moved(state, self._run(self.features(state, action), noise), action, dt)
 
-    def features(self, state: torch.Tensor, action: torch.Tensor | None) -> torch.Tensor:
+    def features(self, state: torch.Tensor, action: Any) -> torch.Tensor:
         """Returns what the network reads, ``[*B, E, S]`` or ``[*B, E, S + A]``, of states and an action."""
         features = state if self.loc is None else state - self.loc
         features = features if self.scale is None else features / self.scale

@@ -59,9 +59,9 @@ class Motion(Transition):
         """The Jacobian ``[*, D, D]`` of :meth:`move`, between tangents, from the same values; it may be left out."""
         raise NotImplementedError
 
-    def move_and_gradient(self, *values: Any, dt: Any) -> tuple[Tensor, Tensor]:
+    def move_and_gradient(self, *values: Any, **dt: Any) -> tuple[Tensor, Tensor]:
         """Both, which may share what they need."""
-        return self.move(*values, dt=dt), self.gradient(*values, dt=dt)
+        return self.move(*values, **dt), self.gradient(*values, **dt)
 
     def noise_of_step(self, dt: Any) -> list:
         """The standard deviations ``[D]`` that a step of ``dt`` seconds adds, in the space's tangents.
@@ -99,6 +99,8 @@ class Motion(Transition):
 
     def _drivers(self, ensemble: Tensor, *others: Tensor) -> tuple[list[Tensor], Any]:
         """The actions and the length of the step, beside an ensemble."""
+        actions: list[Any]
+        dt: Any
         *actions, dt = others if self._timed else (*others, self.dt)
         self.space.check(point=ensemble)
         for (key, size), action in zip(self.actions.items(), actions, strict=True):
