@@ -5,14 +5,15 @@ linear algebra of the extended Kalman filter, whose matrices are Jacobians.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torch_denkf._checks import check_mask, check_one_dtype, check_shape, check_shapes
-from torch_denkf.functional.kernels.small_system import LARGEST, gain_written_out
+from torch_denkf._checks import check_observed, check_one_dtype, check_shape, check_shapes
+from torch_denkf.functional.kernels.small_system import WrittenOut, is_written_out
 from torch_denkf.functional.linalg import Solver, as_covariance
 
 
@@ -125,17 +126,12 @@ def innovation_update(
     batch, dim = innovation.shape[:-1], innovation.shape[-1]
     if noise.ndim == innovation.ndim:
         noise = as_covariance(noise, innovation)
+    noise = noise.to(cov.dtype)
     count: int | Tensor = dim
     if observed is not None:
-        check_mask("observed", observed)
-        width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
-        check_shape("observed", observed, (*batch, width), "[*B, 1] or [*B, O]")
-        observed = observed.expand(innovation.shape)
-        row, column = observed.unsqueeze(-1), observed.unsqueeze(-2)
+        observed, noise, count = hide(observed, noise, (*batch, dim))
         innovation = torch.where(observed, innovation, 0)
-        observation_matrix = torch.where(row, observation_matrix, 0)
-        noise = torch.where(row & column, noise, torch.eye(dim, dtype=cov.dtype, device=cov.device))
-        count = observed.sum(-1, keepdim=True, dtype=cov.dtype)
+        observation_matrix = torch.where(observed.unsqueeze(-1), observation_matrix, 0)
 
     p, h, r = cov, observation_matrix.expand(*batch, dim, cov.shape[-1]), innovation.unsqueeze(-1)
     if len(batch) != 1:  # a product of batches with one dimension costs a third of any other
@@ -149,6 +145,24 @@ def innovation_update(
         mean, new, nis, log_det = (value.reshape(*batch, *value.shape[1:]) for value in (mean, new, nis, log_det))
     log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
     return GaussianUpdate(mean, new, innovation, nis, log_likelihood)
+
+
+def hide(observed: Tensor, noise: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns a mask of each component, R ``[*B, O, O]`` with ones in the place of the others, and how many they are.
+
+    Args:
+        observed: ``[*B, 1]`` or ``[*B, O]``.
+        noise: R, ``[*B, O, O]``.
+        shape: ``[*B, O]``.
+
+    Raises:
+        ValueError: if the mask has another shape, or is not boolean.
+    """
+    check_observed(observed, shape[:-1], shape[-1])
+    observed = observed.expand(shape)
+    identity = torch.eye(shape[-1], dtype=noise.dtype, device=noise.device)
+    noise = torch.where(observed.unsqueeze(-1) & observed.unsqueeze(-2), noise, identity)
+    return observed, noise, observed.sum(-1, keepdim=True, dtype=noise.dtype)
 
 
 def check_update(mean: Tensor, cov: Tensor, observation: Tensor, matrix: Tensor, noise: Tensor) -> None:
@@ -225,9 +239,7 @@ def solve_for_gain(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Ten
         total = torch.where(matrix > 0, matrix, torch.nan)
         of_one = total.squeeze(-1)
         return cross.mT / total, residual.square() / of_one, of_one.log()
-    if torch.compiler.is_compiling() and 0 < matrix.shape[-1] <= LARGEST:
-        return gain_written_out(matrix, cross, residual)
-    solver = Solver(matrix)
+    solver = (WrittenOut if is_written_out(matrix) else Solver)(matrix)
     return solver.solve(cross).mT, solver.square(residual.unsqueeze(-1)), solver.log_det()
 
 
