@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 from torch_denkf._checks import check_count
 from torch_denkf.compilation.compared import placed, put_back, tensors
 from torch_denkf.compilation.compiled import CompiledSteps, of_one_kind
+from torch_denkf.compilation.in_time import InTime
 from torch_denkf.filters.scan import Steps
 from torch_denkf.filters.structure import Structure
 from torch_denkf.submodel import Call, Entries
@@ -387,12 +388,12 @@ def _warn_of(waits: Sequence[str], what: str) -> None:
     )
 
 
-def strategy(chunk: int | None, options: dict[str, Any]) -> CompiledSteps:
+def strategy(chunk: int | None, options: dict[str, Any]) -> CompiledSteps | InTime:
     """Returns the strategy that :meth:`torch_denkf.filters.Filter.compile` asks for.
 
     Args:
         chunk: steps of a sequence in one graph; ``None`` for the strategy's default.
-        options: of ``torch.compile``, or ``mode="graph"``.
+        options: of ``torch.compile``, or ``mode="graph"``, or ``mode="in time"``.
 
     Raises:
         ValueError: if ``chunk`` is no number of steps.
@@ -401,4 +402,6 @@ def strategy(chunk: int | None, options: dict[str, Any]) -> CompiledSteps:
         check_count("chunk", chunk, least=0, cure="It is a number of steps, or 0 for none")
     if options.get("mode") == "graph":
         return CapturedSteps(chunk, options)
+    if options.get("mode") == "in time":
+        return InTime(options)
     return CompiledSteps(4 if chunk is None else chunk, options)

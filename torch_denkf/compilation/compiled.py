@@ -24,7 +24,7 @@ from torch_denkf.submodel import Call, Entries
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
 
-__all__ = ["CompiledSteps", "of_one_kind"]
+__all__ = ["CompiledSteps", "filled", "of_one_kind"]
 
 _LOG = logging.getLogger("torch_denkf")
 #: Seconds of silence of a first call.
@@ -89,7 +89,7 @@ class CompiledSteps:
             # of no use. They begin anew, so that no number of theirs grows without bound.
             whole = -(-count // length) * length
             named |= {
-                _GOES_ON: _filled(~resets, time, count, True),
+                _GOES_ON: filled(~resets, time, count, True),
                 **{("start", key): value for key, value in starts.items()},
             }
         cuts = (*cuts, *[False] * (whole - count))
@@ -233,13 +233,13 @@ def _laid_out(value: Tensor) -> Tensor:
 
 def _pieces(value: Tensor, time: int, length: int, whole: int, mark: bool) -> Sequence[Tensor]:
     """Splits a value ``[*B, T, ...]`` into chunks, all laid out alike, however long the sequence is."""
-    value = _filled(value, time, whole, False if mark else None)
+    value = filled(value, time, whole, False if mark else None)
     if 0 not in value.stride():
         value = _laid_out(value.movedim(time, 0)).movedim(0, time)
     return value.split(length, time)
 
 
-def _filled(value: Tensor, time: int, count: int, fill: bool | None = None) -> Tensor:
+def filled(value: Tensor, time: int, count: int, fill: bool | None = None) -> Tensor:
     """Continues a value ``[*B, T, ...]`` to ``count`` steps, with its last one where it is not said what with."""
     lack = count - value.shape[time]
     if lack <= 0:

@@ -78,10 +78,10 @@ class OfOwnErrors(Wrapper):
         found = linearise(self.module, {**entries, key: state}, call)
         if found is None:
             return None
-        written, matrix, spaces = found
+        written, matrix, sides = found
         begin = state.shape[-1] - len(self.own)
         whole = F.pad(matrix[..., :begin], (0, self.total))
-        return written, whole.index_add(-1, _places(self.own, begin, whole), matrix[..., begin:]), spaces
+        return written, whole.index_add(-1, _places(self.own, begin, whole), matrix[..., begin:]), sides
 
     def _seen(self, entries: Entries) -> tuple[NestedKey, Tensor]:
         """The key and the value of what the sensor sees of the state."""

@@ -62,9 +62,9 @@ class EKFTransition(GaussianTransition):
             return self._move(rows, states, call), None
 
         entries = {**entries, self.ensemble_key: mean.unsqueeze(-2)}
-        spaces = None if is_flat(self.space) else (self.space, self.space)
+        sides = None if is_flat(self.space) else (self.space, self.space)
         forecast, jacobian, _ = _linearise(
-            self, move, entries, call, mean, mean.shape[-1], self.forecast_ensemble_key, spaces
+            self, move, entries, call, mean, mean.shape[-1], self.forecast_ensemble_key, sides
         )
         if self.stop_jacobian_gradient:
             jacobian = jacobian.detach()
@@ -97,12 +97,12 @@ class EKFAnalysis(GaussianAnalysis):
     """
 
     def _update(self, entries, mean, cov, observation, noise, call):
-        size, spaces = observation.shape[-1], None
+        size, sides = observation.shape[-1], None
         if not is_flat(self.space, self.reading_space):
-            spaces = self.space, self.reading_space
+            sides = self.space, self.reading_space
         entries = {**entries, self.ensemble_key: mean.unsqueeze(-2)}
         predicted, jacobian, observed = _linearise(
-            self, self._observe, entries, call, mean, size, self.predicted_key, spaces
+            self, self._observe, entries, call, mean, size, self.predicted_key, sides
         )
         innovation = self._innovation(observation, predicted, observed)
         check_update(mean if is_flat(self.space) else cov[..., 0], cov, innovation, jacobian, noise)
@@ -118,7 +118,7 @@ def _linearise(
     mean: Tensor,
     size: int,
     key: NestedKey,
-    spaces: tuple[Space | None, Space | None] | None,
+    sides: tuple[Space | None, Space | None] | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Value, Jacobian and mask of the model inside a step, which knows its Jacobian or is differentiated.
 
@@ -130,11 +130,11 @@ def _linearise(
         mean: where, ``[*B, P]``.
         size: numbers of the image, N.
         key: of the image.
-        spaces: of ``mean`` and image, between whose tangents the Jacobian is to lead; ``None`` for plain numbers, of
+        sides: of ``mean`` and image, between whose tangents the Jacobian is to lead; ``None`` for plain numbers, of
             one or both.
     """
     found = linearise(step.module, entries, call)
-    if found is None or found[0][key].shape[-1] != size or not _fit(found[2], spaces):
+    if found is None or found[0][key].shape[-1] != size or not _fit(found[2], sides):
         needed, optional = reads(step.module)
         keys = dict.fromkeys([*needed, *optional, role(step, Update).observed_key])
         image, jacobian, mask = _differentiated(
@@ -145,15 +145,15 @@ def _linearise(
         written, jacobian, between = found
         image, mask = written[key].squeeze(-2), step.mask_of(entries, written)
         jacobian = jacobian if jacobian.ndim == 2 else jacobian.squeeze(-3)
-    if spaces is not None and between is None:
-        space, image_space = spaces[0] or Euclidean(mean.shape[-1]), spaces[1] or Euclidean(size)
+    if sides is not None and between is None:
+        space, image_space = sides[0] or Euclidean(mean.shape[-1]), sides[1] or Euclidean(size)
         space.check(point=mean)
         jacobian = image_space.dual_basis(image) @ jacobian @ space.basis(mean)
     return image, jacobian, mask
 
 
 def _fit(known: tuple[Space, Space] | None, wanted: tuple[Space | None, Space | None] | None) -> bool:
-    """Tells whether a Jacobian between the tangents of some spaces is one between those of others, or of numbers."""
+    """Tells whether a Jacobian between the tangents of some sides is one between those of others, or of numbers."""
     if known is None or known == wanted:
         return True
     pairs = zip(known, wanted or (None, None), strict=True)
