@@ -22,9 +22,9 @@ __all__ = ["EKFAnalysis", "EKFTransition"]
 class EKFTransition(GaussianTransition):
     r"""Forecast :math:`f(m)` and :math:`F P F^T + Q` with the Jacobian F of the transition at the mean.
 
-    The transition runs on ensembles of one member; its stochastic networks run their deterministic forward. F comes
-    from automatic differentiation of whatever it does, known motion and networks alike, and can be differentiated
-    itself. Rows of a batch must not depend on each other.
+    The transition runs on ensembles of one member; its stochastic networks run their deterministic forward. F is what
+    it says itself (``jacobian``), as known motions and networks of linear layers do; of anything else it comes from
+    automatic differentiation. It can be differentiated. Rows of a batch must not depend on each other.
 
     Args:
         transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.modules.LearnedTransition`.
@@ -153,7 +153,7 @@ def _linearise(
 
 
 def _fit(known: tuple[Space, Space] | None, wanted: tuple[Space | None, Space | None] | None) -> bool:
-    """Tells whether a Jacobian between the tangents of some sides is one between those of others, or of numbers."""
+    """Tells whether a Jacobian between the tangents of some spaces is one between those of others, or of numbers."""
     if known is None or known == wanted:
         return True
     pairs = zip(known, wanted or (None, None), strict=True)
