@@ -9,7 +9,7 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number, check_values
-from torch_denkf.functional.manifolds import SE2, SE3, SE23, SO3, Circle, Euclidean, Product, Space, rotate
+from torch_denkf.functional.manifolds import SE2, SE3, SE23, SO3, Circle, Euclidean, Product, Space, rotate, skew
 from torch_denkf.modules.tensors import register_constant
 from torch_denkf.submodel import SubModel
 
@@ -36,17 +36,32 @@ class _Reading(SubModel):
             names = " or ".join(f"{kind.__name__}()" for kind in self.kinds)
             raise TypeError(f"{type(self).__name__} reads a part that is {names}; part {part} of {space} is none.")
         self.space, self.read_space = space, parts[part]
-        self.reading_space = self.read_space if reading_space is None else reading_space
+        self._of_readings(self.read_space if reading_space is None else reading_space)
         self.begin = sum(each.point_dim for each in parts[:part])
+        before = sum(each.tangent_dim for each in parts[:part])
+        self._beside = before, space.tangent_dim - before - self.read_space.tangent_dim
+
+    def _of_readings(self, space: Space) -> None:
+        self.reading_space, self.tangents_of = space, (self.space, space)
 
     def observe(self, point: Tensor) -> Tensor:
         """What is read of the part's points ``[*, P]``, ``[*, Q]``."""
         raise NotImplementedError
 
-    def compute(self, ensemble):
+    def gradient(self, point: Tensor, reading: Tensor) -> Tensor:
+        """The Jacobian of :meth:`observe` from the part's tangents to those of the reading; it may be left out."""
+        raise NotImplementedError
+
+    def compute(self, ensemble, *given):
         """The predicted readings."""
         self.space.check(point=ensemble)
         return self.observe(ensemble.narrow(-1, self.begin, self.read_space.point_dim))
+
+    def jacobian(self, ensemble, *given):
+        """Zero but for the part that is read."""
+        reading = self.compute(ensemble, *given)
+        matrix = self.gradient(ensemble.narrow(-1, self.begin, self.read_space.point_dim), reading)
+        return reading, nn.functional.pad(matrix, self._beside) if any(self._beside) else matrix
 
 
 class PoseOf(_Reading):
@@ -81,6 +96,10 @@ class PoseOf(_Reading):
     def observe(self, point):
         """The same point."""
         return point
+
+    def gradient(self, point, reading):
+        """The identity."""
+        return torch.eye(self.read_space.tangent_dim, dtype=point.dtype, device=point.device)
 
 
 class Magnetic(_Reading):
@@ -122,6 +141,11 @@ class Magnetic(_Reading):
     def observe(self, point):
         """The direction in the body's axes."""
         return rotate(_inverse(point), self.field)
+
+    def gradient(self, point, reading):
+        """A turn of the body turns the direction back."""
+        others = self.read_space.tangent_dim - 3
+        return nn.functional.pad(skew(reading), (0, others)) if others else skew(reading)
 
 
 class Gravity(Magnetic):
@@ -208,7 +232,7 @@ class PositionInBody(_Reading):
             _register_vectors(self, "landmark", landmark, [size], [len(landmark), size])
             count = self.landmark.numel() // size
         self.size, self.count = size, count
-        self.reading_space = self.space_of_reading(count)
+        self._of_readings(self.space_of_reading(count))
 
     def space_of_reading(self, count: int) -> Space:
         """The space of readings of so many landmarks."""
@@ -228,6 +252,18 @@ class PositionInBody(_Reading):
     def observe(self, point):
         """The landmarks that are known beforehand, one after the other."""
         return self.seen(point, self.landmark.reshape(-1, self.size)).flatten(-2)
+
+    def gradient(self, point, reading):
+        """A turn of the body turns landmarks back; they come nearer as it moves towards them."""
+        return self._by_pose(reading)
+
+    def _by_pose(self, seen: Tensor) -> Tensor:
+        """The Jacobian ``[*, N L, D]`` of landmarks that lie at ``seen`` ``[*, N L]``."""
+        seen = seen.unflatten(-1, (-1, self.size))
+        turn = skew(seen) if self.size == 3 else torch.stack([seen[..., 1], -seen[..., 0]], -1).unsqueeze(-1)
+        nearer = -torch.eye(self.size, dtype=seen.dtype, device=seen.device).expand(*seen.shape, self.size)
+        between = seen.new_zeros(*seen.shape, self.read_space.tangent_dim - turn.shape[-1] - self.size)
+        return torch.cat([turn, between, nearer], -1).flatten(-3, -2)
 
     def seen(self, point: Tensor, landmark: Tensor) -> Tensor:
         """The landmarks ``[*, L, N]`` in the body's axes."""
@@ -280,6 +316,15 @@ class RangeBearing(PositionInBody):
         away = torch.where(there, torch.ones_like(away), away)
         polar = torch.stack([torch.linalg.vector_norm(away, dim=-1), torch.atan2(away[..., 1], away[..., 0])], -1)
         return torch.where(there, torch.zeros_like(polar), polar)
+
+    def gradient(self, point, reading):
+        """That of range and bearing by where each landmark lies, times that of this."""
+        distance, angle = reading.unflatten(-1, (-1, 2)).unbind(-1)
+        ahead = torch.stack([angle.cos(), angle.sin()], -1)
+        across = torch.stack([-ahead[..., 1], ahead[..., 0]], -1) / torch.where(distance == 0, 1, distance)[..., None]
+        rows = torch.stack([ahead, across], -2) * (distance != 0)[..., None, None]
+        turned = self._by_pose((distance[..., None] * ahead).flatten(-2)).unflatten(-2, (-1, 2))
+        return (rows @ turned).flatten(-3, -2)
 
 
 def _inverse(pose: Tensor) -> Tensor:
