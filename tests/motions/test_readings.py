@@ -205,3 +205,13 @@ def test_a_robot_that_recognises_landmarks(float64):
         means.append(filter.sequence(data.clone())["belief", "mean"])
     assert_close(means[0], means[1])
     assert_close(means[0][-1], true, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("kind", [PositionInBody, RangeBearing])
+def test_the_jacobian_of_landmarks_that_stand_in_the_data(float64, kind):
+    """Against differences along the tangents of the pose."""
+    model, pose, posts = kind(SE2(), landmark_key="posts", count=2), torch.randn(1, 3), torch.randn(4)
+    _, matrix = model.jacobian(pose, posts)
+    steps = 1e-6 * torch.eye(3)
+    ahead, behind = (model.compute(SE2().plus(pose, sign * steps), posts) for sign in (1, -1))
+    assert_close(matrix[0], (ahead - behind).T / 2e-6, rtol=0, atol=1e-7)
