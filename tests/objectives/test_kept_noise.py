@@ -9,7 +9,13 @@ from torch import nn
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import RenameTransform, TransformedEnv
-from torchrl.modules import NormalParamExtractor, ProbabilisticActor, IndependentNormal, ValueOperator, set_recurrent_mode
+from torchrl.modules import (
+    IndependentNormal,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    ValueOperator,
+    set_recurrent_mode,
+)
 from torchrl.modules.utils import get_env_transforms_from_module
 from torchrl.objectives import A2CLoss, ClipPPOLoss
 
@@ -20,10 +26,10 @@ from torch_denkf.filters import EKF
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import (
     DiagonalNoise,
-    MomentPrior,
     GaussianPrior,
     LearnedObservation,
     LearnedTransition,
+    MomentPrior,
     StochasticMLP,
     VectorSensor,
 )
@@ -36,7 +42,7 @@ def stochastic_parts(rate=0.3):
 
 def toy_ekf(**options):
     transition, observation = stochastic_parts()
-    sensor = VectorSensor(M, OBS, ensemble_size=8, num_cells=(8,), rate=0.5, in_key="measurement")
+    sensor = VectorSensor(M, OBS, ensemble_size=8, num_cells=(8, 8), rate=0.5, in_key="measurement")
     start, noise = MomentPrior(torch.zeros(S), torch.eye(S)), DiagonalNoise(OBS, r=0.5, num_cells=(4,))
     return EKF(transition, sensor, observation, noise, process_noise=0.3, initial=start, **options)
 
@@ -193,6 +199,8 @@ def test_data_of_other_modules_are_filtered_with_new_draws(float64):
     """A filter without noise in its sensor reads data of one that has some."""
     policy = make_policy(toy_denkf())
     data = rollout(policy)
-    quiet = policy[0].with_modules(sensor=VectorSensor(M, OBS, ensemble_size=4, num_cells=(8,), layer="none", in_key="measurement"))
+    quiet = policy[0].with_modules(
+        sensor=VectorSensor(M, OBS, ensemble_size=4, num_cells=(8,), layer="none", in_key="measurement")
+    )
     with torch.no_grad(), set_recurrent_mode(True):
         assert quiet(data.copy())["belief", "mean"].isfinite().all()
