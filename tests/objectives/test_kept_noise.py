@@ -66,16 +66,17 @@ FILTERS = {
 every_filter = pytest.mark.parametrize("name", FILTERS)
 
 
-def make_policy(filter):
+def make_policy(filter, *between, key=None):
+    """The head reads the filter's mean, or what a module between both writes."""
     head = nn.Sequential(nn.Linear(S, 2 * A), NormalParamExtractor(scale_lb=0.05))
     actor = ProbabilisticActor(
-        TensorDictModule(head, [filter.outer(("belief", "mean"))], ["loc", "scale"]),
+        TensorDictModule(head, [key or filter.outer(("belief", "mean"))], ["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         return_log_prob=True,
         default_interaction_type="random",
     )
-    return ProbabilisticTensorDictSequential(filter, *actor)
+    return ProbabilisticTensorDictSequential(filter, *between, *actor)
 
 
 def world(*transforms, **options):

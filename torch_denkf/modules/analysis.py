@@ -148,6 +148,11 @@ class EnsembleAnalysis(EnsembleUpdate):
         size = predicted.shape[-1] if self.reading_space is None else self.reading_space.tangent_dim
         return {"members": forecast.shape[-2], "observation_dim": size}
 
+    def reading_dims(self, entries, call):
+        """Returns how many numbers the reading has; of samples, ``(E, O)``."""
+        dim, *others = super().reading_dims(entries, call)
+        return [(entries[self.in_keys[0]].shape[-2], dim) if self.scheme == "sensor" else dim, *others]
+
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
         center = None
