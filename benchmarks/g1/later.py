@@ -28,7 +28,7 @@ from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition,
 RATE, LEVEL = 30, 1.6449  # rows a second; of a normal distribution, the 90 % interval
 ENCODER = 0.1 * torch.pi / 180  # noise of the encoders, a standard deviation in rad
 FIRST = 15  # rows after which a filter is scored: it has forgotten its start
-FACTORS = (1.0, 1.5, 2.0)  # on the standard deviations of the motion's noise
+FACTORS = (1.0, 1.2, 1.4, 1.7, 2.0)  # on the standard deviations of the motion's noise
 MEMBERS = 64
 
 
