@@ -138,15 +138,18 @@ class BeliefAhead(Checked, TensorDictModuleBase):
             raise diagnosis().missing_entry("BeliefAhead", lacking, tensordict.keys(True, True), cure)
         wanted = self._wanted(tensordict)
         kept = tensordict.get(self.drawn_key, None) if recurrent_mode() and filter.keeps_noise else None
-        drawn = []
+        drawn: list[TensorDictBase] = []
         keys = [key for key in self.in_keys if key != self.drawn_key and tensordict.get(key, None) is not None]
         now = TensorDict({key: tensordict.get(key) for key in keys}, size, device=tensordict.device)
         filter.summarise(now)
-        beliefs = [now.select(*self.belief_keys).copy()]
+        beliefs = []
         with set_recurrent_mode(False):
             for k in range(self.steps):
                 self._drive(now, k, wanted)
-                noise = self._noise(now, size) if kept is None else kept[..., k]
+                if kept is None:
+                    noise = self._noise(now, size)
+                else:
+                    noise = kept.apply(lambda value, k=k: value.select(len(size), k), batch_size=size)
                 if noise is not None:
                     now.set(filter.outer("noise"), noise)
                     drawn.append(noise)
@@ -158,12 +161,12 @@ class BeliefAhead(Checked, TensorDictModuleBase):
                 now = later
         for key in self.belief_keys:
             if self.each:
-                value = torch.stack([belief.get(key) for belief in beliefs[1:]], len(size))
+                value = torch.stack([belief.get(key) for belief in beliefs], len(size))
             else:
                 value = now.get(key)
             tensordict.set(_later(key), value)
         if drawn and filter.keeps_noise and kept is None:
-            tensordict.set(self.drawn_key, torch.stack(drawn, len(size)).auto_batch_size_(len(size) + 1))
+            tensordict.set(self.drawn_key, TensorDict.maybe_dense_stack(drawn, len(size)))
         return tensordict
 
     def _wanted(self, tensordict: TensorDictBase) -> Tensor | None:
@@ -172,7 +175,7 @@ class BeliefAhead(Checked, TensorDictModuleBase):
             if self.dt_key is None:
                 return None
             like = tensordict.get(self.dt_key)
-            return torch.full_like(like, self.most / self.dt)
+            return torch.full_like(like, self.most / (self.dt or 1.0))
         wanted = tensordict.get(self.ahead_key)
         if bool((wanted > self.most * (1 + 1e-6)).any() | (wanted < 0).any()):
             raise ValueError(
@@ -192,7 +195,7 @@ class BeliefAhead(Checked, TensorDictModuleBase):
                 )
             for key in self.filter.structure.controls:
                 now.set(key, actions.select(now.ndim, k))
-        if self.dt_key is not None:
+        if self.dt_key is not None and self.dt is not None and wanted is not None:
             now.set(self.dt_key, self.dt * (wanted - k).clamp(0.0, 1.0))
 
     def _noise(self, now: TensorDictBase, size: torch.Size) -> TensorDictBase | None:

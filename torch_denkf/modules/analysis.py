@@ -150,8 +150,8 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     def reading_dims(self, entries, call):
         """Returns how many numbers the reading has; of samples, ``(E, O)``."""
-        dim, *others = super().reading_dims(entries, call)
-        return [(entries[self.in_keys[0]].shape[-2], dim) if self.scheme == "sensor" else dim, *others]
+        (dim, *others), forecast = super().reading_dims(entries, call), entries.get(self.in_keys[0])
+        return [dim if self.scheme != "sensor" or forecast is None else (forecast.shape[-2], dim), *others]
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
