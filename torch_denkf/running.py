@@ -84,9 +84,8 @@ def linearise(
     module: TensorDictModuleBase, entries: Entries, call: Call
 ) -> tuple[Entries, Tensor, tuple[Space, Space] | None] | None:
     """Returns what a module says of itself, see :meth:`SubModel.linearised`; ``None`` where only autograd knows."""
-    if not isinstance(module, SubModel) or type(module).forward is not SubModel.forward:
-        return None
-    if module._forward_hooks or module._forward_pre_hooks:
+    hooked = module._forward_hooks or module._forward_pre_hooks
+    if hooked or not isinstance(module, SubModel) or type(module).forward is not SubModel.forward:
         return None
     try:
         return module.linearised(entries, call)

@@ -116,8 +116,7 @@ class SubModel(Checked, TensorDictModule):
         cls._wants = frozenset({"noise", "batch_size"} & inspect.signature(cls.compute).parameters.keys())
         if vars(cls).keys().isdisjoint(_JACOBIANS) and not _COMPUTES.isdisjoint(vars(cls)):
             # What is inherited is that of another function.
-            for name in ("jacobian", "linearised"):
-                setattr(cls, name, getattr(SubModel, name))
+            cls.jacobian, cls.linearised = SubModel.jacobian, SubModel.linearised  # type: ignore[method-assign]
 
     def __init__(
         self,

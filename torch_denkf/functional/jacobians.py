@@ -12,11 +12,6 @@ from torch.nn import functional as F
 __all__ = ["jacobian_of_layers", "jacobian_of_network"]
 
 
-def _of_silu(layer: nn.Module, x: Tensor, y: Tensor) -> Tensor:
-    share = x.sigmoid()
-    return share + y * (1 - share)
-
-
 #: Derivatives of activations, from the layer, what it read and what it wrote.
 _SLOPES: dict[type, Callable[..., Tensor]] = {
     nn.ReLU: lambda layer, x, y: x > 0,
@@ -24,7 +19,7 @@ _SLOPES: dict[type, Callable[..., Tensor]] = {
     nn.ELU: lambda layer, x, y: torch.where(x > 0, 1.0, y + layer.alpha),
     nn.Tanh: lambda layer, x, y: 1 - y * y,
     nn.Sigmoid: lambda layer, x, y: y * (1 - y),
-    nn.SiLU: _of_silu,
+    nn.SiLU: lambda layer, x, y: y + (1 - y) * x.sigmoid(),
     nn.Softplus: lambda layer, x, y: torch.where(x * layer.beta > layer.threshold, 1.0, (x * layer.beta).sigmoid()),
 }
 
