@@ -21,7 +21,7 @@ _LOG = logging.getLogger("torch_denkf")
 
 
 def usual_folder() -> Path:
-    """Where the cache is, if nothing else is said: ``$TORCH_DENKF_CACHE``, or ``~/.cache/torch_denkf``."""
+    """Returns the default folder of the cache: ``$TORCH_DENKF_CACHE``, or ``~/.cache/torch_denkf``."""
     return Path(os.environ.get("TORCH_DENKF_CACHE") or Path.home() / ".cache" / "torch_denkf").expanduser()
 
 

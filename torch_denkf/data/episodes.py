@@ -44,7 +44,7 @@ class Episode:
 
     @property
     def split_name(self) -> str:
-        """What the hashes of splits are made of: episodes that share it are on the same side."""
+        """Returns the name that splits hash: episodes that share it are on the same side."""
         return self.name
 
 
@@ -65,7 +65,7 @@ def hashed_share(name: str, purpose: str) -> float:
 
 
 def hashed_tests(share: float) -> Callable[[Episode], bool]:
-    """Whether an episode is among the share of all that is for tests, by :func:`hashed_share`.
+    """Returns a predicate that selects a share of all episodes as test split, by :func:`hashed_share`.
 
     Raises:
         ValueError: if the share is out of range.
@@ -78,7 +78,7 @@ def hashed_tests(share: float) -> Callable[[Episode], bool]:
 def roles_of(
     episodes: Sequence[Any], for_tests: Callable[[Any], bool], validation_share: float
 ) -> list[Literal["train", "validation", "test"]]:
-    """What each episode is for; no other episode has a say in it, so that those added later move none.
+    """Assigns each episode to a split, independently of all others, so that those added later move none.
 
     Args:
         episodes: of the whole data set.

@@ -18,7 +18,7 @@ __all__ = ["ReplayOptions", "check_options"]
 
 
 class ReplayOptions(TypedDict, total=False):
-    """What every data set's constructor takes beside its source; see :class:`torch_denkf.data.EpisodeReplay`."""
+    """Arguments of every data set's constructor besides its source; see :class:`torch_denkf.data.EpisodeReplay`."""
 
     split: Split
     validation_share: float

@@ -94,7 +94,7 @@ def picture_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
 
 
 def is_bomb(data: bytes) -> bool:
-    r"""Whether a PNG's or a JPEG's header announces more than 10^8 pixels, which would be unpacked at once.
+    r"""Returns True if a PNG's or a JPEG's header announces more than 10^8 pixels, which would be unpacked at once.
 
     Examples:
         >>> is_bomb(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (30000).to_bytes(4) + (30000).to_bytes(4))
@@ -161,7 +161,7 @@ class JoinedPictures:
 
     @property
     def shape(self) -> torch.Size:
-        """Of all of them together."""
+        """Returns the shape of all of them together."""
         return torch.Size([int(self._ends[-1]), *self.stores[0].shape[1:]])
 
     def __getitem__(self, index: Tensor) -> Tensor:

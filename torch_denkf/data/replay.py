@@ -265,7 +265,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     @property
     def data_path_root(self) -> Path | None:
-        """The same: splits are no folders."""
+        """Returns the same folder: splits are no folders."""
         return self.root
 
     def delete(self) -> None:
@@ -309,7 +309,7 @@ class _AddPictures(Transform):
         self.pictures = pictures
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The same rows, with pictures."""
+        """Adds pictures to rows."""
         tensordict = tensordict.copy()  # data[:] hands out the storage itself
         row = tensordict.pop(ROW)
         if self.pictures is not None:

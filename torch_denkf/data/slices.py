@@ -63,7 +63,7 @@ class Slices(SampleUnit):
         self._sampler = sampler
 
     def expand(self, index: Any, info: dict[str, Any], storage: Any) -> tuple[Any, dict[str, Any]]:
-        """The same rows, and what the sampler says about each of them, in the shape of slices."""
+        """Reshapes rows to slices, with the sampler's information about each of them."""
         first = index[0] if isinstance(index, tuple) else index
         rows = len(first)
         ends = info.get(self._sampler.truncated_key)  # without replacement, the last sample may have fewer slices

@@ -61,7 +61,7 @@ def filled(times: np.ndarray, good: np.ndarray, step: float) -> np.ndarray:
 
 
 def increasing(times: np.ndarray) -> np.ndarray:
-    """Which values belong to the longest strictly increasing sub-sequence, bool ``[N]``.
+    """Masks the values of the longest strictly increasing sub-sequence, bool ``[N]``.
 
     One value that is too small, or too large, is the only one left out; a rule that compares with what came before
     would leave out all that follow a value that is too large. Where both leave out as many, it is the later ones,

@@ -1,4 +1,4 @@
-"""What transforms of frames share: keys, chance, resets, data, and pictures by the chunk."""
+"""Base of transforms of frames: keys, chance, resets, data, and pictures by the chunk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What simulated environments share: randomness of their own, on their device."""
+"""Base of simulated environments: a random generator of their own, on their device."""
 
 from __future__ import annotations
 

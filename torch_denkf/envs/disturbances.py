@@ -1,4 +1,4 @@
-"""What happens to a camera's pictures: dead and hot pixels, a lens out of focus, light, blackouts, dirt.
+"""Disturbances of a camera's pictures: dead and hot pixels, defocus, light, blackouts, dirt.
 
 The first two and the box are the robustness tests of the DEnKF paper's KITTI code, as shares of the picture instead of
 pixels of 1242 x 375, so that they fit any size. Pictures are ``[*B, C, H, W]``, uint8 in [0, 255] or floating in
@@ -261,7 +261,7 @@ class OccludingBox(ImageDisturbance):
         return torch.where(box, to_dtype(inside, frames), frames)
 
     def _side(self, axis: int, frames: Tensor) -> Tensor:
-        """Which rows, or columns, of each frame the box covers, ``[n, H]`` or ``[n, W]``."""
+        """Masks the rows, or columns, of each frame that the box covers, ``[n, H]`` or ``[n, W]``."""
         length, count = frames.shape[axis - 2], len(frames)
         side = round(self.size[axis] * length)
         if self.position is None:

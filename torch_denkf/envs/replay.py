@@ -34,7 +34,7 @@ class RecordedPolicy(TensorDictModuleBase):
     out_keys: ClassVar[list[NestedKey]] = ["action"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The same tensordict, with ``"action"``."""
+        """Adds ``"action"`` to the tensordict."""
         return tensordict.set("action", tensordict.get(_RECORDED).clone())
 
 

@@ -124,7 +124,7 @@ def message_rows(
 
 @dataclass(frozen=True)
 class _Stream:
-    """What a sensor said, in the order of its times ``[m]``: values ``[m, O]``, and noise of each, if it says so."""
+    """Messages of a sensor by time ``[m]``: values ``[m, O]``, and noise of each, if it reports one."""
 
     times: np.ndarray
     values: np.ndarray
@@ -146,7 +146,7 @@ class _Stream:
         return finite.kept(np.append(np.diff(finite.times) > 0, True))
 
     def events(self) -> np.ndarray:
-        """Of each message its time, and how many of the same sensor and time stand before it, ``[m, 2]``."""
+        """Returns, for each message, its time and the number of earlier ones of its sensor and time, ``[m, 2]``."""
         before = np.arange(len(self.times)) - np.searchsorted(self.times, self.times)
         return np.stack([self.times, before.astype(float)], 1)
 

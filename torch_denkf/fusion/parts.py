@@ -47,7 +47,7 @@ class Renamed(Wrapper, Sensor):
         self.marks = {names.get(made, made): names.get(key, key) for made, key in marks_of(module).items()}
 
     def on_entries(self, entries, call):
-        """What the module writes."""
+        """Returns the entries that the module writes."""
         inside = {key: value for key, value in entries.items() if key not in self.names}
         inside.update({key: entries[name] for key, name in self.names.items() if name in entries})
         written = self.run_inside(inside, call)

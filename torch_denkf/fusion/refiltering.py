@@ -33,7 +33,7 @@ class RefilteringWindow(NamedTuple):
 
     @property
     def belief(self) -> TensorDictBase:
-        """What the last step wrote."""
+        """Returns the belief of the last step."""
         return self.beliefs[-1]
 
 

@@ -45,7 +45,7 @@ class EnsembleAnalysisKeys(TypedDict, total=False):
 
 
 class EnsembleOptions(EnsembleAnalysisKeys, total=False):
-    """What every update of an ensemble takes beside its keys.
+    """Arguments of every ensemble update besides its keys.
 
     Attributes:
         inflation: factor on the analysis anomalies, where anything is observed; 1, by default, for none.

@@ -67,7 +67,7 @@ def sign_limits(values: Tensor, rate: float, floor: Tensor, margin: float) -> Te
 
 
 def _levels(count: int) -> Tensor:
-    """Those that so many values can tell, rising."""
+    """Returns the levels that a sample of this size resolves, ascending."""
     levels = torch.tensor(_LEVELS, dtype=torch.float64)
     return levels.clamp(max=1 - 1 / (count + 1)) + 1e-9 * torch.arange(len(levels))
 

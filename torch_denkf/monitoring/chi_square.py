@@ -110,7 +110,7 @@ def _double(value: float) -> Tensor:
 
 
 def _root(rises: Callable[[float], float]) -> float:
-    """Where a function that rises from below zero crosses it, for positive arguments."""
+    """Finds the root of a function that rises from below zero, for positive arguments."""
     low, high = 0.0, 1.0
     while rises(high) < 0:
         low, high = high, 2 * high

@@ -76,7 +76,7 @@ class Monitored(Filter):
 
     @property
     def monitor(self) -> InnovationMonitor:
-        """What watches."""
+        """Returns the monitor."""
         return self[self._place]
 
     def calibrate(self, clean: Sequence[TensorDictBase], **options) -> Monitored:
@@ -190,7 +190,7 @@ class Gated(Filter):
 
 
 def _with_past(part: torch.nn.Module) -> bool:
-    """Whether a module observes states of the past, or present and past as one."""
+    """Returns True if a module observes states of the past, or present and past as one."""
     return isinstance(part, StateObservation) and part.state_dim is not None
 
 
@@ -215,7 +215,7 @@ def _with(module: TensorDictModuleBase, old: SubModel, new: SubModel) -> TensorD
 
 
 def _dim(filter: Filter, analysis: Update) -> int:
-    """How many components an analysis' reading has."""
+    """Returns the size of an analysis' reading."""
     noise = set(map(unravel_key, analysis.reading_keys[1:]))
     for part in (part for _, module in filter.structure.modules for part in in_sequences(module)):
         dim = role(part, Sensor).observation_dim

@@ -29,7 +29,7 @@ _LARGEST_FACTOR = 1e6  # on variances, up or down: what adaptation may reach
 
 
 class GateOptions(TypedDict, total=False):
-    """What :class:`GatedAnalysis` takes beside the analysis.
+    """Arguments of :class:`GatedAnalysis` besides the analysis.
 
     Attributes:
         response: what happens to a reading that is not believed: ``"reject"`` takes it out, ``"student"`` and
@@ -63,7 +63,7 @@ class GateOptions(TypedDict, total=False):
 
 
 def can_be_gated(analysis: nn.Module) -> TypeGuard[Update]:
-    """Whether a module is an analysis that says where its forecast, its reading and its diagnostics are."""
+    """Returns True for an analysis with keys of forecast, reading and diagnostics."""
     if isinstance(analysis, Visible):
         return analysis.kind != "particles" and can_be_gated(analysis.module)
     wrapped = isinstance(analysis, Around) and not analysis.updates_ensemble
@@ -334,7 +334,7 @@ class GatedAnalysis(Around):
         return {**entries, key: wider.unflatten(-1, past.shape[-2:])}
 
     def _without(self, entries: Entries, call: Call, rejected: Tensor) -> Entries:
-        """What the analysis writes without what is rejected ``[*B, K]``."""
+        """Runs the analysis without the rejected readings ``[*B, K]``."""
         mask = entries.get(self.observed_key)
         kept = ~rejected if mask is None else mask & ~rejected
         return self._analyse({**entries, self.observed_key: kept}, call)

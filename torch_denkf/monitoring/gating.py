@@ -1,4 +1,4 @@
-"""How far a reading is believed, from its own and the last innovations."""
+"""Gating of a reading by its own and the last innovations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the past innovations of one sensor say together: their mean size, their drift, their memory."""
+"""Tests of one sensor's past innovations: mean size, drift, autocorrelation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["InnovationTests", "InnovationWindow", "innovation_tests", "interpola
 
 
 class InnovationWindow(NamedTuple):
-    """What is remembered of one sensor's innovations.
+    """Statistics of one sensor's past innovations.
 
     Attributes:
         terms: of the last W observed steps, the latest first, ``[*B, W, 4]``: normalised innovation squared, its
@@ -26,7 +26,7 @@ class InnovationWindow(NamedTuple):
 
 
 class InnovationTests(NamedTuple):
-    """What :func:`innovation_tests` returns, ``[*B, 1]`` each.
+    """Result of :func:`innovation_tests`, ``[*B, 1]`` each.
 
     Attributes:
         p_value: of the mean normalised innovation squared over the window, under its chi-square distribution.

@@ -37,7 +37,7 @@ _STATE = ("terms", "last", "cusum", "claim", "p_value", "whiteness", "evidence")
 
 
 class MonitoredSensor(NamedTuple):
-    """Where a sensor's innovations are.
+    """Keys of a sensor's innovations.
 
     Attributes:
         info_prefix: prefix of ``innovation`` ``[*B, O]`` and ``nis`` ``[*B, 1]``; where a filter has several analyses,
@@ -363,7 +363,7 @@ class InnovationMonitor(SubModel):
 
 
 def _logarithms(p_value: Tensor, limit: Tensor) -> Tensor:
-    """How many times the logarithm of a p-value is that of its limit."""
+    """Returns the ratio of the logarithms of a p-value and its limit."""
     least = torch.finfo(p_value.dtype).tiny
     return p_value.clamp_min(least).log() / limit.clamp_min(least).log()
 

@@ -105,7 +105,7 @@ class InertialMotion(Motion):
         return torch.cat([moved, gyro_bias, accelerometer_bias], -1)
 
     def noise_of_step(self, dt):
-        """Of orientation, velocity, position, the gyro's bias and the accelerometer's."""
+        """Returns the noise of orientation, velocity, position, the gyro's bias and the accelerometer's."""
         force = self.accelerometer_noise
         moved = walked(self.gyro_noise, dt) + walked(force, dt) + integrated(force, dt)
         return moved + walked(self.gyro_walk, dt) + walked(self.accelerometer_walk, dt)
@@ -159,7 +159,7 @@ class AttitudeMotion(Motion):
         return torch.cat([SO3().plus(orientation, (gyro - bias) * dt), bias], -1)
 
     def noise_of_step(self, dt):
-        """Of orientation and bias."""
+        """Returns the noise of orientation and bias."""
         return walked(self.gyro_noise, dt) + walked(self.gyro_walk, dt)
 
 

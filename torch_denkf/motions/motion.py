@@ -1,4 +1,4 @@
-"""What all known motions share."""
+"""Base of all known motions."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Motion(Transition):
 
     @property
     def process_noise(self) -> list[float] | SubModel:
-        """What a step adds, in the space's tangents: the noise to give to a filter.
+        """Returns the process noise of a step, in the space's tangents: the noise to give to a filter.
 
         Standard deviations ``[D]``; where the motion reads the length of each step, a module that writes the variances
         of that step.

@@ -74,6 +74,6 @@ class PlanarMotion(Motion):
         return torch.cat([SE2().plus(pose, arc), speed, kept * turn, errors], -1)
 
     def noise_of_step(self, dt):
-        """Of turn, ahead and sideways; of speed, turn rate, bias and scale."""
+        """Returns the noise of turn, ahead and sideways; of speed, turn rate, bias and scale."""
         ahead, turn = integrated(self.noises[:2], dt)
         return [turn, ahead, 0.0, *walked(self.noises, dt)]

@@ -1,4 +1,4 @@
-"""What sensors read of a pose: gravity, the magnetic field, the pose itself, landmarks."""
+"""Measurement models of a pose: gravity, the magnetic field, the pose itself, landmarks."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class _Reading(SubModel):
         self.begin = sum(each.point_dim for each in parts[:part])
 
     def observe(self, point: Tensor) -> Tensor:
-        """What is read of the part's points ``[*, P]``, ``[*, Q]``."""
+        """Returns the observation ``[*, Q]`` of the part's points ``[*, P]``."""
         raise NotImplementedError
 
     def compute(self, ensemble):
@@ -79,7 +79,7 @@ class PoseOf(_Reading):
         super().__init__(space, part, None, in_key, out_key)
 
     def observe(self, point):
-        """The same point."""
+        """Returns the point itself."""
         return point
 
 
@@ -125,7 +125,7 @@ class Magnetic(_Reading):
 
 
 class Gravity(Magnetic):
-    """What an accelerometer reads while the velocity is constant: specific force, upwards, in the body's axes.
+    """Observes specific force, upwards, in the body's axes: an accelerometer at constant velocity.
 
     Args:
         space: of the states.
@@ -159,7 +159,7 @@ class Gravity(Magnetic):
 
 
 class PositionInBody(_Reading):
-    r"""Where landmarks lie as seen from the body, :math:`R^\top (l - p)`: what a stereo camera or a lidar reads.
+    r"""Observes landmarks in the body's axes, :math:`R^\top (l - p)`: as a stereo camera or a lidar does.
 
     Args:
         space: of the states.
@@ -209,7 +209,7 @@ class PositionInBody(_Reading):
 
 
 class RangeBearing(PositionInBody):
-    """How far a landmark in the plane is, and by how much to the left of straight ahead.
+    """Observes range and bearing of a landmark in the plane; the bearing is positive to the left of straight ahead.
 
     The second number is an angle: the reading is a point of ``Product(Euclidean(1), Circle())``, ``reading_space``.
 

@@ -61,5 +61,5 @@ class ConstantTwist(Motion):
         return torch.cat([self.pose_space.plus(pose, twist * dt), twist], -1)
 
     def noise_of_step(self, dt):
-        """Of the pose, then of the twist."""
+        """Returns the noise of the pose, then of the twist."""
         return integrated(self.twist_noise, dt) + walked(self.twist_noise, dt)

@@ -136,7 +136,7 @@ def times_of(time: float | Tensor | None, steps: int) -> np.ndarray:
 
 
 def step_bounds(seconds: np.ndarray) -> np.ndarray:
-    """Where steps begin and end, half way between their times, ``[T+1]``."""
+    """Returns the borders of steps, half way between their times, ``[T+1]``."""
     if len(seconds) == 1:
         return np.array([seconds[0] - 0.5, seconds[0] + 0.5])
     middle = (seconds[1:] + seconds[:-1]) / 2

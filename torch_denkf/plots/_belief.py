@@ -1,4 +1,4 @@
-"""What the pictures read from a roll-out: belief, truth and which readings there were."""
+"""Belief, truth and observed masks of a roll-out, as plots read them."""
 
 from __future__ import annotations
 

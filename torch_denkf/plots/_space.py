@@ -62,7 +62,7 @@ def in_tangents(read: Belief, space: Space) -> Belief:
 
 
 def angles_of(space: Space) -> list[int]:
-    """Which of the D numbers are angles."""
+    """Returns the indices of the D numbers that are angles."""
     return [index for place in places_of(space) for index in range(place.rotation.start, place.rotation.stop)]
 
 

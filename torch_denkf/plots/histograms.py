@@ -1,4 +1,4 @@
-"""What the pictures of calibration show: histograms of ranks with their band, and errors over spread."""
+"""Plots of calibration: rank histograms with their band, and errors over spread."""
 
 from __future__ import annotations
 

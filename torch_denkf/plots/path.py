@@ -118,7 +118,7 @@ def plot_path(
 
 
 def _kind(read: Belief, spread: str, count: int) -> str:
-    """Which spread to draw."""
+    """Returns the kind of spread to draw."""
     if spread not in ("auto", "ensemble", "ellipses", "none"):
         raise ValueError(f'spread must be "auto", "ensemble", "ellipses" or "none"; got {spread!r}')
     if spread == "ensemble" and read.ensemble_size is None:

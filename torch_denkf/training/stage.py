@@ -137,7 +137,7 @@ class Stage:
         return optimiser, LambdaLR(optimiser, lambda update: 1.0)
 
     def settings(self, model: nn.Module) -> dict:
-        """What a checkpoint must agree with to be resumed; plain values."""
+        """Returns the settings that a checkpoint must share to be resumed; plain values."""
         names = {id(parameter): name for name, parameter in model.named_parameters()}
         schedule = self.schedule if isinstance(self.schedule, str) else getattr(self.schedule, "__qualname__", "custom")
         return {

@@ -38,7 +38,7 @@ class NamedSpan(NamedTuple):
 
 
 def path_options(tracked: TensorDictBase) -> dict[str, Any]:
-    """What :func:`torch_denkf.plots.plot_path` draws of a tracked drive."""
+    """Returns the arguments of :func:`torch_denkf.plots.plot_path` for a tracked drive."""
     return {"others": {"dead reckoning (last reading held)": tracked["dead_reckoning"]}, "forward_up": True}
 
 

@@ -205,7 +205,7 @@ class LeggedEnv(EnvBase):
         return {"imu": imu + self.bias + white, "joints": joints, "joint_rates": rates}
 
     def _forces(self) -> np.ndarray:
-        """What presses each foot, in N."""
+        """Returns the contact force of each foot, in N."""
         found, six = np.zeros(len(self.feet)), np.empty(6)
         bodies = self.model.geom_bodyid[self.data.contact.geom]  # [contacts, 2]
         for place, body in enumerate(self.feet):

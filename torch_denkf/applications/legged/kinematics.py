@@ -1,4 +1,4 @@
-"""Where the feet of a robot are, by the angles of its joints."""
+"""Forward kinematics of a robot's feet."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def _frame(model: mujoco.MjModel, argument: str, name: str) -> tuple[int, Tensor
 
 
 def _pose(model: mujoco.MjModel, body: int) -> Tensor:
-    """Of a body on its parent, before its joints move it."""
+    """Returns the pose of a body on its parent, before its joints move it."""
     return _point(model.body_quat[body], model.body_pos[body])
 
 

@@ -1,4 +1,4 @@
-"""How much each standing foot moves, as a network tells it by the last rows of what a legged robot reads."""
+"""Learned velocity of each standing foot: a network of the last rows of readings of a legged robot."""
 
 from __future__ import annotations
 
@@ -93,13 +93,13 @@ class LearnedContacts(Sensor):
         return blocks.flatten(-4, -3).flatten(-2), slip, mean.flatten(-2)
 
     def _moments(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Of each foot's velocity the mean ``[*B, F, 3]`` and the covariance ``[*B, F, 3, 3]``."""
+        """Returns mean ``[*B, F, 3]`` and covariance ``[*B, F, 3, 3]`` of each foot's velocity."""
         noise = self.module
         mean = self.mean((features - noise.loc) / noise.scale)
         return mean, noise.compute(features, batch_size=features.shape[:-1])
 
     def loss(self, log: TensorDictBase) -> Tensor:
-        """How unlikely the true velocities of the standing feet are, a scalar: their mean negative log-likelihood.
+        """Returns the mean negative log-likelihood of the true velocities of the standing feet, a scalar.
 
         Args:
             log: ``[*B]``, rows in any order, with the last rows and ``("true", "velocity")`` of the base ``[*B, 3]`` in
@@ -131,7 +131,7 @@ class LearnedContacts(Sensor):
     def features(
         self, imu: Tensor, joints: Tensor, rates: Tensor, contact: Tensor, *, rows: int | None = None
     ) -> Tensor:
-        """What the network reads of each foot, ``[*B, F, 16 K]``; ``rows`` in the place of K."""
+        """Returns the network's inputs for each foot, ``[*B, F, 16 K]``; ``rows`` in the place of K."""
         rows, kinematics = self.rows if rows is None else rows, self.kinematics
         like = kinematics.base
         sizes = 6, len(kinematics.joints), len(kinematics.joints), len(kinematics.feet)

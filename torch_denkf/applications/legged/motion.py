@@ -1,4 +1,4 @@
-"""How a legged robot moves, by an inertial sensor and by which feet stand."""
+"""Motion model of a legged robot, by an inertial sensor and foot contacts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["LeggedMotion", "LeggedMotionNoise", "LeggedSpace"]
 
 @dataclass(frozen=True)
 class LeggedSpace(Space):
-    """Where the states live: the inertial sensor's pose with its velocity, its biases, and the feet in the world.
+    """State space: the inertial sensor's pose with its velocity, its biases, and the feet in the world.
 
     A point has 16 + 3 F numbers: orientation (4), velocity in m/s and position in m (3 each), both in the world's axes;
     the gyro's bias in rad/s and the accelerometer's in m/s^2; then each foot's position in m.
@@ -60,15 +60,15 @@ class LeggedSpace(Space):
         return _in_order(self.in_groups.compose(_in_groups(first, 10), _in_groups(second, 10)), 10)
 
     def inverse(self, point):
-        """What undoes it."""
+        """Returns the inverse element."""
         return _in_order(self.in_groups.inverse(_in_groups(point, 10)), 10)
 
     def exp(self, tangent):
-        """Where a constant rate of all leads."""
+        """Returns the end of a step at a constant rate: the exponential map."""
         return _in_order(self.in_groups.exp(_in_groups(tangent, 9)), 10)
 
     def log(self, point):
-        """What leads there."""
+        """Returns the step that leads to a point: the inverse of :meth:`exp`."""
         return _in_order(self.in_groups.log(_in_groups(point, 10)), 9)
 
     def right_jacobian(self, tangent):
@@ -80,7 +80,7 @@ class LeggedSpace(Space):
         return _matrix_in_order(self.in_groups.adjoint(_in_groups(point, 10)))
 
     def basis(self, point):
-        """How points move by steps in the world's axes."""
+        """Returns the derivative of points by steps in the world's axes."""
         return _matrix_in_order(self.in_groups.basis(_in_groups(point, 10)), rows=10)
 
     def dual_basis(self, point):
@@ -173,7 +173,7 @@ class LeggedMotion(Motion):
 
 
 class LeggedMotionNoise(SubModel):
-    """What a step of :class:`LeggedMotion` adds, by which feet stand.
+    """Process noise of a step of :class:`LeggedMotion`, given the foot contacts.
 
     A foot that stands slips a little; one in the air is where its joints say but for their error.
 

@@ -1,4 +1,4 @@
-"""How wrong the sensors of a legged robot are, and how much a standing foot moves."""
+"""Noise of a legged robot's sensors, and of the velocity of a standing foot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the joints of a legged robot say: where its feet are, how fast, and how the robot stands at the start."""
+"""Observations from the joints of a legged robot: positions and velocities of its feet, and its first pose."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class LegReadings(SubModel):
 
 
 class FeetInBody(SubModel):
-    r"""Where the feet are in the inertial sensor's axes, :math:`R^\top (f_i - p)`, of forecast states.
+    r"""Observes the feet in the inertial sensor's axes, :math:`R^\top (f_i - p)`, of forecast states.
 
     Args:
         space: of the states, :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.
@@ -107,7 +107,7 @@ class FeetInBody(SubModel):
 
 
 class FeetRates(SubModel):
-    r"""How fast standing feet move in the sensor's axes, :math:`-R^\top v - (\omega - b) \times R^\top (f_i - p)`.
+    r"""Observes standing feet's velocities in sensor axes, :math:`-R^\top v - (\omega - b) \times R^\top (f_i - p)`.
 
     It is told by the joints' rates, and says the base's velocity at once.
 
@@ -141,6 +141,6 @@ class FeetRates(SubModel):
 
 
 def _feet(state: Tensor) -> Tensor:
-    """Of the feet in the sensor's axes, ``[*, F, 3]``."""
+    """Returns the feet in the sensor's axes, ``[*, F, 3]``."""
     away = state[..., 16:].unflatten(-1, (-1, 3)) - state[..., None, 7:10]
     return rotate(SO3().inverse(state[..., None, :4]), away)

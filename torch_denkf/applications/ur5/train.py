@@ -159,7 +159,7 @@ def _train_sensor(
 
 @torch.no_grad()
 def read_demos(model: UR5TableFilter, demos: TensorDict, seed: int = 0) -> TensorDict:
-    """What the sensor reads of whole demos ``[N, T]``: samples and encodings in the place of the pixels."""
+    """Runs the sensor on whole demos ``[N, T]``: samples and encodings in the place of the pixels."""
     parts = []
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -170,7 +170,7 @@ def read_demos(model: UR5TableFilter, demos: TensorDict, seed: int = 0) -> Tenso
 
 
 def behind_sensor(model: UR5TableFilter) -> Filter:
-    """The same filter for readings that the sensor has made before."""
+    """Returns this filter for precomputed readings of its sensor."""
     names = [name for name in model.module if name != "sensor"]
     parts = {name: model[name] for name in names}
     return Filter(parts, initial=model.initial, update_at_reset=model.update_at_reset)

@@ -37,7 +37,7 @@ _WIDTH = re.compile(r"0?\d{0,2}d?")
 
 @dataclass(frozen=True)
 class EpisodeFiles:
-    """Where one episode is.
+    """Files of one episode.
 
     Attributes:
         number: of the episode.

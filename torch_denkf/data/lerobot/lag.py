@@ -28,7 +28,7 @@ def lag_errors(
     components: int = 150,
     folds: int = 5,
 ) -> dict[int, float]:
-    """How well pictures predict the states that are recorded some rows later, for each of some lags.
+    """Returns the error of predicting, from pictures, states that are recorded some rows later, for each lag.
 
     The camera and the joints of a robot reach the recorder by different ways, and one may be later than the other. The
     lag is where the error is smallest: ``lag = min(errors, key=errors.get)``, which
@@ -97,7 +97,7 @@ def _small_pictures(data: LeRobotReplay, index: Tensor) -> Tensor:
 
 
 def _principal_components(pictures: Tensor, count: int) -> Tensor:
-    """Of variance one, ``[n, count or less]``."""
+    """Returns principal components with variance one, ``[n, count or less]``."""
     pictures = pictures - pictures.mean(0)
     count = min(count, len(pictures) // 2, pictures.shape[-1])
     values, vectors = torch.linalg.eigh((pictures.mT @ pictures).double() / len(pictures))

@@ -38,7 +38,7 @@ _FORMAT = 2  # part of the cache's key: raise it when what is stored changes
 
 @dataclass(frozen=True)
 class DecodedRecording:
-    """What :class:`torch_denkf.data.LeRobotReplay` replays.
+    """Decoded data set that :class:`torch_denkf.data.LeRobotReplay` replays.
 
     Attributes:
         rows: batch size ``[N]``, the rows of each episode one behind the other in time: ``image`` uint8 ``[N,3,H,W]``,

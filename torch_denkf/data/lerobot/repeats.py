@@ -19,7 +19,7 @@ REPEAT_THRESHOLD = 0.08
 def repeated_pictures(
     pictures: Tensor | JoinedPictures, shown: Tensor, first: Tensor, threshold: float = REPEAT_THRESHOLD
 ) -> Tensor:
-    """Which rows show the picture of the row before once more.
+    """Masks rows that repeat the picture of the row before.
 
     A recorder that writes more rows than its camera takes pictures repeats some. A video's codec changes a repeated
     picture a little, so that not only equal ones count. A repeat carries no news: a filter that takes it for a second

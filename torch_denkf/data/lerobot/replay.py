@@ -38,7 +38,7 @@ class LeRobotEpisode(Episode):
 
 
 def is_for_tests(number: int) -> bool:
-    """Whether an episode is the one of its five that is for tests; it does not depend on the others."""
+    """Returns True for the test episode among its five; it does not depend on the others."""
     block, place = divmod(number, _FOLD)
     return hashlib.sha256(f"torch_denkf {block}".encode()).digest()[0] % _FOLD == place
 

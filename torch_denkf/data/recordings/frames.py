@@ -34,7 +34,7 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 
 @dataclass(frozen=True)
 class Frames:
-    """What a camera's pictures have in common; take :class:`Video` or :class:`Images`.
+    """Base of a camera's pictures; take :class:`Video` or :class:`Images`.
 
     Args:
         file: the video, or the folder of images.
@@ -228,7 +228,7 @@ class Images(Frames):
 
 
 def _counted(source: Path, files: list[Path]) -> np.ndarray:
-    """How many pictures a camera of steady rate took before each: where names end in numbers, one may be missing."""
+    """Counts the frames of a camera of steady rate before each: where names end in numbers, one may be missing."""
     numbers = np.array([_number(file) or float((re.findall(r"\d+", file.stem) or "0")[-1]) for file in files])
     steps = np.diff(numbers)
     least = steps.min(initial=np.inf)

@@ -25,7 +25,7 @@ LARGEST = float(np.finfo(np.float32).max)
 
 
 class Readings(NamedTuple):
-    """What a table holds.
+    """Content of a table.
 
     Attributes:
         times: when they were taken, s, ascending, ``[n]``.
@@ -217,7 +217,7 @@ def _choose(file: Path, there: Sequence[str], time: str, columns: Sequence[str] 
 
 
 def _hint(there: Sequence[str], time: str, missing: Sequence[str]) -> str:
-    """What to do about columns that are not there."""
+    """Returns advice for columns that are missing."""
     if len(there) == 1 and set(missing) & set(re.split(r"[;\t |]+", there[0])):
         return "separate columns by commas, or by tabs in a .tsv"
     if there and all(map(_is_number, there)):

@@ -49,7 +49,7 @@ class Opposite(Space):
 
     @property
     def parts(self) -> Sequence[Space]:  # type: ignore[override]
-        """Those of the space, each with its steps on the other side."""
+        """Returns the parts of the space, each with its steps on the other side."""
         return tuple(part.flat or Opposite(part) for part in self.part.parts)
 
     @property

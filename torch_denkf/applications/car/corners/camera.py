@@ -69,7 +69,7 @@ class StereoCamera:
         return self.focal * seen / points[..., 2:] + torch.tensor([*self.center, 0.0]).to(points)
 
     def jacobian(self, points: Tensor) -> Tensor:
-        """Of :meth:`project`, ``[*, 3, 3]``."""
+        """Returns the Jacobian of :meth:`project`, ``[*, 3, 3]``."""
         over = self.focal / points[..., 2]
         x, y = points[..., 0] * over / points[..., 2], points[..., 1] * over / points[..., 2]
         zero, depth = torch.zeros_like(over), over * self.baseline / points[..., 2]
@@ -77,7 +77,7 @@ class StereoCamera:
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
     def jacobian_of_points(self, corners: Tensor) -> Tensor:
-        """Of :meth:`points`, ``[*, 3, 3]``."""
+        """Returns the Jacobian of :meth:`points`, ``[*, 3, 3]``."""
         points = self.points(corners)
         over = self.baseline / corners[..., 2]
         zero = torch.zeros_like(over)

@@ -24,7 +24,7 @@ LEAST = 0.03  # weight of a corner that is not wrong
 
 @dataclass(frozen=True)
 class CornerNoise:
-    """How far corners are off, in pixels: standard deviations.
+    """Standard deviations of corners, in pixels.
 
     Attributes:
         pixel: of a corner's place in the left image, between two rows.
@@ -72,7 +72,7 @@ class CornerNoise:
 
 
 class CornerMotion(NamedTuple):
-    """What :func:`corner_motion` returns.
+    """Result of :func:`corner_motion`.
 
     Attributes:
         motion: points of SE3 ``[*B, 7]``: the pose of the later row, seen from the earlier one.
@@ -240,7 +240,7 @@ def corner_motions(
 
 
 def _covariance(by_disparity: Tensor, flow2: Tensor, stays: Tensor | float, noise: CornerNoise) -> Tensor:
-    """Of what the later row shows, ``[*, 3, 3]``.
+    """Returns the covariance of the observations in the later row, ``[*, 3, 3]``.
 
     Args:
         by_disparity: by how much it changes with the disparity of the earlier row, ``[*, 3]``.

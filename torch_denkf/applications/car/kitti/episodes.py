@@ -1,4 +1,4 @@
-"""Which drives and cameras a data set of KITTI drives consists of, and how they are opened."""
+"""Episodes of a KITTI data set: one for each drive and camera, and opening them."""
 
 from __future__ import annotations
 

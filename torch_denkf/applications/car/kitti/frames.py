@@ -1,4 +1,4 @@
-"""What a network sees of a drive: frames with the difference to the frame before, the same for training and replay.
+"""Input frames of a network with the difference to the frame before, the same for training and replay.
 
 :class:`torch_denkf.applications.car.KITTIReplayEnv` and the training data both come from :func:`frames_at`.
 """

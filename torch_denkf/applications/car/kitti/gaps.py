@@ -73,7 +73,7 @@ def steps_between(valid: Tensor, longest: int) -> Tensor:
 
 
 def steps_at(drive: TensorDictBase, index: Tensor) -> Tensor:
-    """How many steps before each frame its pair begins, ``[*B, 1]``; 0 for none.
+    """Returns the number of steps between a frame and the first frame of its pair, ``[*B, 1]``; 0 for none.
 
     Without :func:`bridge_gaps` a pair is of neighbours.
     """

@@ -135,7 +135,7 @@ class KITTIOdometryExperienceReplay(EpisodeReplay):
         return {**super()._number_statistics(rows), "velocity": mean_and_std(rows["state"][:, 3:])}
 
     def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:
-        """Of frames over rows whose frame is there, and of differences over rows that are observed."""
+        """Returns statistics of frames over rows that have one, and of differences over observed rows."""
         if "image" not in self._drives[0]:
             return None
         copies = len(self._all_episodes) // len(self._drives)  # a mirror image has the same figures
@@ -152,7 +152,7 @@ class _Frames:
         self._starts = torch.tensor([episode.start for episode in episodes])
 
     def __call__(self, row: Tensor) -> dict[str, Tensor]:
-        """Of rows ``[m]`` of the whole data set."""
+        """Returns the pictures of rows ``[m]`` of the whole data set."""
         number = torch.searchsorted(self._starts, row, right=True) - 1
         out: dict[str, Tensor] = {}
         for episode in number.unique().tolist():
@@ -167,7 +167,7 @@ class _Frames:
 
 
 def _rows(drive: TensorDictBase, mirrored_width: int | None) -> TensorDict:
-    """What the buffer stores of an episode."""
+    """Returns the rows of an episode as the buffer stores them."""
     row = torch.arange(len(drive))
     rows = drive.select("state", "time", "dt", "frame", "calibration")
     if mirrored_width is not None:

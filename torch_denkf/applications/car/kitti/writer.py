@@ -56,11 +56,11 @@ class Job:
 
     @property
     def target(self) -> Path:
-        """Where the drive will be."""
+        """Returns the folder that the drive is written to."""
         return self.root / "sequences" / self.name
 
     def is_there(self, overwrite: bool) -> bool:
-        """Whether the drive is there already.
+        """Returns True if the drive exists already.
 
         Raises:
             FileExistsError: if another one is, which may not be replaced.

@@ -23,7 +23,7 @@ def step_lengths(path: Tensor) -> Tensor:
 
 
 def relative_pose_error(start: Tensor, end: Tensor, true_start: Tensor, true_end: Tensor) -> tuple[Tensor, Tensor]:
-    """How far two motions end from each other when they begin at the same pose.
+    """Returns the error of the relative pose: how far two motions end from each other if they begin at the same pose.
 
     Args:
         start: estimated poses (x m, y m, θ rad) where the motions begin, ``[*B, 3]``.

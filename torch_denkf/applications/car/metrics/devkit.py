@@ -15,7 +15,7 @@ __all__ = ["DevkitError", "kitti_devkit_error"]
 
 
 class DevkitError(NamedTuple):
-    """What :func:`kitti_devkit_error` returns; ``*B`` are the batch dims of the paths, L the number of lengths.
+    """Result of :func:`kitti_devkit_error`; ``*B`` are the batch dims of the paths, L the number of lengths.
 
     Attributes:
         translation: t_rel, mean over all segments of all lengths, in %, ``[*B]``.

@@ -22,7 +22,7 @@ __all__ = ["EndpointError", "dead_reckoning", "kitti_endpoint_error"]
 
 
 class EndpointError(NamedTuple):
-    """What :func:`kitti_endpoint_error` returns; ``*B`` are the batch dims of the paths, W the number of windows.
+    """Result of :func:`kitti_endpoint_error`; ``*B`` are the batch dims of the paths, W the number of windows.
 
     Attributes:
         translation: mean end point error over the windows that count, in m/m, ``[*B]``.

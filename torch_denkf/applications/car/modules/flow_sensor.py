@@ -106,7 +106,7 @@ class _MotionTrunk(nn.Module):
 
     @staticmethod
     def _corner_cues(two_view: torch.Tensor, turned: torch.Tensor, pitch: torch.Tensor) -> list[torch.Tensor]:
-        """How sure corners are of the turn and the pitch, and how far they agree with the flow; zeros without any."""
+        """Returns the confidence of corners in turn and pitch, and their agreement with the flow; zeros without."""
         left, *_, down, turn_std, pitch_std, inliers = two_view.unbind(1)
         seen = inliers > 0
         doubts = [(turn_std / _TURN_UNIT).clamp_min(1e-4).log() + 4, (pitch_std / _PITCH_UNIT).clamp_min(1e-4).log()]
@@ -220,7 +220,7 @@ class FlowSensor(StochasticSensor):
 
 
 def _grid(height: int, width: int) -> torch.Tensor:
-    """Where a cell lies: two channels from -1 to 1, ``[1, 2, height, width]``."""
+    """Returns the coordinates of cells: two channels from -1 to 1, ``[1, 2, height, width]``."""
     rows, columns = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
     return torch.stack([columns, rows]).unsqueeze(0)
 

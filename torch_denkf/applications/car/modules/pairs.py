@@ -62,7 +62,7 @@ def _same_velocities(ensemble_key: NestedKey, lags: int, belief: Entries, _: tor
 
 
 class PairObservation(SubModel):
-    r"""What a sensor reads from a pair of frames that are n steps apart: the velocities of all n, added up.
+    r"""Observation of a pair of frames n steps apart: the sum of the velocities of all n steps.
 
     .. math:: H x^i_t = h\Big(\sum_{k=0}^{n-1} (v, \dot\theta)^i_{t-k}\Big)
 
@@ -216,7 +216,7 @@ class ClonedTransition(Wrapper, Transition):
 
 
 def within_pair(steps: torch.Tensor | None, history: torch.Tensor) -> torch.Tensor:
-    """Which past steps lie between the two frames of a pair: ``[*B, 1, L, 1]``."""
+    """Returns a mask of the past steps between the two frames of a pair: ``[*B, 1, L, 1]``."""
     lags = torch.arange(1, history.shape[-2] + 1, device=history.device)
     steps = torch.ones(1, dtype=torch.int64, device=history.device) if steps is None else steps
     return (lags < steps)[..., None, :, None]

@@ -111,7 +111,7 @@ def track_failing_drive(
 
 
 def drive_scores(tracked: TensorDict, level: float = 0.9) -> dict[str, float]:
-    """What :func:`track_failing_drive` found, in numbers.
+    """Returns the scores of a result of :func:`track_failing_drive`.
 
     Returns:
         ``way_m``; ``filter_end_m`` and ``reckoned_end_m``, distances from the truth at the end, and ``filter_mean_m``

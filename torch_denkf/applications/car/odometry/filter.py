@@ -79,7 +79,7 @@ class CarSettings:
 
     @property
     def unit(self) -> Tensor:
-        """What counts as an error of one, in (m/s, rad/s): ``[2]``."""
+        """Returns the unit of the error, in (m/s, rad/s): ``[2]``."""
         return torch.tensor(self.velocity_std) * torch.tensor(_UNITS)
 
     @property
@@ -184,7 +184,7 @@ class CarFilter(Filter):
         return next(module for module in self.modules() if isinstance(module, EnsembleAnalysis))
 
     def without_sensor(self) -> Filter:
-        """The same filter for readings that the sensor has made before: it shares all parameters but the sensor's."""
+        """Returns this filter for precomputed readings of its sensor: it shares all parameters but the sensor's."""
         names = [name for name in self.module if name != "sensor"]
         return Filter(OrderedDict((name, self[name]) for name in names), initial=self.initial)
 

@@ -1,4 +1,4 @@
-"""What a car filter's training minimises, and what is measured on whole drives."""
+"""Loss of a car filter, and its scores on whole drives."""
 
 from __future__ import annotations
 

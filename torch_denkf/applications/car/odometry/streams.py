@@ -1,4 +1,4 @@
-"""What a car filter is trained and tested on: the flow of whole drives, and a frozen sensor's readings of them."""
+"""Training and test data of a car filter: the flow of whole drives, and a frozen sensor's readings of them."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def rows(data: TensorDict, index: Tensor, longest: int) -> TensorDict:
 
 
 def mirror(frames: TensorDict) -> TensorDict:
-    """What a mirrored world would have shown: sideways motion and turns change sign."""
+    """Mirrors frames: sideways motion and turns change sign."""
     mirrored = mirror_drive(frames)
     return mirrored.set("target_observation", frames["target_observation"] * torch.tensor([1.0, -1.0]))
 
@@ -168,7 +168,7 @@ def read_spans(sensor: FlowSensor, drives: Sequence[TensorDict], longest: int, *
 
 
 def take_spans(readings: TensorDict, steps: Tensor) -> TensorDict:
-    """Of readings of pairs of 1, 2, ... steps ``[*B]``, those of ``steps`` ``[*B]``; none where that is 0.
+    """Selects readings of pairs ``steps`` apart, ``[*B]``, from those of 1, 2, ... steps; missing where that is 0.
 
     Returns:
         A copy, as a filter without its sensor reads it: ``"observed"`` and ``"steps"`` ``[*B, 1]``, ``"sensor"``.
@@ -188,17 +188,17 @@ def take_spans(readings: TensorDict, steps: Tensor) -> TensorDict:
 
 
 def lose_frames(readings: TensorDict, seed: int, share: float = MISSING) -> TensorDict:
-    """What the sensor reads where some frames did not arrive: pairs of those that did."""
+    """Drops random frames: returns the sensor's readings of pairs of the remaining ones."""
     kept = torch.rand(len(readings), generator=torch.Generator().manual_seed(seed)) >= share
     return take_spans(readings, steps_between(kept, readings["spans"].shape[-1]))
 
 
 def shortest_spans(readings: TensorDict) -> TensorDict:
-    """What the sensor reads of the shortest pair that is observed, for each frame."""
+    """Returns the sensor's reading of the shortest observed pair, for each frame."""
     seen = readings["spans", "observed"].squeeze(-1)
     return take_spans(readings, torch.where(seen.any(-1), seen.int().argmax(-1) + 1, 0))
 
 
 def all_frames(readings: TensorDict) -> TensorDict:
-    """What the sensor reads of neighbours."""
+    """Returns the sensor's readings of neighbouring frames."""
     return take_spans(readings, torch.ones(len(readings), dtype=torch.int64))

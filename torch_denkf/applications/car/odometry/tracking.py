@@ -26,7 +26,7 @@ _EARLY = 0.25  # steps that a frame may come before its time
 
 
 class TrackedBelief(NamedTuple):
-    """What :func:`track` knows when a frame has been seen.
+    """Belief of :func:`track` after a frame.
 
     Attributes:
         frame: number of the frame among those given, from 0.

@@ -35,7 +35,7 @@ __all__ = ["Updates", "train_car_filter"]
 
 @dataclass(frozen=True)
 class Updates:
-    """How long each stage of the training is.
+    """Number of updates of each training stage.
 
     Attributes:
         sensor: updates of the sensor alone.

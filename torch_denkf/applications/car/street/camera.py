@@ -49,7 +49,7 @@ class Camera:
         return cls(size, focal * across, focal * down, cx * across - 0.5, cy * down - 0.5)
 
     def supersampled(self, down: int, across: int) -> Camera:
-        """The same camera with ``down`` x ``across`` pixels for each one."""
+        """Returns this camera with ``down`` x ``across`` pixels for each one."""
         return dataclasses.replace(
             self,
             size=(self.size[0] * down, self.size[1] * across),

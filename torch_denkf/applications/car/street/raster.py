@@ -30,7 +30,7 @@ def level(minification: float, levels: int) -> int:
 
 
 def hidden(pixels: np.ndarray, ahead: np.ndarray, solid: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Which things are outside the picture or wholly behind nearer solid ones.
+    """Masks things that are outside the picture or fully occluded by nearer solid ones.
 
     Args:
         pixels: of the feet and the heads of things on the ground, the nearest first, ``[n, 2, 4, 2]``.

@@ -164,7 +164,7 @@ class Renderer:
         picture[start:end][above] = sky[above]
 
     def _shown(self, region: tuple[int, int, int, int], depth: float) -> np.ndarray | None:
-        """Where no crest of the road hides what is at a depth, uint8; None for everywhere."""
+        """Masks pixels at a depth that no crest of the road occludes, uint8; None if none is occluded."""
         if not self._hides:
             return None
         x0, y0, x1, y1 = region

@@ -90,7 +90,7 @@ def _exposure(frames: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _first_visit(line: np.ndarray) -> np.ndarray:
-    """Where a line is at a place for the first time, and not within 6 m of another stretch."""
+    """Masks the points of a line at a place for the first time, and not within 6 m of another stretch."""
     # A pixel a metre keeps the number of the last point painted: painted backwards, the first one stays.
     low = line.min(0) - 8
     shape = np.ceil(line.max(0) - low + 8).astype(int) + 1
@@ -119,7 +119,7 @@ class _Roadside:
         return np.round((points - self.low) / self.cell * 16).astype(np.int32)
 
     def _take(self, corners: np.ndarray, distance: float) -> bool:
-        """Whether a footprint is clear of all roads and of what is there; if so it is taken."""
+        """Reserves a footprint if it is clear of all roads and things; returns True if it is."""
         x, z = np.round((corners - self.low) / self.cell).astype(int).T
         if x.min() < 0 or z.min() < 0 or x.max() >= self.taken.shape[1] or z.max() >= self.taken.shape[0]:
             return False

@@ -1,4 +1,4 @@
-"""What stands and moves in the world of a rendered drive, and the ground's picture from above.
+"""Static and moving things of a rendered drive, and the ground's picture from above.
 
 Everything is fixed in the world but the cars of ``Scene.traffic``, in KITTI's axes: x right, y down, z forward,
 metres. Places are (x, z): things stand on the ground, whose height :mod:`torch_denkf.applications.car.street.terrain`
@@ -70,7 +70,7 @@ class Mover:
 
 @dataclass
 class Scene:
-    """What there is in the world.
+    """Content of the rendered world.
 
     Attributes:
         road: the centre line of the road, (x, z) in m, ``[M, 2]``.

@@ -52,7 +52,7 @@ class CanonicalCamera:
         return round(2 * _HALF_HEIGHT * self.focal) + 1
 
     def view(self, image: np.ndarray, calibration) -> np.ndarray:
-        """What this camera sees of a real camera's image; what that has not seen repeats its border.
+        """Resamples a real camera's image for this camera; outside of it, the border is repeated.
 
         Args:
             image: ``[H, W]``, uint8.

@@ -27,7 +27,7 @@ _STEP = 1e-5  # of finite differences
 
 
 class TwoView(NamedTuple):
-    """How a camera moved between two frames.
+    """Motion of a camera between two frames.
 
     Attributes:
         turn: to the left, up and anticlockwise around the axis, in rad, ``[3]``.
@@ -68,7 +68,7 @@ def track_corners(
 
 
 def _track(previous: np.ndarray, current: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where corners ``[K, 1, 2]`` are in the other image, and whether they were found ``[K, 1]``."""
+    """Tracks corners ``[K, 1, 2]`` into the other image; returns positions and a mask of those found ``[K, 1]``."""
     moved, found, _ = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]  # cv2 does not say that None is to make
         previous, current, corners, None, winSize=_WINDOW, maxLevel=_LEVELS, criteria=(3, 30, 0.01)
     )

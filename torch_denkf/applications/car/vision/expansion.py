@@ -1,4 +1,4 @@
-"""Where a camera moves to: the point that a coarse optical flow expands from, and the turn between the two frames."""
+"""Focus of expansion of a coarse optical flow, and the turn between the two frames."""
 
 from __future__ import annotations
 

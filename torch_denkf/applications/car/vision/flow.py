@@ -57,7 +57,7 @@ def coarse_flow(flow: np.ndarray, previous: np.ndarray, current: np.ndarray, cam
 
 
 def median_turn(flow: np.ndarray) -> tuple[float, float]:
-    """How far the camera turned to the left and up: the median flow ahead, where things are too far off to approach.
+    """Returns the turn to the left and up: the median flow ahead, where things are too far off to approach.
 
     Args:
         flow: ``[H, W, 2]`` or coarser, in tangents.

@@ -62,5 +62,5 @@ def continue_flow(
 
 
 def grown(hidden: np.ndarray, rim: int) -> np.ndarray:
-    """What is hidden ``[H, W]``, bool, with a rim of so many pixels, as uint8."""
+    """Dilates the mask of occluded pixels ``[H, W]``, bool, by a rim of so many pixels; returns uint8."""
     return cv2.dilate(hidden.astype(np.uint8), np.ones((2 * rim + 1, 2 * rim + 1), np.uint8))

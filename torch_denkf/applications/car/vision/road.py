@@ -1,4 +1,4 @@
-"""How far the road moved: two images, laid flat on the ground, correlated along the direction of travel.
+"""Motion over the road: two images, projected on the ground, correlated along the direction of travel.
 
 Dense optical flow shrinks on the near road, where motion is large and texture is poor; yet there the ground plane ties
 pixels to metres. Each image is projected on the plane under the car, for several pitches of the camera, and the older
@@ -60,7 +60,7 @@ def road_correlation(
 
 @lru_cache(maxsize=256)
 def _nearest(camera: CanonicalCamera, pitch: float, height: float) -> float:
-    """Where the road enters the image, in m ahead."""
+    """Returns the distance at which the road enters the image, in m ahead."""
     bottom = (camera.height - 4) / 2 / camera.focal
     return max(height / np.tan(np.arctan(bottom) - pitch), _NEAREST)
 

@@ -309,7 +309,7 @@ def write_options(root: Path, options: dict) -> None:
 
 
 def read_options(root: Path) -> dict | None:
-    """What :func:`write_options` wrote, or None.
+    """Reads the result of :func:`write_options`, or returns None.
 
     Raises:
         ValueError: if the file is damaged.

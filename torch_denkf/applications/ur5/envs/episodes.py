@@ -24,7 +24,7 @@ DRAWS = 20  # episodes tried for a demo; the expert seldom fails
 
 @dataclass(frozen=True)
 class Options:
-    """What a demo follows from, besides its number."""
+    """Settings of a demo, besides its number."""
 
     size: tuple[int, int]
     frames: int | None

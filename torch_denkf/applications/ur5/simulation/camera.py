@@ -1,4 +1,4 @@
-"""What a camera makes of a picture: lens, motion blur and sensor noise."""
+"""Camera model: lens distortion, motion blur and sensor noise of a rendered picture."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["Camera", "distortion_map"]
 
 
 def distortion_map(size: tuple[int, int], k1: float, k2: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where each pixel of the distorted picture lies in the ideal one: x and y in pixels, ``[H, W]`` each.
+    """Maps each pixel of the distorted picture to the ideal one: x and y in pixels, ``[H, W]`` each.
 
     Brown's radial polynomial (1966) from the distorted to the ideal radius, ``r (1 - k1 r^2 - k2 r^4)``, which is the
     usual model's inverse to first order; r is one at the middle of the upper edge. Negative k1 is a barrel. The

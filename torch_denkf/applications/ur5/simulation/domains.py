@@ -1,4 +1,4 @@
-"""Where the UR5 stands: the simulator as it is, or a stand-in for a real laboratory."""
+"""Domains of the UR5: the simulator as it is, or a stand-in for a real laboratory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["DOMAINS", "Domain", "apply_domain", "light_of_episode"]
 
 @dataclass(frozen=True)
 class Domain:
-    """What the arm looks like and how it moves.
+    """Appearance and motion of the arm.
 
     Attributes:
         camera: position of the camera, m from the table's centre.

@@ -23,7 +23,7 @@ class Unreachable(ValueError):
 
 @dataclass
 class Waypoint:
-    """Where the pinch point goes next: m from the table's centre, quaternion, J7 in rad, control steps it takes."""
+    """Next pose of the pinch point: m from the table's centre, quaternion, J7 in rad, control steps it takes."""
 
     position: np.ndarray
     rotation: np.ndarray
