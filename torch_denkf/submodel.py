@@ -48,12 +48,12 @@ class Call(NamedTuple):
     raw: bool = False
 
     def part(self, name: str) -> Call:
-        """The call of a part of the module."""
+        """Returns the call of a part of the module."""
         return self._replace(place=name if self.place == "self" else f"{self.place}.{name}")
 
 
 def flat_noise(noise: Noise | TensorDictBase, *place: str) -> Entries:
-    """Noise as entries ``("noise", *place)``, or ``("noise", *place, name)`` where it is several tensors."""
+    """Returns noise as entries ``("noise", *place)``, or ``("noise", *place, name)`` where it is several tensors."""
     if noise is None:
         return {}
     if isinstance(noise, Tensor):
@@ -99,7 +99,7 @@ class SubModel(Checked, TensorDictModule):
 
         @property
         def noise_names(self) -> tuple[str, ...]:
-            """A tuple in the class, or a property."""
+            """Names the noise of a call: a tuple in the class, or a property."""
 
     else:
         noise_names = ()
@@ -166,7 +166,7 @@ class SubModel(Checked, TensorDictModule):
         return None
 
     def noise_sizes(self, *values: Any, **_: Any) -> dict[str, int]:
-        """The sizes that :meth:`draw_noise` needs, from the values that :meth:`compute` gets by position."""
+        """Returns the sizes that :meth:`draw_noise` needs, from the values that :meth:`compute` gets by position."""
         return {}
 
     def parts(self) -> dict[str, TensorDictModuleBase]:
@@ -202,7 +202,7 @@ class SubModel(Checked, TensorDictModule):
         return self.by_key(out)
 
     def values(self, entries: Entries) -> list[Any]:
-        """The entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
+        """Returns the entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
 
         Raises:
             KeyError: if an entry of ``in_keys`` is missing.
@@ -225,7 +225,7 @@ class SubModel(Checked, TensorDictModule):
         return dict(zip(self.out_keys, values, strict=True))
 
     def required(self, entries: Entries, key: NestedKey) -> Tensor:
-        """The entry ``key``.
+        """Returns the entry ``key``.
 
         Raises:
             KeyError: if it is missing; the message names it and lists what is there.

@@ -32,7 +32,7 @@ _SMOOTHED = ("ensemble", "mean", "var", "age")
 
 
 def with_smoothed(initial: TensorDictModuleBase, *, belief_prefix: str = "belief") -> AugmentedBelief:
-    """An initial belief that is also what is believed of the state before it.
+    """Returns an initial belief that is also the smoothed belief of the state before it.
 
     Args:
         initial: writes ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]`` under ``belief_prefix``.
@@ -132,11 +132,11 @@ class IteratedAnalysis(Rotated):
         self.reading_keys = self.in_keys[1:3]
 
     def parts(self):
-        """The transition, whose noise is looked for; the observation has none."""
+        """Returns the transition, whose noise is looked for; the observation has none."""
         return {"transition": self.module["transition"]}
 
     def on_entries(self, entries, call):
-        """The belief, the smoothed belief, and the diagnostics."""
+        """Returns the belief, the smoothed belief, and the diagnostics."""
         ensemble, reading, variance = (self.required(entries, key) for key in self.in_keys[:3])
         space, on = self.space, self.reading_space
         observed = told(on, entries.get(self.observed_key))
@@ -185,7 +185,7 @@ class IteratedAnalysis(Rotated):
         return dict(zip(self.out_keys, out, strict=True))
 
     def _motion_noise(self, entries: Entries, ensemble: torch.Tensor, call: Call) -> Entries:
-        """The noise of the members' motion, drawn once for all iterations."""
+        """Returns the noise of the members' motion, drawn once for all iterations."""
         noise: Entries = {}
         if not call.sample:
             return noise
@@ -197,7 +197,7 @@ class IteratedAnalysis(Rotated):
         return noise
 
     def _after(self, smoothed, observed, rotation) -> torch.Tensor:
-        """The smoothed members, inflated and rotated where anything was observed."""
+        """Returns the smoothed members, inflated and rotated where anything was observed."""
         changed = self.rotated(inflate(smoothed, self.inflation) if self.inflation != 1.0 else smoothed, rotation)
         return changed if observed is None else torch.where(observed.any(-1)[..., None, None], changed, smoothed)
 

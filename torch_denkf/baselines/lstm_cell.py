@@ -31,7 +31,7 @@ _MOST_LAYERS = 1000  # more are a slip, and would be built one by one until memo
 def with_memory(
     initial: TensorDictModuleBase, hidden_size: int, *, num_layers: int = 1, belief_prefix: str = "belief"
 ) -> AugmentedBelief:
-    """An initial belief with an empty memory: hidden and cell states of zero, as in ``torch.nn.LSTM``.
+    """Returns an initial belief with an empty memory: hidden and cell states of zero, as in ``torch.nn.LSTM``.
 
     Args:
         initial: the initial belief with a mean: :class:`MomentPrior`, :class:`GaussianAround`.
@@ -77,7 +77,7 @@ class LSTMTransition(Transition):
         super().__init__(nn.Identity(), in_keys, out_keys)
 
     def compute(self, *values):
-        """The forecast."""
+        """Returns the forecast."""
         return values
 
 
@@ -203,7 +203,7 @@ class LSTMUpdate(Update):
         return self.feature_sizes
 
     def compute(self, hidden, cell, *rest, batch_size):
-        """The memory and the belief."""
+        """Returns the memory and the belief."""
         *inputs, observed = rest
         features = self._features(inputs, observed, batch_size)
         # A cell takes one batch dimension; the tensordict may have none or many.

@@ -18,7 +18,7 @@ _OWN = {
 
 
 def commands() -> dict[str, tuple[str, str]]:
-    """By name: where the command is, and what it does; applications register theirs.
+    """Maps names of commands to their place and their purpose; applications register theirs.
 
     Example:
         >>> sorted(commands())[:2]
@@ -28,7 +28,7 @@ def commands() -> dict[str, tuple[str, str]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a sub-command.
+    """Runs a sub-command.
 
     Args:
         arguments: words of the command line; by default the process's own.

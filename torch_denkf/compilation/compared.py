@@ -114,7 +114,7 @@ def put_back(kept: Sequence[tuple[Tensor, Tensor]]) -> None:
 
 
 def tensors(value: Any) -> Iterator[Tensor]:
-    """The tensors in nested tuples and lists."""
+    """Yields the tensors in nested tuples and lists."""
     if isinstance(value, Tensor):
         yield value
     elif isinstance(value, tuple | list):
@@ -123,7 +123,7 @@ def tensors(value: Any) -> Iterator[Tensor]:
 
 
 def placed(like: Any, values: Iterator[Tensor]) -> Any:
-    """Tensors in place of those in nested tuples."""
+    """Returns tensors in place of those in nested tuples."""
     if isinstance(like, Tensor):
         return next(values)
     return tuple(placed(part, values) for part in like) if isinstance(like, tuple) else like
@@ -161,7 +161,7 @@ def _waves(value: Tensor) -> Tensor:
 
 
 def _telling(value: Tensor) -> Tensor:
-    """A frame that an update answers to, laid out as the given one; the given one if it is such a frame."""
+    """Returns a frame that an update answers to, laid out as the given one; the given one if it is such a frame."""
     if value.dtype == torch.bool:
         known, numbers = value, torch.ones_like(value)
     elif value.is_floating_point():
@@ -197,7 +197,7 @@ def _distance(one: Tensor, other: Tensor) -> Tensor:
 
 
 def _columns(value: Tensor) -> Tensor:
-    """The largest number in each column."""
+    """Returns the largest number in each column."""
     value = value.reshape(-1, value.shape[-1] if value.ndim and value.numel() else 1)
     return value.amax(0) if len(value) else value.new_zeros(1)
 
@@ -232,7 +232,7 @@ class _Precision(TorchDispatchMode):
 
 
 def _coarsest_rounding(run: Callable, *args: Any) -> float:
-    """The rounding of the coarsest numbers that are computed, such as those of a trunk in bfloat16."""
+    """Returns the rounding of the coarsest numbers that are computed, such as those of a trunk in bfloat16."""
     with _Precision() as mode:
         run(*args)
     products = 0.0 if torch.get_float32_matmul_precision() == "highest" else torch.finfo(torch.bfloat16).eps

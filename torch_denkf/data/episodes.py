@@ -49,7 +49,7 @@ class Episode:
 
 
 def hashed_share(name: str, purpose: str) -> float:
-    """A number in [0, 1) made of a name: those below a share are in it, and stay in it as the share grows.
+    """Returns a number in [0, 1) made of a name: those below a share are in it, and stay in it as the share grows.
 
     Args:
         name: of an episode.
@@ -137,7 +137,7 @@ def rows_of(episodes: Sequence[Episode]) -> Tensor:
 def select_episodes(
     rows: TensorDictBase, chosen: Sequence[Episode], single: Tensor | None
 ) -> tuple[TensorDict, tuple[Episode, ...]]:
-    """Rows of the chosen episodes with their flags and numbers, and these episodes with their new places.
+    """Returns rows of the chosen episodes with their flags and numbers, and these episodes with their new places.
 
     Args:
         rows: of the whole data set, ``[N]``.

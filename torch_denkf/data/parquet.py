@@ -15,7 +15,7 @@ MOST_BYTES, MOST_RATIO = 1 << 30, 64  # more than so many bytes may not be more 
 
 
 def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
-    """Columns of a parquet file, or all, as a pyarrow table.
+    """Returns columns of a parquet file, or all, as a pyarrow table.
 
     Raises:
         ImportError: without pyarrow.
@@ -42,7 +42,7 @@ def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
 
 
 def _refuse_bombs(file: Path, metadata: Any) -> None:
-    """Before anything is unpacked.
+    """Raises for decompression bombs, before anything is unpacked.
 
     Raises:
         ValueError: for a small file that announces a huge table.

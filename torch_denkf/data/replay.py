@@ -160,7 +160,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
             self.append_transform(transform)
 
     def draw(self, generator: torch.Generator, length: int | None = None) -> TensorDictBase:
-        """A sample whose randomness all comes from a generator: what a :class:`torch_denkf.training.Stage` asks for.
+        """Draws a sample with all randomness from a generator, as a :class:`torch_denkf.training.Stage` asks for.
 
         Args:
             generator: on the CPU; with the same state it draws the same rows.
@@ -205,7 +205,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     @property
     def _training_index(self) -> Tensor:
-        """Rows of the training episodes, numbered in the whole data set, ``[n]``."""
+        """Returns rows of the training episodes, numbered in the whole data set, ``[n]``."""
         training = [e for e, role in zip(self._all_episodes, self._roles, strict=True) if role == "train"]
         if not training:
             raise ValueError(f"none of the episodes {self._source} is in the training split; add episodes")
@@ -213,7 +213,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     @cached_property
     def statistics(self) -> TensorDict:
-        """Means and standard deviations over the **training** episodes, whichever split and rows this data set has.
+        """Returns means and standard deviations over the **training** episodes, whatever the split and rows.
 
         They standardise what a network reads and predicts, and tell it nothing about other episodes.
 
@@ -243,7 +243,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         return [key for name in self._numbers for key in (name, f"{name}_observed")]
 
     def _number_statistics(self, rows: TensorDictBase) -> dict[str, Any]:
-        """Statistics of numbers of the training rows."""
+        """Returns statistics of numbers of the training rows."""
         statistics = {}
         for key in self._numbers:
             if key in rows:
@@ -252,7 +252,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         return statistics
 
     def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:
-        """Statistics of the pixels of some rows of the whole data set; None without pictures."""
+        """Returns statistics of the pixels of some rows of the whole data set; None without pictures."""
         return None
 
     def _is_downloaded(self) -> bool:
@@ -260,7 +260,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     @property
     def data_path(self) -> Path | None:
-        """The folder that the data set reads; None for one that came from elsewhere."""
+        """Returns the folder that the data set reads; None for one that came from elsewhere."""
         return self.root
 
     @property
@@ -289,7 +289,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         super().__setstate__({**state, "_storage": storage})
 
     def preprocess(self, fn: Callable[[TensorDictBase], TensorDictBase], *args, **kwargs) -> TensorStorage:
-        """TorchRL's ``preprocess``: ``fn`` sees rows with their pixels, and what it returns is stored in ``dest``."""
+        """Runs TorchRL's ``preprocess``: ``fn`` gets rows with their pixels, and its result is stored in ``dest``."""
         return super().preprocess(partial(_then, self._add_pictures, fn), *args, **kwargs)
 
 

@@ -16,7 +16,7 @@ __all__ = ["Slices", "choose_sampler", "refuse_short_episodes", "slices_of"]
 
 
 def choose_sampler(options: Mapping[str, Any]) -> tuple[Sampler | None, int | None]:
-    """A sampler of slices of episodes, if a data set's options ask for them, or else theirs; and the batch size.
+    """Returns a sampler, of slices of episodes if a data set's options ask for them, and the batch size.
 
     Raises:
         ValueError: if ``sampler`` comes with ``num_slices`` or ``slice_len``, or these two contradict ``batch_size``.
@@ -81,7 +81,7 @@ class Slices(SampleUnit):
 
 
 def refuse_short_episodes(episodes: Sequence[Episode], sampler: Sampler | None, batch_size: int | None) -> None:
-    """TorchRL's samplers leave short episodes out without a word; here, that is a mistake.
+    """Raises for episodes that are too short; TorchRL's samplers leave them out without a warning.
 
     Raises:
         ValueError: if an episode is shorter than a slice.

@@ -19,7 +19,7 @@ NOT_DECODED = (
 
 
 def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Decode a video once and pair its frames with the times that are asked for.
+    """Decodes a video once and pairs its frames with the times that are asked for.
 
     By time and not by count: a damaged frame, which decoders leave out without a word, must not shift those after it.
 
@@ -56,7 +56,7 @@ def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator
 
 
 def decoded_frames(file: Path) -> Iterator[tuple[float, np.ndarray]]:
-    """All frames that can be decoded, in the order in which they are shown."""
+    """Yields all frames that can be decoded, in the order in which they are shown."""
     capture = cv2.VideoCapture(name_for_c(file), cv2.CAP_FFMPEG)
     try:
         # OpenCV's wheels leave AV1, LeRobot's default, to the hardware.

@@ -293,7 +293,7 @@ def _all_told(values: Mapping[NestedKey, Tensor], keys: list[NestedKey]) -> str:
 
 
 def _told(value: Tensor) -> str:
-    """A few numbers, or the largest of many."""
+    """Returns a few numbers, or the largest of many."""
     value = value.detach()
     if value.numel() <= 4:
         numbers = value.flatten().tolist()

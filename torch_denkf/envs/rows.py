@@ -43,7 +43,7 @@ class RowsEnv(Checked, EnvBase):
         raise NotImplementedError
 
     def _choose(self, starts: Tensor) -> tuple[Tensor, Tensor]:
-        """First and last rows ``[*B]`` of new stretches, for the elements that start one, ``[*B]`` bool."""
+        """Returns first and last rows ``[*B]`` of new stretches, for the elements that start one, ``[*B]`` bool."""
         raise NotImplementedError
 
     def _set_specs(self, row: Tensor, actions: int = 0, **specs: TensorSpec) -> None:

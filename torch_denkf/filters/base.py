@@ -177,12 +177,12 @@ class Filter(Checked, TensorDictSequential):
 
     @property
     def variance_ceiling(self) -> float | None:
-        """Ceiling of the belief's variances."""
+        """Returns the ceiling of the belief's variances."""
         return self.fixed_options["variance_ceiling"]
 
     @property
     def prefix(self) -> str | None:
-        """Name under which the filter's own entries stand."""
+        """Returns the name under which the filter's own entries stand."""
         return self.fixed_options["prefix"]
 
     def with_options(self, **options: Unpack[FilterOptions]) -> Filter:
@@ -254,17 +254,17 @@ class Filter(Checked, TensorDictSequential):
 
     @property
     def carry_keys(self) -> list[NestedKey]:
-        """The entries of the belief that go on from step to step."""
+        """Returns the entries of the belief that go on from step to step."""
         return [self.outer(key) for key in self.structure.carry]
 
     @property
     def belief_keys(self) -> list[NestedKey]:
-        """All entries of the belief: the carry, and what follows from it."""
+        """Returns all entries of the belief: the carry, and what follows from it."""
         return [self.outer(key) for key in self.structure.belief]
 
     @property
     def transition_module(self) -> TensorDictModuleBase:
-        """The module that forecasts the carry: the first that depends on the belief."""
+        """Returns the module that forecasts the carry: the first that depends on the belief."""
         return self.structure.transition[1]
 
     def outer(self, key: NestedKey) -> NestedKey:
@@ -278,7 +278,7 @@ class Filter(Checked, TensorDictSequential):
         return (self.prefix, *names) if own else key
 
     def inside(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """A shallow copy that holds the filter's own entries as they would be without a prefix."""
+        """Returns a shallow copy that holds the filter's own entries as they would be without a prefix."""
         out = tensordict.copy()
         return out if self.prefix is None else out.update(tensordict.get(self.prefix))
 
@@ -319,7 +319,7 @@ class Filter(Checked, TensorDictSequential):
         return primers().LastAction(actions, primers=found)
 
     def compile(self, *, chunk: int | None = None, **options) -> Filter:
-        """From now on runs steps, and sequences in chunks of steps, through ``torch.compile``.
+        """Runs steps, and sequences in chunks of steps, through ``torch.compile`` from now on.
 
         The first call of each kind (chunk, batch size, with or without gradients) compiles, later ones reuse that;
         copies and pickles of the filter compile again. Noise is drawn outside: a seed gives what it gives eagerly, up
@@ -423,7 +423,7 @@ class Filter(Checked, TensorDictSequential):
         return self.write(tensordict, self.finished(Record("step", tensordict, size, entries, written)))
 
     def predict(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
-        """A step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does.
+        """Runs a step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does.
 
         Raises:
             KeyError: if an analysis does not say which entries are its readings.
@@ -589,7 +589,7 @@ class Filter(Checked, TensorDictSequential):
         return self.finished(Record("sequence", tensordict, size, entries, outputs), given), rows
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:
-        """``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
+        """Returns ``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
         size = tensordict.batch_size
         marks = starts_of(tensordict, self.init_key)
         first = torch.zeros(size, dtype=torch.bool, device=device_of(tensordict))
@@ -601,7 +601,7 @@ class Filter(Checked, TensorDictSequential):
         return torch.ones_like(first) if known is None else known.reshape(size)
 
     def like(self) -> Tensor | None:
-        """A tensor of the filter's precision and device; ``None`` where it has no parameters or constants."""
+        """Returns a tensor of the filter's precision and device; ``None`` where it has no parameters or constants."""
         return next((p for p in chain(self.parameters(), self.buffers()) if p.is_floating_point()), None)
 
     def entries_of(self, tensordict: TensorDictBase, *, one_step: bool = False) -> Entries:

@@ -103,7 +103,7 @@ class DEnKF(Filter):
         initial: TensorDictModuleBase | None = None,
         **kwargs,
     ) -> DEnKF:
-        """The networks of the paper's Table I, on a standardised state and observation.
+        """Returns the networks of the paper's Table I, on a standardised state and observation.
 
         Args:
             state_dim: S.
@@ -146,7 +146,7 @@ class DEnKF(Filter):
         initial: TensorDictModuleBase | None = None,
         **kwargs,
     ) -> DEnKF:
-        """The layer kinds and widths of the authors' PyTorch code, which differ from Table I.
+        """Returns the layer kinds and widths of the authors' PyTorch code, which differ from Table I.
 
         Flipout layers of widths 64, 512, 256 in a residual transition; an observation model of widths 64, 128, 128,
         64; a sensor of three pooled convolutions, a 512-wide and a 64-wide flipout layer; a noise model of width 32

@@ -38,14 +38,14 @@ class Rows(NamedTuple):
 
     @property
     def fresh(self) -> Tensor:
-        """Elements that are reset, ``[*B, T, 1]``."""
+        """Masks elements that are reset, ``[*B, T, 1]``."""
         if self.begins.shape[-2] == self.size[-1]:
             return self.begins
         return _or_first(None, self.size, self.begins.device)
 
 
 def of_one_robot(name: str, like: Tensor | None, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
-    """A tensordict as it is; of a dictionary a new one, ``[]``, in the precision and on the device of ``like``."""
+    """Returns a tensordict as it is; of a dictionary a new one, ``[]``, in the dtype and on the device of ``like``."""
     if isinstance(tensordict, TensorDictBase):
         return tensordict
     if not isinstance(tensordict, Mapping):

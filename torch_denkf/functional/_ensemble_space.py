@@ -23,7 +23,7 @@ GPU_TILE_ELEMENTS = 2**28
 
 
 def solve_ensemble_space(gram: Tensor, right: Tensor, *, square_root: bool) -> tuple[Tensor, Tensor | None, Tensor]:
-    """Solve with I + YYᵀ, E x E.
+    """Solves with I + YYᵀ, E x E.
 
     YYᵀ maps the vector of ones to zero, and what is solved for is orthogonal to it. So its eigenvalue is
     free: at the mean of the diagonal, c, the matrix keeps its digits when R is tiny.

@@ -66,7 +66,7 @@ def analyse(
     significance: float | Tensor | None = None,
     space: Space = "auto",
 ) -> Analysis:
-    """Condition a forecast ensemble on an observation.
+    """Conditions a forecast ensemble on an observation.
 
     Members are rows. A are their deviations from the mean, HA those of their predictions, and W = HA R^-1/2 / √(E − 1).
     With the gain K = AᵀHA S⁻¹ / (E − 1) (eq. 11) and d = mean observation − mean prediction:
@@ -249,7 +249,7 @@ def _observation_space(
     square_root: bool,
     taper: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Solve with I + YᵀY, O x O.
+    """Solves with I + YᵀY, O x O.
 
     Returns:
         The increment of each member, ``[*B, E, S]`` or ``[*B, 1, S]``; the square root's anomalies,
@@ -276,7 +276,7 @@ def _one_after_the_other(
     taper: tuple[Tensor, Tensor] | None,
     significance: float | Tensor,
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Take in the components of the reading in their order, each as far as correlations with it are significant.
+    """Takes in the components of the reading in their order, each as far as correlations with it are significant.
 
     A component by itself needs no matrix, and no product of factors with a matrix, which might not be positive
     definite. What the members predict of the components behind it is moved like the state.
@@ -361,7 +361,7 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
 def _ensemble_space(
     reading: Whitened, anomalies: Tensor, acted_on: Tensor, *, square_root: bool
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Solve with I + YYᵀ, E x E; what it returns equals :func:`_observation_space`'s."""
+    """Solves with I + YYᵀ, E x E; what it returns equals :func:`_observation_space`'s."""
     y = reading.normalised
     weights, root, log_det = solve_ensemble_space(y @ y.mT, y @ acted_on.mT, square_root=square_root)
     mean_weights = weights.mean(-2, keepdim=True)

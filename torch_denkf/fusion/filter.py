@@ -189,7 +189,7 @@ def _refuse_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, j
 
 
 def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:
-    """L: what is given, or the largest delay."""
+    """Returns L: what is given, or the largest delay."""
     for name, sensor in sensors.items():
         check_count(f"delay of {name!r}", sensor.delay, least=0)
         if sensor.late_key is not None and sensor.delay < 1:
@@ -201,7 +201,7 @@ def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:
 
 
 def _with_errors(transition, process_noise, initial, sensors):
-    """Transition, process noise, initial belief and sensors of the state with the sensors' lasting errors behind it."""
+    """Augments the state of transition, process noise, initial belief and sensors by the sensors' biases."""
     given = [sensor.sensor_error for sensor in sensors.values() if sensor.sensor_error is not None]
     for error in given:
         check_kind("sensor_error", error)
@@ -246,7 +246,7 @@ def _check_motion(transition, process_noise, initial, gaussian):
 
 
 def _moving(transition, process_noise, initial, gaussian):
-    """The transition with its process noise."""
+    """Returns the transition with its process noise."""
     if process_noise is None:
         return transition
     noise, space = as_process_noise(process_noise, initial), role(initial, Initial).space

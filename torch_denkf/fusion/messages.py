@@ -28,7 +28,7 @@ def message_rows(
     origin: Mapping[str, Any] | None = None,
     dtype: torch.dtype | None = None,
 ) -> TensorDict:
-    """Rows ``[T]`` of a log in which sensors of different rates write when they like.
+    """Returns rows ``[T]`` of a log in which sensors of different rates write when they like.
 
     Each time at which a sensor has read is a row, and ``"dt"`` ``[T, 1]`` holds the seconds since the row before: the
     motion must read it. The first row is the start of the filter; no message stands there. A sensor that says two
@@ -131,15 +131,15 @@ class _Stream:
     noise: np.ndarray | None
 
     def kept(self, which: np.ndarray) -> _Stream:
-        """The messages at some places."""
+        """Returns the messages at some places."""
         return _Stream(self.times[which], self.values[which], None if self.noise is None else self.noise[which])
 
     def since(self, first: float) -> _Stream:
-        """The messages from a time on."""
+        """Returns the messages from a time on."""
         return self.kept(self.times >= first)
 
     def once(self, name: str) -> _Stream:
-        """The last message of each time, without those that are not finite."""
+        """Returns the last message of each time, without those that are not finite."""
         finite = self.kept(np.isfinite(self.values).all(1))
         if not len(finite.times):
             raise ValueError(f"{name!r} drives the motion and has no message that is finite.")
@@ -163,7 +163,7 @@ class _Stream:
         return found
 
     def means(self, times: np.ndarray) -> np.ndarray:
-        """Means between each of the ``times`` and the one before, on straight lines between the messages ``[T, O]``."""
+        """Returns means from each of the ``times`` before to the next, interpolating messages linearly ``[T, O]``."""
         now = np.stack([np.interp(times, self.times, column) for column in self.values.T], 1)
         knots = np.unique(np.concatenate([times, self.times]))
         on = np.stack([np.interp(knots, self.times, column) for column in self.values.T], 1)
@@ -216,7 +216,7 @@ def _look_at_silence(name: str, times: np.ndarray, others: np.ndarray) -> None:
 
 
 def _by_sensor(messages: Iterable[Sequence[Any]], unit: str) -> dict[str, _Stream]:
-    """The messages of each sensor, in the order of their stamps, s.
+    """Returns the messages of each sensor, in the order of their stamps, s.
 
     Raises:
         ValueError: see :func:`message_rows`.

@@ -68,7 +68,7 @@ class OfOwnErrors(Wrapper):
         self.own, self.total = list(own), total
 
     def on_entries(self, entries, call):
-        """The predicted observations."""
+        """Returns the predicted observations."""
         key = unravel_key(self.in_keys[0])
         system, errors = self.required(entries, key).tensor_split([-self.total], -1)
         state = torch.cat([system, errors[..., self.own]], -1)
@@ -93,7 +93,7 @@ class LinearMembers(SubModel):
         super().__init__(transition, keys, [("forecast", "ensemble")])
 
     def compute(self, ensemble, *action):
-        """The forecast."""
+        """Returns the forecast."""
         moved = ensemble @ self.module.matrix.mT
         return moved if not action else moved + (action[0].to(moved.dtype) @ self.module.control.mT).unsqueeze(-2)
 
@@ -170,7 +170,7 @@ class StateObservation(Wrapper, Update):
         self.reading_keys = list(map(unravel_key, reading_keys))
 
     def on_entries(self, entries, call):
-        """The predicted observations, and the mask."""
+        """Returns the predicted observations, and the mask."""
         states, written = self.required(entries, self.ensemble_key), {}
         if self.state_dim is not None:
             if self.past_key is None:
@@ -183,13 +183,13 @@ class StateObservation(Wrapper, Update):
         return {self.predicted_key: self.run_inside({**entries, key: states}, call)[out_key], **written}
 
     def seen(self, entries: Entries, call: Call) -> tuple[Tensor, Tensor | None]:
-        """The predicted observations ``[*B, E, O]``, and the mask of what is observed, if there is one."""
+        """Returns the predicted observations ``[*B, E, O]``, and the mask of what is observed, if there is one."""
         written = run_module(self, entries, call)
         mask = entries.get(self.observed_key) if self.state_dim is None else written[unravel_key(self.out_keys[1])]
         return written[self.predicted_key], mask
 
     def _of_its_time(self, whole: Tensor, entries) -> tuple[Tensor, Tensor]:
-        """The states ``[*B, E, S]`` that the reading belongs to, of ``[*B, E, L + 1, S]``, and the mask."""
+        """Returns the states ``[*B, E, S]`` that the reading belongs to, of ``[*B, E, L + 1, S]``, and the mask."""
         observed, age = entries.get(self.observed_key), entries.get(self.age_key)
         check_mask(str(self.observed_key), observed)
         if age is None:  # a call that learns shapes brings no age
@@ -234,11 +234,11 @@ class JoinedObservation(SubModel):
         self.spaces = list(spaces)
 
     def parts(self):
-        """The models."""
+        """Returns the models."""
         return dict(self.module.items())
 
     def on_entries(self, entries, call):
-        """The predicted observations, and the mask."""
+        """Returns the predicted observations, and the mask."""
         predicted, masks = [], []
         for (name, model), space in zip(self.module.items(), self.spaces, strict=True):
             values, seen = model.seen(entries, call.part(name))
@@ -284,7 +284,7 @@ class JoinedReading(Sensor):
         self.spaces = list(spaces)
 
     def compute(self, *values, batch_size):
-        """The readings and their noise."""
+        """Returns the readings and their noise."""
         count, size = len(self.spaces), len(batch_size)
         readings = [
             value if value.ndim == size + 1 else value.mean(-2) if space is None else space.mean(value)

@@ -102,7 +102,7 @@ class SensorAttention(nn.Module):
         self.score = nn.Sequential(first, nn.ELU(), last)
 
     def forward(self, innovations: Mapping[str, Tensor], observed: Tensor, features: Mapping[str, Tensor]) -> Tensor:
-        """The weights.
+        """Returns the weights.
 
         Args:
             innovations: of each sensor in standard deviations, ``[*B, O]``; 0 where not observed.
@@ -183,7 +183,7 @@ class SensorWeights(Sensor):
         self.spaces, self.moments, self.state_key = dict(spaces), moments, unravel_key(state_key)
 
     def on_entries(self, entries, call):
-        """The weights."""
+        """Returns the weights."""
         if self.moments is not None:
             mean, cov = (self.required(entries, (self.moments, name)) for name in ("mean", "cov"))
             size = next((model.state_dim for model in self.module["models"].values()), None)
@@ -232,12 +232,12 @@ class WeightedNoise(Sensor):
         self.observation_dim = observation_dim
 
     def compute(self, variance, weight):
-        """The larger noise."""
+        """Returns the larger noise."""
         return variance / (weight if variance.ndim == weight.ndim else weight.unsqueeze(-1))
 
 
 def _points(mean: Tensor, cov: Tensor, size: int) -> Tensor:
-    """Members ``[*B, 2 S, N S]`` of that mean, in which each of N states has its sample covariance.
+    """Returns members ``[*B, 2 S, N S]`` of that mean, in which each of N states has its sample covariance.
 
     How the states belong together is left out: each sensor observes one of them, and the covariance of all may be as
     good as singular.

@@ -85,7 +85,7 @@ class FadingBias(nn.Module):
     def from_residuals(
         cls, residuals: Tensor, *, trainable: bool = True, per_run: bool = False
     ) -> tuple[FadingBias, Tensor]:
-        r"""The biases that explain how long a sensor's errors last, and what is left: white noise.
+        r"""Returns the biases that explain how long a sensor's errors last, and what is left: white noise.
 
         The autocovariance of :math:`b + w` at lag k is :math:`\sigma^2 e^{-k / \tau}`, and at lag 0 it is more by the
         white variance. Size and time are those of the least squares over lags of one step and more, each lag counted
@@ -135,7 +135,7 @@ class FadingBias(nn.Module):
 
     @property
     def std(self) -> Tensor:
-        """Standard deviations in the long run ``[K]``: of the biases in an initial belief."""
+        """Returns standard deviations in the long run ``[K]``: of the biases in an initial belief."""
         return self.log_std.exp()
 
     @property
@@ -145,7 +145,7 @@ class FadingBias(nn.Module):
 
     @property
     def variance(self) -> Tensor:
-        """Variance of what is new in a step, ``[K]``: with it the biases stay as large as they are."""
+        """Returns the variance of what is new in a step, ``[K]``: with it the biases stay as large as they are."""
         return (2 * self.log_std).exp() * -torch.expm1(-2 * (-self.log_time).exp())
 
     def augmented(
@@ -247,7 +247,7 @@ class BiasedTransition(Wrapper, Transition):
         self.bias = bias
 
     def on_entries(self, entries, call):
-        """The forecast of both, and whatever else the transition writes."""
+        """Returns the forecast of both, and whatever else the transition writes."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, slow = _split(self.required(entries, key), self.bias, self)
         written = self.run_inside({**entries, key: state}, call)
@@ -277,7 +277,7 @@ class BiasedNoise(Wrapper):
         self.bias = bias
 
     def on_entries(self, entries, call):
-        """Q of both."""
+        """Returns Q of both."""
         out, key = self.run_inside(entries, call), unravel_key(self.out_keys[0])
         of_state, slow = out[key], self.bias.variance.to(out[key].dtype)
         if of_state.ndim == len(call.batch_size) + 1:
@@ -321,7 +321,7 @@ class BiasedObservation(Wrapper):
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
 
     def on_entries(self, entries, call):
-        """The predicted observations."""
+        """Returns the predicted observations."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, slow = _split(self.required(entries, key), self.bias, self)
         written = self.run_inside({**entries, key: state}, call)
@@ -366,7 +366,7 @@ class BiasedBelief(AroundInitial):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """The draws of an ensemble's biases."""
+        """Names the draws of an ensemble's biases."""
         return ("",) if any(map(is_samples, self.out_keys)) else ()
 
     def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
@@ -377,11 +377,11 @@ class BiasedBelief(AroundInitial):
         return torch.randn((*batch_size, members, len(self.bias)), device=device, dtype=dtype, generator=generator)
 
     def noise_sizes(self, ensemble, *_):
-        """E, from the ensemble of the state."""
+        """Returns E, from the ensemble of the state."""
         return {"members": ensemble.shape[-2]}
 
     def on_entries(self, entries, call):
-        """The belief of both."""
+        """Returns the belief of both."""
         written = dict(self.run_inside(entries, call))
         names = {key[-1]: key for key in map(unravel_key, self.out_keys)}
         std, size = self.bias.std, call.batch_size
@@ -405,7 +405,7 @@ class BiasedBelief(AroundInitial):
 
 
 def _autocovariance(values: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-    """Means of products of values ``[N, T]`` that lie 0, 1, ... steps apart, and how many there are."""
+    """Returns means of products of values ``[N, T]`` that lie 0, 1, ... steps apart, and how many there are."""
     values, steps = torch.where(known, values, 0), values.shape[1]
     products, counts = [], []
     for lag in range(min(steps, 1000)):
@@ -417,7 +417,7 @@ def _autocovariance(values: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _fit(covariance: Tensor, count: Tensor, component: int, per_run: bool) -> tuple[float, float, float, float]:
-    """Standard deviation and time of the fading part, standard deviations of the white and of a run's part."""
+    """Fits standard deviation and time of the fading part, standard deviations of the white and of a run's part."""
     if count[1] < 100:
         raise ValueError(f"component {component} has {int(count[1])} pairs of neighbouring residuals; it takes 100")
     longest = len(covariance)
@@ -447,7 +447,7 @@ def _fit(covariance: Tensor, count: Tensor, component: int, per_run: bool) -> tu
 
 
 def _split(state: Tensor, bias: FadingBias, module: nn.Module) -> tuple[Tensor, Tensor]:
-    """The system's part of a state, and the biases."""
+    """Returns the system's part of a state, and the biases."""
     count = len(bias)
     if state.shape[-1] <= count:
         raise ValueError(

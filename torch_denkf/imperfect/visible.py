@@ -88,7 +88,7 @@ class Visibility(Sensor):
         self.floor = floor
 
     def compute(self, encoding, observed=None, *, batch_size):
-        """The probability."""
+        """Returns the probability."""
         encoding = mean_of_members(encoding, batch_size)
         if observed is not None:
             encoding = torch.where(observed.any(-1, keepdim=True), encoding, 0)
@@ -160,7 +160,7 @@ class Visible(Around):
         self.kind, self.broad, self.visible_key = self_made, broad, unravel_key(visible_key)
 
     def on_entries(self, entries, call):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         if self.observed_key is not None:
             entries = self.with_mask(entries, call)
         mask = None if self.observed_key is None else entries.get(self.observed_key)
@@ -190,13 +190,13 @@ class Visible(Around):
         return {**out, **mixed, **{(self.info_prefix, name): value for name, value in told.items()}}
 
     def _moments(self, entries: Entries, out: Entries, share: Tensor) -> Entries:
-        """Mean, covariance and variances."""
+        """Returns mean, covariance and variances."""
         keys = self.module.out_keys[:3]
         mean, cov = mix_moments(share, out[keys[0]], out[keys[1]], *(entries[key] for key in self.module.in_keys[:2]))
         return dict(zip(keys, (mean, cov, cov.diagonal(dim1=-2, dim2=-1)), strict=True))
 
     def _members(self, entries: Entries, out: Entries, share: Tensor) -> Entries:
-        """Ensemble, mean and variances; a past, and a covariance, where the analysis writes them."""
+        """Returns ensemble, mean and variances; a past, and a covariance, where the analysis writes them."""
         analysis = self.module
         pairs = [(analysis.in_keys[0], analysis.out_keys[0])]
         pairs += [(key, key) for key in analysis.in_keys if key in analysis.out_keys]  # the past is corrected in place
@@ -232,7 +232,7 @@ class Visible(Around):
 
 
 def _like(seen: Tensor, value: Tensor) -> Tensor:
-    """A mask ``[*B, 1]`` with as many dimensions as a value ``[*B, ...]``."""
+    """Returns a mask ``[*B, 1]`` with as many dimensions as a value ``[*B, ...]``."""
     return seen.reshape(*seen.shape[:-1], *(1,) * (value.ndim - seen.ndim + 1))
 
 

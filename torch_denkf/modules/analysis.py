@@ -99,7 +99,7 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Perturbations or rotations, where the scheme needs any."""
+        """Returns perturbations or rotations, where the scheme needs any."""
         return ("",) if self.rotate or self.scheme == "perturbed" else ()
 
     def draw_noise(self, batch_size, *, members=None, observation_dim=None, generator=None, **where):
@@ -128,12 +128,12 @@ class EnsembleAnalysis(EnsembleUpdate):
         return exact_draws(noise, predicted, forecast) * ((size - 1) / size) ** 0.5
 
     def noise_sizes(self, forecast, predicted, *_):
-        """E and O, from the ensemble and its predicted observations."""
+        """Returns E and O, from the ensemble and its predicted observations."""
         size = predicted.shape[-1] if self.reading_space is None else self.reading_space.tangent_dim
         return {**super().noise_sizes(forecast), "observation_dim": size}
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         center = None
         if self.space is not None:
             center = self.space.near(forecast).unsqueeze(-2)
@@ -172,7 +172,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         return factor
 
     def move_past(self, past, predicted, observation, variance, observed=None, *, noise=None):
-        """See :meth:`Update.move_past`; neither inflation nor relaxation touches the past."""
+        """Overrides :meth:`Update.move_past`; neither inflation nor relaxation touches the past."""
         center = None
         if self.space is not None:
             center = self.space.near(past.movedim(-3, -2)).unsqueeze(-3)  # of each time

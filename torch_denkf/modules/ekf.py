@@ -123,7 +123,7 @@ def _linearise_on(
     space: Space,
     image_space: Space,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The image of a point ``[*B, P]``, and the Jacobian ``[*B, N, D]`` between the tangents of both."""
+    """Returns the image of a point ``[*B, P]``, and the Jacobian ``[*B, N, D]`` between the tangents of both."""
     image, jacobian, mask = _linearise(model, entries, call, mean, image_space.point_dim)
     space.check(point=mean)
     return image, image_space.dual_basis(image) @ jacobian @ space.basis(mean), mask
@@ -136,7 +136,7 @@ def _linearise(
     mean: Tensor,
     size: int,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Value and Jacobian at ``mean`` ``[*B, S]`` of a model of ensembles, in one call of it.
+    """Returns value and Jacobian at ``mean`` ``[*B, S]`` of a model of ensembles, in one call of it.
 
     The model runs on N copies of the batch, and one backward pass goes from the n-th output of the n-th copy. This
     takes a quarter of the time of torch.func's forward mode, whose Python formulas dominate in small systems, and

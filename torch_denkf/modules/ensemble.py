@@ -75,7 +75,7 @@ class Rotated(Update):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Rotations, where wanted."""
+        """Returns rotations, where wanted."""
         return ("",) if self.rotate else ()
 
     def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
@@ -85,7 +85,7 @@ class Rotated(Update):
         return random_rotation(members, tuple(batch_size), device=device, dtype=dtype, generator=generator)
 
     def noise_sizes(self, ensemble, *_):
-        """E, from the ensemble."""
+        """Returns E, from the ensemble."""
         return {"members": ensemble.shape[-2]}
 
     def rotated(self, ensemble: Tensor, rotation: Tensor | None) -> Tensor:
@@ -156,11 +156,11 @@ class EnsembleUpdate(Rotated):
 
     @property
     def significance(self) -> float | Tensor | None:
-        """The threshold of the localisation by significance; ``None`` without one."""
+        """Returns the threshold of the localisation by significance; ``None`` without one."""
         return None if self.localisation is None else self.threshold
 
     def on_entries(self, entries, call):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         return super().on_entries(entries if self.reading_space is None else self.aligned(entries), call)
 
     def aligned(self, entries: Entries) -> Entries:
@@ -178,5 +178,5 @@ class EnsembleUpdate(Rotated):
         return {**entries, **aligned, **({} if observed is None else {self.observed_key: observed})}
 
     def on_aligned(self, entries: Entries, call: Call) -> Entries:
-        """The belief and the diagnostics of entries as :meth:`aligned` gives them."""
+        """Returns the belief and the diagnostics of entries as :meth:`aligned` gives them."""
         return super().on_entries(entries, call)

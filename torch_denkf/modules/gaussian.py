@@ -77,11 +77,11 @@ class GaussianTransition(Transition):
         self.ensemble_key, self.forecast_ensemble_key = map(unravel_key, (ensemble_key, forecast_ensemble_key))
 
     def parts(self):
-        """The process noise; the transition is deterministic."""
+        """Returns the process noise; the transition is deterministic."""
         return {"process_noise": self.process_noise}
 
     def on_entries(self, entries, call):
-        """The forecast."""
+        """Returns the forecast."""
         return self.with_link(entries, call, wanted=False)[0]
 
     def with_link(self, entries: Entries, call: Call, *, wanted: bool = True) -> tuple[Entries, Sequence[torch.Tensor]]:
@@ -99,11 +99,11 @@ class GaussianTransition(Transition):
     def _forecast(
         self, entries: Entries, mean, cov, call: Call, wanted: bool
     ) -> tuple[torch.Tensor, torch.Tensor, Sequence[torch.Tensor] | None]:
-        """Mean and covariance before the process noise is added, and where wanted A, M and B."""
+        """Returns mean and covariance before the process noise is added, and where wanted A, M and B."""
         raise NotImplementedError
 
     def _move(self, entries: Entries, states: torch.Tensor, call: Call) -> torch.Tensor:
-        """The transition of an ensemble ``[*B, E, S]``."""
+        """Returns the transition of an ensemble ``[*B, E, S]``."""
         with deterministic(self.module):  # also of networks that do not know about calls
             return run_module(self.module, {**entries, self.ensemble_key: states}, call)[self.forecast_ensemble_key]
 
@@ -188,7 +188,7 @@ class GaussianAnalysis(Update):
         self.reading_keys, self.observed_key = self.in_keys[2:4], unravel_key(observed_key)
 
     def on_entries(self, entries, call):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         mean, cov, observation, noise = (self.required(entries, key) for key in self.in_keys[:4])
         if observation.ndim > mean.ndim:
             observation = mean_reading(self.reading_space, observation, entries.get(self.observed_key))
@@ -204,7 +204,7 @@ class GaussianAnalysis(Update):
         return observation - predicted if space is None else space.innovation(observation, predicted, observed)
 
     def _moved(self, mean: torch.Tensor, update: GaussianUpdate) -> GaussianUpdate:
-        """An update of the tangents at ``mean``, as a point and the covariance of the tangents there."""
+        """Returns an update of the tangents at ``mean``, as a point and the covariance of the tangents there."""
         if self.space is None:
             return update._replace(mean=mean + update.mean)
         cov = update.cov
@@ -215,7 +215,7 @@ class GaussianAnalysis(Update):
         return update._replace(mean=self.space.plus(mean, update.mean), cov=cov)
 
     def reading_dims(self, entries, call):
-        """O, as the model predicts it."""
+        """Returns O, as the model predicts it."""
         mean = self.required(entries, self.in_keys[0])
         size = self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[0].shape[-1]
         return [size, size if self.reading_space is None else self.reading_space.tangent_dim]
@@ -231,11 +231,11 @@ class GaussianAnalysis(Update):
     def _update(
         self, entries: Entries, mean, cov, observation, noise, call: Call
     ) -> tuple[GaussianUpdate, torch.Tensor | None]:
-        """The update, and the mask that it used."""
+        """Returns the update, and the mask that it used."""
         raise NotImplementedError
 
     def _observe(self, entries: Entries, states: torch.Tensor, call: Call) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Predicted observations ``[*B, E, O]`` of an ensemble, and the mask after the model ran."""
+        """Returns the predicted observations ``[*B, E, O]`` of an ensemble, and the mask after the model ran."""
         with deterministic(self.module):
             written = run_module(self.module, {**entries, self.ensemble_key: states}, call)
         given, made = entries.get(self.observed_key), written.get(self.observed_key)

@@ -72,7 +72,7 @@ class GaussianLikelihood(Update):
         self.predicted_key = self.in_keys[0]
 
     def compute(self, predicted, reading, variance, observed=None, *, batch_size):
-        """The log-likelihoods."""
+        """Returns the log-likelihoods."""
         if variance.ndim > len(batch_size) + 1:
             raise ValueError(
                 f"GaussianLikelihood takes variances [*B, O]; {self.in_keys[2]!r} has shape {list(variance.shape)}. "
@@ -203,7 +203,7 @@ class LearnedLikelihood(Update):
         return [self.encoding_dim, self.observation_dim][: len(self.reading_keys)]
 
     def compute(self, encoding, predicted, *rest, batch_size):
-        """The log-likelihoods."""
+        """Returns the log-likelihoods."""
         *readings, observed = rest
         encoding = mean_of_members(encoding, batch_size)
         if readings:

@@ -99,7 +99,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         period: torch.Tensor | list[float] | None = None,
         **kwargs,
     ) -> LocalEnsembleAnalysis:
-        """From places, with Gaspari & Cohn's taper.
+        """Builds the analysis from places, with Gaspari & Cohn's taper.
 
         Args:
             states: places of the components, ``[S, D]``, in any unit.
@@ -117,7 +117,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         return cls(neighbours(states, observations, radius, period=period), **kwargs)
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         observation = mean_of_members(observation, predicted.shape[:-2])
         ensemble = self._analyse(forecast, predicted, observation, variance, observed, noise, 1)
         if self.relaxation:
@@ -144,7 +144,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         return moved.unflatten(-1, past.shape[-2:])
 
     def _analyse(self, ensemble, predicted, observation, variance, observed, noise, copies: int) -> torch.Tensor:
-        """The analysis of ``copies`` states side by side, rotated."""
+        """Returns the analysis of ``copies`` states side by side, rotated."""
         index, taper = self.index, self.taper
         if copies > 1:
             index, taper = index.repeat(copies, 1), taper.repeat(copies, 1)
@@ -162,7 +162,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
 
 
 def _diagnostics(predicted, observation, variance, observed) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Innovation, its normalised square and its log-likelihood, each observation by itself."""
+    """Returns innovation, its normalised square and its log-likelihood, each observation by itself."""
     if observed is not None:  # before anything is computed, so that a NaN behind the mask spoils no gradient
         predicted = torch.where(observed.unsqueeze(-2), predicted, 0)
         observation, variance = torch.where(observed, observation, 0), torch.where(observed, variance, 1)

@@ -51,7 +51,7 @@ class LearnedObservation(MemberNetwork):
         return self.compute(state, noise=None)
 
     def compute(self, ensemble, *, noise):
-        """The predicted observations."""
+        """Returns the predicted observations."""
         if self.loc is not None:
             ensemble = ensemble - self.loc
         if self.scale is not None:
@@ -91,7 +91,7 @@ class Select(SubModel):
         return state.gather(-1, self.dims.expand(*state.shape[:-1], -1))
 
     def compute(self, ensemble):
-        """The predicted observations of all members."""
+        """Returns the predicted observations of all members."""
         return self.observe(ensemble)
 
 
@@ -125,5 +125,5 @@ class LinearObservation(SubModel):
         return product_of_known(self.matrix, state)
 
     def compute(self, ensemble):
-        """The predicted observations."""
+        """Returns the predicted observations."""
         return ensemble @ self.matrix.mT

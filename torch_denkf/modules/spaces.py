@@ -25,7 +25,7 @@ def mean_reading(space: Space | None, samples: Tensor, observed: Tensor | None) 
 
 
 def mean_and_tangents(space: Space, ensemble: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-    """The mean ``[*B, P]`` of members, and the tangents ``[*B, E, D]`` to them, by two steps from a point near it.
+    """Returns the mean ``[*B, P]`` of members and the tangents ``[*B, E, D]`` to them, by two steps from nearby.
 
     For members that an update has just placed about ``start`` ``[*B, P]``; wide ones need more, see :meth:`Space.mean`.
     """

@@ -27,7 +27,7 @@ __all__ = [
 
 
 def as_floating(value: Any, name: str = "the constant") -> Tensor:
-    """A floating tensor in memory of its own: a tensor keeps its precision, everything else gets torch's default one.
+    """Copies a value to a floating tensor: a tensor keeps its dtype, everything else gets torch's default one.
 
     Raises:
         TypeError: if it is neither a tensor nor numbers, or complex; ``name`` is the argument's.
@@ -109,7 +109,7 @@ def register_location_and_scale(
 
 
 def as_standard_deviations(name: str, value: Any) -> Tensor:
-    """Standard deviations ``[N]``, zero where there is none.
+    """Returns standard deviations ``[N]``, zero where there is none.
 
     Raises:
         ValueError: if they have another shape, or one is negative or not finite.
@@ -122,7 +122,7 @@ def as_standard_deviations(name: str, value: Any) -> Tensor:
 
 
 def as_vector(name: str, value: Any, size: int, *, above: float | None = None) -> Tensor:
-    """Finite numbers ``[size]``, of one number for all or one for each.
+    """Returns finite numbers ``[size]``, of one number for all or one for each.
 
     Raises:
         TypeError: if they are no numbers.
@@ -173,7 +173,7 @@ def variance_and_floor(
 
 
 def mask_of(observed_key: NestedKey, out_key: NestedKey) -> dict[NestedKey, NestedKey]:
-    """A mask that a module makes, and that of which it makes it, unravelled.
+    """Maps a mask that a module derives to the mask that it derives it from, unravelled.
 
     Raises:
         ValueError: if both have one key: what a step wrote would be taken for what was observed in the next.
@@ -187,5 +187,5 @@ def mask_of(observed_key: NestedKey, out_key: NestedKey) -> dict[NestedKey, Nest
 
 
 def mean_of_members(value: Tensor, batch_size: Sequence[int]) -> Tensor:
-    """The mean of ``[*B, E, N]`` over the members; ``[*B, N]`` as it is."""
+    """Returns the mean of ``[*B, E, N]`` over the members; ``[*B, N]`` as it is."""
     return value.mean(-2) if value.ndim > len(batch_size) + 1 else value

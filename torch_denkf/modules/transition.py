@@ -29,7 +29,7 @@ class MemberNetwork(SubModel):
         return self.module.draw_noise(batch_size, members, time=time, device=device, dtype=dtype, generator=generator)
 
     def noise_sizes(self, state, *_):
-        """E, from the ensemble."""
+        """Returns E, from the ensemble."""
         return {"members": state.shape[-2]}
 
     def _run(self, features: torch.Tensor, noise) -> torch.Tensor:
@@ -94,7 +94,7 @@ class LearnedTransition(MemberNetwork, Transition):
         register_location_and_scale(self, action_loc, action_scale, "action_")
 
     def compute(self, state, action=None, dt=None, *, noise):
-        """The forecast ensemble."""
+        """Returns the forecast ensemble."""
         if self.action_key is None:  # then what is read second is the length of the step
             action, dt = None, action
         features = state if self.loc is None else state - self.loc

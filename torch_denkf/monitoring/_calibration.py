@@ -15,7 +15,7 @@ IDENTITY = torch.arange(len(_LEVELS) + 2.0).repeat(2, 1)
 
 
 def check_observation_dim(expected: int, innovation: Tensor, name: str) -> None:
-    """Raise unless the innovations ``[*B, O]`` have as many components as ``name`` was told.
+    """Raises unless the innovations ``[*B, O]`` have as many components as ``name`` was told.
 
     Raises:
         ValueError: if they have not.
@@ -28,12 +28,12 @@ def check_observation_dim(expected: int, innovation: Tensor, name: str) -> None:
 
 
 def empirical_quantile(values: Tensor, levels: Tensor) -> Tensor:
-    """Order statistics of ``[M]`` at ``levels``; ``torch.quantile`` takes no more than 16 million."""
+    """Returns order statistics of ``[M]`` at ``levels``; ``torch.quantile`` takes no more than 16 million."""
     return values.sort().values[(levels * (len(values) - 1)).round().long()]
 
 
 def chi_square_table(nis: Tensor, freedom: int) -> Tensor:
-    """Knots and heights ``[2, N]`` from ``nis`` ``[M]`` of clean data to chi-square values; beyond, the ratio stays."""
+    """Returns knots and heights ``[2, N]`` from ``nis`` ``[M]`` of clean data to chi-square; linear beyond."""
     levels = _levels(len(nis))
     measured = _rising(empirical_quantile(nis, levels).clamp_min(1e-9))
     expected = torch.tensor([chi_square_quantile(1 - level, freedom) for level in levels.tolist()])
@@ -42,7 +42,7 @@ def chi_square_table(nis: Tensor, freedom: int) -> Tensor:
 
 
 def score_table(values: Tensor) -> Tensor:
-    """Knots and heights ``[2, N]`` that map ``values`` ``[M]`` of clean data to standard normal scores.
+    """Returns knots and heights ``[2, N]`` that map ``values`` ``[M]`` of clean data to standard normal scores.
 
     Beyond the largest a standard deviation of the data is a score of one.
     """
@@ -73,6 +73,6 @@ def _levels(count: int) -> Tensor:
 
 
 def _rising(values: Tensor) -> Tensor:
-    """With steps between equal ones that float32 can tell."""
+    """Separates equal values by steps that float32 can tell."""
     step = 1e-5 * values.abs().max().clamp_min(1e-9)
     return values.cummax(0).values + step * torch.arange(len(values))

@@ -49,7 +49,7 @@ class BlackIsMissing(Sensor):
         self.threshold, self.marks = threshold, mask_of(observed_key, out_key)
 
     def compute(self, pixels: Tensor, before: Tensor | None = None) -> Tensor:
-        """The mask ``[*B, 1]``."""
+        """Returns the mask ``[*B, 1]``."""
         white = 1.0 if pixels.is_floating_point() else 255
         seen = (pixels.flatten(-3).amax(-1, keepdim=True) / white) > self.threshold
         return seen if before is None else seen & before

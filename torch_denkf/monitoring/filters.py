@@ -169,7 +169,7 @@ class Gated(Filter):
 
     @property
     def gates(self) -> list[GatedAnalysis]:
-        """The gated analyses, in order."""
+        """Returns the gated analyses, in order."""
         return [module for module in self.modules() if isinstance(module, GatedAnalysis)]
 
     def calibrate(self, clean: Sequence[TensorDictBase], **options) -> Gated:
@@ -203,12 +203,12 @@ def _check_filter(name: str, filter: object) -> None:
 
 
 def _analyses(module: TensorDictModuleBase) -> Iterator[Update]:
-    """The analyses of a module of a filter that can be gated."""
+    """Yields the analyses of a module of a filter that can be gated."""
     yield from filter(can_be_gated, in_sequences(module))
 
 
 def _with(module: TensorDictModuleBase, old: SubModel, new: SubModel) -> TensorDictModuleBase:
-    """The module, or a plain sequence in which one module is replaced."""
+    """Returns the module, or a plain sequence in which one module is replaced."""
     if not is_sequence(module):
         return new if module is old else module
     return TensorDictSequential(OrderedDict((name, _with(part, old, new)) for name, part in named_modules_of(module)))
@@ -230,7 +230,7 @@ def _dim(filter: Filter, analysis: Update) -> int:
 
 
 def _with_state(initial: TensorDictModuleBase, owners: Sequence[InnovationMonitor | GatedAnalysis]) -> AugmentedBelief:
-    """An initial belief, and the entries that other modules carry on.
+    """Returns an initial belief, and the entries that other modules carry on.
 
     Args:
         initial: the initial belief.

@@ -205,7 +205,7 @@ class GatedAnalysis(Around):
         self.register_buffer("usual", torch.tensor([torch.inf, *usual]))
 
     def initial_state(self, batch_size: Sequence[int], *, device=None, dtype=None) -> list[Tensor]:
-        """The state before anything was observed, in the order of ``state_keys``."""
+        """Returns the state before anything was observed, in the order of ``state_keys``."""
         count = self.parts_count
         sizes = ((self.window, count, 2), (count,), (count,), (1,))
         return [torch.zeros(*batch_size, *size, device=device, dtype=dtype) for size in sizes]
@@ -213,7 +213,7 @@ class GatedAnalysis(Around):
     # ------------------------------------------------------------------------------------------------------ one step
 
     def on_entries(self, entries, call):
-        """The belief, the diagnostics and the state."""
+        """Returns the belief, the diagnostics and the state."""
         terms, shut, log_noise, log_inflation = (self.required(entries, key) for key in self.state_keys)
         plain = self.with_mask(self._with_noise(entries, call), call)
         if self.of_ensemble:
@@ -277,7 +277,7 @@ class GatedAnalysis(Around):
         return (self.module.on_aligned if self.of_ensemble else self.module.on_entries)(entries, call)
 
     def _with_noise(self, entries: Entries, call: Call) -> Entries:
-        """The entries with the random numbers that both runs share, and the variances that a Kalman analysis holds."""
+        """Returns the entries with the random numbers that both runs share, and variances of a Kalman analysis."""
         entries = dict(entries)
         if self.claimed is not None:
             mean = self.required(entries, self.in_keys[0])
@@ -289,7 +289,7 @@ class GatedAnalysis(Around):
         return entries
 
     def _parts(self, entries: Entries, nis: Tensor, innovation: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised innovations squared ``[*B, K]``, and how many components were observed in each."""
+        """Returns normalised innovations squared ``[*B, K]``, and how many components were observed in each."""
         mask = entries.get(self.observed_key)
         observed = torch.ones_like(innovation) if mask is None else mask.expand(innovation.shape).to(nis.dtype)
         if isinstance(self.module, Visible):  # what is not about the state says nothing about the sensor
@@ -304,14 +304,14 @@ class GatedAnalysis(Around):
         return torch.where(seen, innovation.square() / spread, 0), observed
 
     def _noisier(self, entries: Entries, factor: Tensor) -> Entries:
-        """The entries with variances ``[*B, O]`` or a covariance ``[*B, O, O]`` times a factor ``[*B, K]``."""
+        """Returns the entries with variances ``[*B, O]`` or a covariance ``[*B, O, O]`` times a factor ``[*B, K]``."""
         noise = self.required(entries, self.noise_variance_key)
         if noise.ndim > factor.ndim:
             factor = factor.unsqueeze(-1)
         return {**entries, self.noise_variance_key: noise * factor}
 
     def _wider(self, entries: Entries, factor: Tensor) -> Entries:
-        """The entries with the forecast's covariance times a factor ``[*B, 1]``."""
+        """Returns the entries with the forecast's covariance times a factor ``[*B, 1]``."""
         if not self.of_ensemble:
             key = self.module.in_keys[1]
             return {**entries, key: entries[key] * factor.unsqueeze(-1)}
@@ -321,7 +321,7 @@ class GatedAnalysis(Around):
         return {**entries, **wider}
 
     def _with_past(self, entries: Entries, factor: Tensor) -> Entries:
-        """The entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
+        """Returns the entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
         inside = self.module.module if isinstance(self.module, Visible) else self.module
         if not isinstance(inside, LaggedAnalysis):
             return entries
@@ -377,7 +377,7 @@ class GatedAnalysis(Around):
 
 
 def _with_noise_from(key: NestedKey, analysis: KalmanAnalysis) -> KalmanAnalysis:
-    """A Kalman analysis that shares the matrix of another, and reads the noise that the other holds."""
+    """Returns a Kalman analysis that shares the matrix of another, and reads the noise that the other holds."""
     keys = analysis.in_keys
     changed = KalmanAnalysis(
         analysis.matrix.detach(),

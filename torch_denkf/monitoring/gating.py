@@ -15,7 +15,7 @@ Response = Literal["reject", "student", "huber"]
 
 
 def disbelief(evidence: Tensor, limit: Tensor, response: Response, *, freedom: float = 4.0) -> Tensor:
-    r"""Factor on a reading's variances: 1 up to the limit, and from there on the larger, the less it is believed.
+    r"""Returns the factor on a reading's variances: 1 up to the limit, and growing with the evidence from there on.
 
     ============== ===================================== =============================================================
     response       beyond the limit l                    so that an outlier's pull
@@ -48,7 +48,7 @@ def disbelief(evidence: Tensor, limit: Tensor, response: Response, *, freedom: f
 
 
 def adapt(log_factor: Tensor, nis: Tensor, freedom: Tensor, rate: float, *, largest: float = 9.0) -> Tensor:
-    r"""One step of stochastic approximation: a factor on a variance grows while innovations are too large.
+    r"""Runs one step of stochastic approximation: a factor on a variance grows while innovations are too large.
 
     :math:`\log \alpha \leftarrow \log \alpha + \eta (\mathrm{nis} / O - 1)` rests where the normalised innovation
     squared has its expected mean O (Robbins & Monro 1951), which it has with the true variance.
@@ -69,7 +69,7 @@ def adapt(log_factor: Tensor, nis: Tensor, freedom: Tensor, rate: float, *, larg
 
 
 def spread_about_mean(members: Tensor, factor: Tensor, space: Space | None = None) -> Tensor:
-    """Members ``[*B, E, N]``, their distances from the mean times ``factor`` ``[*B, 1]``; bit-equal for 1."""
+    """Returns members ``[*B, E, N]``, their distances from the mean times ``factor`` ``[*B, 1]``; bit-equal for 1."""
     factor = factor.unsqueeze(-2)
     if space is not None:
         center = space.mean(members).unsqueeze(-2)

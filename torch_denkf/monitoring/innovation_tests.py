@@ -38,7 +38,7 @@ class InnovationTests(NamedTuple):
 
 
 def interpolate(value: Tensor, knots: Tensor, heights: Tensor) -> Tensor:
-    """Linear between knots, and beyond them as between the two nearest.
+    """Interpolates linearly between knots, and extrapolates beyond them from the two nearest.
 
     Args:
         value: any shape ``[*]``.
@@ -56,14 +56,14 @@ def interpolate(value: Tensor, knots: Tensor, heights: Tensor) -> Tensor:
 
 
 def _at(table: Tensor, index: Tensor) -> Tensor:
-    """Entries of ``[N]`` or ``[K, N]`` at ``[*, 1]`` or ``[*, K, 1]``."""
+    """Returns entries of ``[N]`` or ``[K, N]`` at ``[*, 1]`` or ``[*, K, 1]``."""
     return table.expand(*index.shape[:-1], table.shape[-1]).gather(-1, index).squeeze(-1)
 
 
 def observe(
     window: InnovationWindow, nis: Tensor, innovation: Tensor, freedom: Tensor, scale: Tensor | float = 1.0
 ) -> InnovationWindow:
-    """The window after one more step; as it was where nothing is observed.
+    """Returns the window after one more step; as it was where nothing is observed.
 
     The direction of a normalised innovation is that of the innovation in units of ``scale``, its length is the root of
     ``nis``. With one component that is exact, whatever the scale.
@@ -89,7 +89,7 @@ def observe(
 
 
 def innovation_tests(window: InnovationWindow) -> InnovationTests:
-    """P-values of a window's innovations; 1 where nothing was observed yet.
+    """Returns p-values of a window's innovations; 1 where nothing was observed yet.
 
     Example:
         >>> terms = torch.tensor([[3.0, 2.0, 0.0, 0.0], [5.0, 2.0, 2.8, 2.0]])  # 8 with 4 degrees of freedom

@@ -98,7 +98,7 @@ class InertialMotion(Motion):
         self.accelerometer_walk = densities("accelerometer_walk", accelerometer_walk, 3)
 
     def move(self, state, *readings, dt):
-        """The state moved by the readings without their biases."""
+        """Returns the state moved by the readings without their biases."""
         gyro, accelerometer = readings if len(readings) == 2 else readings[0].split(3, -1)
         pose, gyro_bias, accelerometer_bias = self.space.points(state)
         moved = move_inertially(pose, gyro - gyro_bias, accelerometer - accelerometer_bias, dt, self.gravity)
@@ -154,7 +154,7 @@ class AttitudeMotion(Motion):
         self.gyro_walk = densities("gyro_walk", gyro_walk, 3)
 
     def move(self, state, gyro, *, dt):
-        """The orientation turned by the reading without its bias."""
+        """Returns the orientation turned by the reading without its bias."""
         orientation, bias = self.space.points(state)
         return torch.cat([SO3().plus(orientation, (gyro - bias) * dt), bias], -1)
 
@@ -164,7 +164,7 @@ class AttitudeMotion(Motion):
 
 
 def move_inertially(pose: Tensor, rate: Tensor, force: Tensor, dt: float | Tensor, gravity: float = 9.81) -> Tensor:
-    r"""The pose of a body after a step in which its rate of turn and its specific force are constant in its own axes.
+    r"""Returns the pose after a step of constant angular velocity and specific force in the body's axes.
 
     With rate :math:`\omega`, specific force :math:`f` and gravity :math:`g`, both axes and world as in
     :mod:`torch_denkf.functional.manifolds`:

@@ -46,7 +46,7 @@ class Motion(Transition):
         self.space, self.dt, self.actions = space, dt, actions
 
     def move(self, *values: Any, **_: Any) -> Tensor:
-        """The states ``[*, P]`` one step later.
+        """Returns the states ``[*, P]`` one step later.
 
         Args:
             *values: the states ``[*, P]``, then the actions ``[*, A]``.
@@ -55,7 +55,7 @@ class Motion(Transition):
         raise NotImplementedError
 
     def noise_of_step(self, dt: Any) -> list:
-        """The standard deviations ``[D]`` that a step of ``dt`` seconds adds, in the space's tangents.
+        """Returns the standard deviations ``[D]`` that a step of ``dt`` seconds adds, in the space's tangents.
 
         They are numbers, or tensors of the shape of ``dt``, if that is a tensor.
         """
@@ -79,7 +79,7 @@ class Motion(Transition):
         return self.noise_of_step(self.dt) if isinstance(self.dt, (int, float)) else NoiseOfStep(self)
 
     def compute(self, ensemble, *others):
-        """The forecast ensemble."""
+        """Returns the forecast ensemble."""
         *actions, dt = others if keys_of_dt(self.dt) else (*others, self.dt)
         self.space.check(point=ensemble)
         for (key, size), action in zip(self.actions.items(), actions, strict=True):
@@ -105,13 +105,13 @@ class NoiseOfStep(SubModel):
         super().__init__(motion, [("belief", "mean"), *keys_of_dt(motion.dt)], [out_key])
 
     def compute(self, mean, dt):
-        """The variances of the step."""
+        """Returns the variances of the step."""
         dt = dt.to(mean.dtype).squeeze(-1)
         return torch.stack([torch.zeros_like(dt) + each for each in self.module.noise_of_step(dt)], -1).square()
 
 
 def densities(name: str, value: float | Sequence[float] | Tensor, size: int) -> list[float]:
-    """Noise densities, one for each of ``size`` numbers, of one for all or of one for each.
+    """Returns noise densities, one for each of ``size`` numbers, of one for all or of one for each.
 
     Raises:
         TypeError: if they are no numbers.
@@ -123,12 +123,12 @@ def densities(name: str, value: float | Sequence[float] | Tensor, size: int) -> 
 
 
 def walked(density: Sequence[float], dt: Any) -> list:
-    """The standard deviations of a random walk after ``dt`` seconds."""
+    """Returns the standard deviations of a random walk after ``dt`` seconds."""
     return [each * dt**0.5 for each in density]
 
 
 def integrated(density: Sequence[float], dt: Any) -> list:
-    """The standard deviations of a random walk's integral after ``dt`` seconds.
+    """Returns the standard deviations of a random walk's integral after ``dt`` seconds.
 
     They are correlated with those of the walk by .87. In a filter, where the next step moves by what this one has
     drawn, all but the last step's correlation is there.

@@ -65,7 +65,7 @@ class PlanarMotion(Motion):
         self.damping, self.usual_speed = float(damping), float(usual_speed)
 
     def move(self, state, *, dt):
-        """The pose on its arc; speed and turn rate on their way back."""
+        """Returns the pose on its arc; speed and turn rate on their way back."""
         pose, rest = self.space.points(state)
         speed, turn, errors = rest.split([1, 1, 2], -1)
         arc = torch.cat([turn * dt, speed * dt, torch.zeros_like(turn)], -1)

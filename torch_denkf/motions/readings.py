@@ -44,7 +44,7 @@ class _Reading(SubModel):
         raise NotImplementedError
 
     def compute(self, ensemble):
-        """The predicted readings."""
+        """Returns the predicted readings."""
         self.space.check(point=ensemble)
         return self.observe(ensemble.narrow(-1, self.begin, self.read_space.point_dim))
 
@@ -120,7 +120,7 @@ class Magnetic(_Reading):
         _register_vectors(self, "field", field, [3])
 
     def observe(self, point):
-        """The direction in the body's axes."""
+        """Returns the direction in the body's axes."""
         return rotate(_inverse(point), self.field)
 
 
@@ -198,7 +198,7 @@ class PositionInBody(_Reading):
         self.reading_space = Euclidean(self.landmark.numel())
 
     def observe(self, point):
-        """The landmarks in the body's axes."""
+        """Returns the landmarks in the body's axes."""
         size = self.landmark.shape[-1]
         away = self.landmark.reshape(-1, size) - point[..., -size:].unsqueeze(-2)
         if size == 3:
@@ -248,7 +248,7 @@ class RangeBearing(PositionInBody):
         self.reading_space = Product(Euclidean(1), Circle())
 
     def observe(self, point):
-        """Range and bearing; at the landmark itself zero, and so is their gradient."""
+        """Returns range and bearing; at the landmark itself zero, and so is their gradient."""
         away = super().observe(point)
         there = (away == 0).all(-1, keepdim=True)
         away = torch.where(there, torch.ones_like(away), away)
@@ -257,7 +257,7 @@ class RangeBearing(PositionInBody):
 
 
 def _inverse(pose: Tensor) -> Tensor:
-    """The world's orientation seen from the body, of a pose whose first four numbers are a quaternion."""
+    """Returns the world's orientation seen from the body, of a pose whose first four numbers are a quaternion."""
     return SO3().inverse(pose[..., :4])
 
 

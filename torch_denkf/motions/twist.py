@@ -56,7 +56,7 @@ class ConstantTwist(Motion):
         self.twist_noise = densities("twist_noise", twist_noise, space.tangent_dim)
 
     def move(self, state, *, dt):
-        """The pose moved by its twist."""
+        """Returns the pose moved by its twist."""
         pose, twist = self.space.points(state)
         return torch.cat([self.pose_space.plus(pose, twist * dt), twist], -1)
 

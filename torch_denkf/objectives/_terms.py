@@ -73,7 +73,7 @@ class Particles(OfBelief):
         return score_mixture(errors, labels.mask, log_weights, truth.loss.score, std, labels.scale), labels.rows
 
     def errors(self, truth: Truth) -> tuple[Tensor, Tensor, Labels]:
-        """Errors of the particles ``[*B, T, E, S]``, their log-weights ``[*B, T, E]`` and the labels."""
+        """Returns errors of the particles ``[*B, T, E, S]``, their log-weights ``[*B, T, E]`` and the labels."""
         place = self.place(truth)
         particles = truth.entry((place, "ensemble"), BELIEFS)
         log_weights = truth.out.get((place, "log_weight"), None)
@@ -96,7 +96,7 @@ class Mean(Particles):
         return labels.mean(weighted_mean(errors, log_weights).square()), labels.rows
 
     def each(self, truth):
-        """Never."""
+        """Returns False."""
         return False
 
 
@@ -113,7 +113,7 @@ class Sensor(Term):
         return score_members(labels.errors(samples), labels.mask, score), labels.rows
 
     def exists(self, loss: FilterLoss) -> bool:
-        """A module writes its samples, or the user has named where they are."""
+        """Returns True if a module writes its samples, or the user has named where they are."""
         structure = loss.filter.structure
         samples = [*filter(beliefs.is_samples, structure.frame_keys)] or ("sensor", "ensemble") in structure.step_keys
         return loss.tensor_keys.sensor is not None or bool(samples)
@@ -284,7 +284,7 @@ def score_gaussian(errors: Tensor, mask: Tensor, cov: Tensor, score: str, scale:
 
 
 def score_ensemble(truth: Truth, ensemble: Tensor) -> tuple[Tensor, Tensor]:
-    """The loss's score of members ``[*B, E, S]`` against the true state, and which elements have one."""
+    """Returns the loss's score of members ``[*B, E, S]`` against the true state, and which elements have one."""
     labels = truth.state(ensemble.shape[-1])
     return score_members(labels.errors(ensemble), labels.mask, truth.loss.score), labels.rows
 
@@ -296,7 +296,7 @@ def score_moments(truth: Truth, mean: Tensor, cov: Tensor) -> tuple[Tensor, Tens
 
 
 def sensor_samples(truth: Truth) -> tuple[Tensor, Labels]:
-    """The sensor's samples ``[*B, E, O]``, and what they should be where it observed all.
+    """Returns the sensor's samples ``[*B, E, O]``, and what they should be where it observed all.
 
     Raises:
         KeyError: if there are no samples, or no true observation.

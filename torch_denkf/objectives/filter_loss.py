@@ -127,7 +127,7 @@ class Term(nn.Module):
         self.weight = weight
 
     def forward(self, out: TensorDictBase, truth: Truth) -> tuple[Tensor, Tensor | None]:
-        """The term's value in each element.
+        """Returns the term's value in each element.
 
         Args:
             out: the batch ``[*B]`` with what the filter wrote.
@@ -278,7 +278,7 @@ class FilterLoss(Checked, LossModule):
         self.out_keys = [f"loss_{name}" for name in self.weights]
 
     def named_parameters(self, prefix: str = "", recurse: bool = True) -> Iterator[tuple[str, nn.Parameter]]:
-        """The parameters that are trained, with their names in the loss."""
+        """Returns the parameters that are trained, with their names in the loss."""
         found, parts = super().named_parameters(prefix, recurse), self._trained()
         if parts is None:
             return found
@@ -306,7 +306,7 @@ class FilterLoss(Checked, LossModule):
     # ------------------------------------------------------------------------ what a loss of a part has otherwise
 
     def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The batch with what the filter, or its part, writes."""
+        """Returns the batch with what the filter, or its part, writes."""
         self.filter.observe(Record("data", tensordict, tensordict.batch_size, {}, {}))
         return self.filter.inside(self._filters().sequence(tensordict.copy(), detach_every=self.detach_every))
 
@@ -327,7 +327,7 @@ class FilterLoss(Checked, LossModule):
         return [*needed, self.tensor_keys.state] if supervised else needed
 
     def _trained(self) -> Iterable[nn.Module] | None:
-        """The modules of the part that is trained; ``None`` for all.
+        """Returns the modules of the part that is trained; ``None`` for all.
 
         The whole filter is kept, so that it follows the loss to another device, and its names stay in the state dict.
         """

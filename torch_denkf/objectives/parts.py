@@ -152,7 +152,7 @@ class SensorLoss(FilterLoss):
         return [module for _, module in self._placed()]
 
     def _placed(self):
-        """The modules that read frames alone and lead to what is scored: the sensor; R and a head where they are."""
+        """Returns the modules that read frames alone and lead to the score: the sensor; R and a head where they are."""
         keys, reading, placed = self.tensor_keys, self.reading, []
         wanted = {reading.samples, reading.observed}
         wanted |= {unravel_key(keys.noise or reading.noise)} if "noise" in self.weights else set()
@@ -290,7 +290,7 @@ class Step(Term):
 
 
 def members_of(filter: Filter, belief: str, members: int | None) -> int | None:
-    """E, as many as were asked for or as the initial belief has; ``None`` of a filter with a mean and a covariance.
+    """Returns E, as asked for or of the initial belief; ``None`` for a filter with a mean and a covariance.
 
     Raises:
         ValueError: if the filter carries neither below the prefix ``belief``, or nobody says how many.

@@ -133,12 +133,12 @@ class DEnKFLoss(FilterLoss):
 
     @classmethod
     def paper(cls, filter: Filter, **kwargs) -> DEnKFLoss:
-        """The paper's loss: squared errors of the means of belief, forecast and sensor, equally weighted."""
+        """Returns the paper's loss: squared errors of the means of belief, forecast and sensor, equally weighted."""
         return cls(filter, **{"score": "mse", **kwargs})
 
     @classmethod
     def ad_enkf(cls, filter: Filter, *, detach_every: int | None = None, **kwargs) -> DEnKFLoss:
-        r"""Training without true states: the likelihood of the innovations alone, as in AD-EnKF.
+        r"""Trains without true states: the likelihood of the innovations alone, as in AD-EnKF.
 
         .. math:: -\log p(y_{1:T}) \approx -\sum_t \log N(y_t; H \bar x_{t|t-1}, H C_{t|t-1} H^T + R)
 

@@ -122,7 +122,7 @@ class Scene:
         return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
 
     def frame(self, step: int) -> np.ndarray:
-        """The picture of one step, ``[H, W, 3]`` uint8."""
+        """Returns the picture of one step, ``[H, W, 3]`` uint8."""
         if self.camera is not None and self.pictures is not None:
             self.image.set_data(as_picture(self.pictures[step]))
             unseen = self.seen is not None and not bool(self.seen[step])

@@ -81,7 +81,7 @@ def plot_path(
     axes = _axes(ax, len(chosen))
 
     def place(states: Tensor, dims: Sequence[int] = chosen) -> list[np.ndarray]:
-        """Coordinates on the picture's axes, each ``[T, ...]``."""
+        """Returns coordinates on the picture's axes, each ``[T, ...]``."""
         parts = [states[..., dim].numpy() for dim in dims]
         return [-parts[1], parts[0]] if forward_up else parts
 

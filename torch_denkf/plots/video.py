@@ -146,7 +146,7 @@ def _panel_count(bands: Mapping[str, Any] | None, state_dim: int) -> int:
 
 
 def _own_speed(time: float | Tensor | None, every: int) -> float:
-    """Frames a second at which the sequence goes by as fast as it did."""
+    """Returns frames a second at which the sequence goes by as fast as it did."""
     if time is None:
         return 10.0 / every
     dt = float(torch.as_tensor(time).flatten().diff().median()) if isinstance(time, Tensor) else time

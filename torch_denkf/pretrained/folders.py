@@ -29,7 +29,7 @@ def available() -> list[str]:
 def from_pretrained(
     name_or_folder: str | Path, *, builders: Mapping[str, Callable[..., Filter]] | None = None
 ) -> Filter:
-    """A trained filter: one that comes with the library, or one that was saved to a folder. Nothing is downloaded.
+    """Loads a trained filter: one that comes with the library, or one that was saved to a folder; without downloads.
 
     The weights are data only, the filter is built by a function of this library from the numbers in ``config.json``,
     and the weights' SHA-256 is compared with the one that stands there: no code of a file is executed.

@@ -126,7 +126,7 @@ class EnKS(Smoother):
 
 
 def of_own_time(ensemble: Tensor, past: Tensor, follows: Tensor) -> tuple[Tensor, Tensor]:
-    """The members of each time as they are L steps later, or at the end of their episode.
+    """Returns the members of each time as they are L steps later, or at the end of their episode.
 
     Args:
         ensemble: ``[*B, T, E, S]``.

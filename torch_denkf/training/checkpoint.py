@@ -47,7 +47,7 @@ def write_checkpoint(file: Path | str, content: Mapping[str, Any]) -> None:
 
 
 def _alone(content: Any) -> Any:
-    """The content in containers of its own, with one object for each text.
+    """Copies the content to new containers, with one object for each text.
 
     Pickle writes an object that it has met before as a reference to the first. So the same words and numbers give other
     bytes where two equal texts are two objects, as they are once one of them has been read from a file.
@@ -175,7 +175,7 @@ def check_settings(file: Path | str, saved: Mapping[str, Any], wanted: Mapping[s
 
 
 def _short(value: Any, other: Any) -> str:
-    """A setting, for a message; of the names of parameters those that the other one has not."""
+    """Returns a setting, for a message; of the names of parameters those that the other one has not."""
     if not isinstance(value, list) or not isinstance(other, list):
         return str(value)
     own = [name for group in value for name in group if not any(name in theirs for theirs in other)]

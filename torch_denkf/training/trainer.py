@@ -145,7 +145,7 @@ class FilterTrainer(HookPoints):
 
     @property
     def last_checkpoint(self) -> Path:
-        """The file from which a training is resumed."""
+        """Returns the file from which a training is resumed."""
         return self.out / "last.pt"
 
     def fit(self, *, resume: bool = True) -> dict[str, dict[str, Any]]:

@@ -213,7 +213,7 @@ class DEnKFTransform(Checked, Transform):
         return torch.stack([mask.reshape(*tensordict.batch_size, -1).any(-1) for mask in masks]).any(0)
 
     def _trial(self, row: TensorDictBase) -> dict[NestedKey, torch.Tensor]:
-        """All that a step from ``row`` without actions writes."""
+        """Returns all that a step from ``row`` without actions writes."""
         if self._controls:
             actions = self.parent.full_action_spec.zero()
             self._copy(actions, row, self._controls, "the environment's action spec")

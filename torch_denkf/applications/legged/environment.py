@@ -193,7 +193,7 @@ class LeggedEnv(EnvBase):
                 force[:2], self.pushed = self.pushes * self.random.standard_normal(2), round(0.1 / self.dt)
 
     def _simulate(self) -> None:
-        """One step of the simulator."""
+        """Runs one step of the simulator."""
         mujoco.mj_step(self.model, self.data)
 
     def _with_errors(self, imu: np.ndarray) -> dict:
@@ -216,7 +216,7 @@ class LeggedEnv(EnvBase):
 
 
 def on_floor(robot: ElementTree.Element, assets: dict, friction: float, softness: float) -> mujoco.MjModel:
-    """A robot of dm_control on a floor, as its sensors need it.
+    """Returns a robot of dm_control on a floor, as its sensors need it.
 
     Args:
         robot: its MJCF.

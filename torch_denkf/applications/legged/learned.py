@@ -84,7 +84,7 @@ class LearnedContacts(Sensor):
         self.register_buffer("lasts", torch.tensor(float(lasts)))
 
     def compute(self, imu, joints, rates, contact):
-        """The covariance, the variance with which feet walk, and how they move."""
+        """Returns the covariance, the variance with which feet walk, and how they move."""
         mean, cov = self._moments(self.features(imu, joints, rates, contact))
         cov = self.lasts * cov
         feet = torch.eye(cov.shape[-3], dtype=cov.dtype, device=cov.device)
@@ -166,7 +166,7 @@ class Variances(Sensor):
         self.observation_dim = contacts.observation_dim
 
     def compute(self, *last):
-        """The variances ``[*B, 3 F]``, and how feet walk."""
+        """Returns the variances ``[*B, 3 F]``, and how feet walk."""
         cov, *others = self.module.compute(*last)
         return cov.diagonal(dim1=-2, dim2=-1), *others
 
@@ -178,7 +178,7 @@ def check_rows(rows: int, every: int) -> None:
 
 
 def last_rows(rows: int, every: int = 1) -> Compose:
-    """A transform of an environment that keeps the last rows of what :class:`LearnedContacts` reads.
+    """Returns a transform of an environment that keeps the last rows of what :class:`LearnedContacts` reads.
 
     Args:
         rows: K.
@@ -195,7 +195,7 @@ def _picked(frames: Tensor, rows: int, every: int) -> Tensor:
 
 
 def with_last_rows(log: TensorDictBase, rows: int, every: int = 1) -> TensorDictBase:
-    """A log ``[*B, T]`` with the last rows of what :class:`LearnedContacts` reads.
+    """Returns a log ``[*B, T]`` with the last rows of what :class:`LearnedContacts` reads.
 
     The first row stands for those before it.
 

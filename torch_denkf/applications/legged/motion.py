@@ -47,16 +47,16 @@ class LeggedSpace(Space):
 
     @property
     def point_dim(self) -> int:  # type: ignore[override]
-        """16 + 3 F."""
+        """Returns 16 + 3 F."""
         return 16 + 3 * self.feet
 
     @property
     def tangent_dim(self) -> int:  # type: ignore[override]
-        """15 + 3 F."""
+        """Returns 15 + 3 F."""
         return 15 + 3 * self.feet
 
     def compose(self, first, second):
-        """The second, then the first; biases add up."""
+        """Composes in reverse order: the second, then the first; biases add up."""
         return _in_order(self.in_groups.compose(_in_groups(first, 10), _in_groups(second, 10)), 10)
 
     def inverse(self, point):
@@ -72,7 +72,7 @@ class LeggedSpace(Space):
         return _in_order(self.in_groups.log(_in_groups(point, 10)), 9)
 
     def right_jacobian(self, tangent):
-        """That of a step in the world's axes."""
+        """Returns that of a step in the world's axes."""
         return _matrix_in_order(self.in_groups.right_jacobian(_in_groups(tangent, 9)))
 
     def adjoint(self, point):
@@ -84,19 +84,19 @@ class LeggedSpace(Space):
         return _matrix_in_order(self.in_groups.basis(_in_groups(point, 10)), rows=10)
 
     def dual_basis(self, point):
-        """The step in the world's axes that leads to a point nearby."""
+        """Returns the step in the world's axes that leads to a point nearby."""
         return _matrix_in_order(self.in_groups.dual_basis(_in_groups(point, 10)), columns=10)
 
     def neutral(self, like=None):
-        """No rotation, zeros."""
+        """Returns no rotation and zeros."""
         return _in_order(self.in_groups.neutral(like), 10)
 
     def normalise(self, point):
-        """With a quaternion of length one."""
+        """Scales the quaternion to length one."""
         return _in_order(self.in_groups.normalise(_in_groups(point, 10)), 10)
 
     def near(self, points, weights=None):
-        """Part by part."""
+        """Works part by part."""
         return _in_order(self.in_groups.near(_in_groups(points, 10), weights), 10)
 
     def _whole(self, known):
@@ -111,12 +111,12 @@ class LeggedSpace(Space):
 
 
 def _in_groups(value: Tensor, begin: int) -> Tensor:
-    """Points or tangents with the biases, which begin there, at the end."""
+    """Returns points or tangents with the biases, which begin there, at the end."""
     return torch.cat([value[..., :begin], value[..., begin + 6 :], value[..., begin : begin + 6]], -1)
 
 
 def _in_order(value: Tensor, begin: int) -> Tensor:
-    """The inverse of :func:`_in_groups`."""
+    """Returns the inverse of :func:`_in_groups`."""
     return torch.cat([value[..., :begin], value[..., -6:], value[..., begin:-6]], -1)
 
 
@@ -160,7 +160,7 @@ class LeggedMotion(Motion):
         self.inertial = InertialMotion(dt, gravity=gravity)
 
     def move(self, state, imu, feet, contact, *moves, dt):
-        """The states one step later."""
+        """Returns the states one step later."""
         base = self.inertial.move(state[..., :16], imu, dt=dt)
         turn, place = base[..., None, :4], base[..., None, 7:10]
         by_joints = place + rotate(turn, feet.unflatten(-1, (-1, 3)))
@@ -216,7 +216,7 @@ class LeggedMotionNoise(SubModel):
         self.register_buffer("air", torch.tensor(n.kinematics**2))
 
     def compute(self, *entries):
-        """Variances, or the covariance."""
+        """Returns variances, or the covariance."""
         mean, (contact, *more) = (None, entries) if self.ensemble else (entries[0], entries[1:])
         dt = self.slip.new_full((), self.dt) if len(more) == self.learned else more[-1].to(self.slip.dtype)
         slip = more[0] * dt if self.learned else self.slip

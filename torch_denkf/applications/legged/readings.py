@@ -51,7 +51,7 @@ class LegReadings(SubModel):
         super().__init__(kinematics, in_keys, [(prefix, name) for name in names])
 
     def compute(self, imu, joints, contact, *others):
-        """The feet, which of them stand, the start, and the feet's rates."""
+        """Returns the feet, which of them stand, the start, and the feet's rates."""
         kinematics, values = self.module, (imu, joints, contact, *others)
         sizes = [6, len(kinematics.joints), len(kinematics.feet), *[1] * len(self.steps), len(kinematics.joints)]
         for key, size, value in zip(self.in_keys, sizes, values, strict=False):
@@ -101,7 +101,7 @@ class FeetInBody(SubModel):
         self.observed_space = space
 
     def compute(self, state):
-        """The predicted readings."""
+        """Returns the predicted readings."""
         self.observed_space.check(point=state)
         return _feet(state).flatten(-2)
 
@@ -132,7 +132,7 @@ class FeetRates(SubModel):
         self.observed_space = space
 
     def compute(self, state, imu, moves=None):
-        """The predicted readings."""
+        """Returns the predicted readings."""
         self.observed_space.check(point=state)
         turn = (imu[..., :3].to(state.dtype).unsqueeze(-2) - state[..., 10:13]).unsqueeze(-2)
         velocity = rotate(SO3().inverse(state[..., :4]), state[..., 4:7]).unsqueeze(-2)

@@ -104,7 +104,7 @@ class Layout:
 
 
 def read_layout(root: Path, camera: str | None, chosen: Sequence[int] | None = None) -> Layout:
-    """Read the metadata of a LeRobot folder.
+    """Reads the metadata of a LeRobot folder.
 
     Args:
         root: the folder.
@@ -310,7 +310,7 @@ def _episodes_of_version_3(root: Path, info: dict, camera: str) -> tuple[list[Ep
 
 
 def _inside(root: Path, info: dict, name: str, **place: Any) -> Path:
-    """A file that a template of ``info.json`` names.
+    """Returns a file that a template of ``info.json`` names.
 
     Raises:
         ValueError: if there is no such template, it is none of LeRobot's, or it leads out of the folder.
@@ -334,7 +334,7 @@ def _inside(root: Path, info: dict, name: str, **place: Any) -> Path:
 
 
 def read_table(file: Path, columns: list[str] | None = None):
-    """Columns of a parquet file, or all, as a pyarrow table.
+    """Returns columns of a parquet file, or all, as a pyarrow table.
 
     Raises:
         ImportError: without pyarrow.
@@ -347,7 +347,7 @@ def read_table(file: Path, columns: list[str] | None = None):
 
 
 def rows_of_episode(table, episode: EpisodeFiles):
-    """The rows of one episode.
+    """Returns the rows of one episode.
 
     Raises:
         ValueError: if they are not as many as the metadata says, or not in order.
@@ -371,7 +371,7 @@ def rows_of_episode(table, episode: EpisodeFiles):
 
 
 def vectors(table, file: Path, key: str, width: int) -> np.ndarray:
-    """A column of numbers, float64 ``[n, width]``.
+    """Returns a column of numbers, float64 ``[n, width]``.
 
     Raises:
         ValueError: if a row has another width, or none.
@@ -394,7 +394,7 @@ def vectors(table, file: Path, key: str, width: int) -> np.ndarray:
 
 
 def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict | None) -> np.ndarray | None:
-    """One image of a parquet file, or of a file that it names, as RGB ``[H, W, 3]``; None if it cannot be decoded."""
+    """Decodes an image of a parquet file, or of a file that it names, to RGB ``[H, W, 3]``; None if that fails."""
     data = (value or {}).get("bytes")
     if data is None:
         names = [(value or {}).get("path")]
@@ -406,7 +406,7 @@ def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict 
 
 
 def stay_inside(root: Path, path: str, source: str) -> Path:
-    """A path below a folder, as metadata name it.
+    """Returns a path below a folder, as metadata name it.
 
     Args:
         root: the folder.

@@ -91,7 +91,7 @@ def lag_errors(
 
 
 def _small_pictures(data: LeRobotReplay, index: Tensor) -> Tensor:
-    """Grey pictures of some rows, ``[n, pixels]``."""
+    """Returns grey pictures of some rows, ``[n, pixels]``."""
     parts = [adaptive_avg_pool2d(data[rows]["pixels"].mean(1, keepdim=True), _SMALL) for rows in index.split(256)]
     return torch.cat(parts).flatten(1)
 

@@ -69,7 +69,7 @@ def read_recording(
     episodes: Sequence[int] | None = None,
     origin: Mapping[str, Any] | None = None,
 ) -> DecodedRecording:
-    """Read episodes of a LeRobot folder, or load them from the cache.
+    """Reads episodes of a LeRobot folder, or loads them from the cache.
 
     Raises:
         ImportError: without pyarrow.
@@ -139,7 +139,7 @@ class _Frames:
         self._bar = progress_bar("reading recordings", rows, unit=" frames", shown=progress)
 
     def put(self, rows: np.ndarray, image: np.ndarray, source: object) -> None:
-        """Scale an image and take it for ``rows``."""
+        """Scales an image and takes it for ``rows``."""
         if self._native is None:
             self._native = image.shape[:2], source
         if image.shape[:2] != self._native[0]:
@@ -236,7 +236,7 @@ def _put_images(layout: Layout, episode: EpisodeFiles, rows, start: int, frames:
 
 
 def _check_seen(episode: EpisodeFiles, seen: np.ndarray) -> None:
-    """A frame that is not there is a warning; an episode without any is an error."""
+    """Warns of missing frames; raises for an episode without any."""
     source = episode.video or episode.data
     if not seen.any():
         raise ValueError(

@@ -215,7 +215,7 @@ class LeRobotReplay(EpisodeReplay):
 
 
 def _paired(rows: TensorDict, lag: int) -> tuple[TensorDict, Tensor]:
-    """Rows that have a partner ``lag`` rows before them, with their ``step``; and the partners' numbers."""
+    """Returns rows that have a partner ``lag`` rows before them, with their ``step``; and the partners' numbers."""
     numbers, lengths = torch.unique_consecutive(rows["episode"], return_counts=True)
     if int(lengths.min()) <= abs(lag):
         short = numbers[lengths <= abs(lag)].tolist()

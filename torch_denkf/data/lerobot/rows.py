@@ -33,7 +33,7 @@ def recording_from_rows(
     names: tuple[str, ...] | None = None,
     folder: str | Path | None = None,
 ) -> DecodedRecording:
-    """Turn rows as :class:`torchrl.data.datasets.OpenXExperienceReplay` stores them into a recording.
+    """Turns rows as :class:`torchrl.data.datasets.OpenXExperienceReplay` stores them into a recording.
 
     The defaults are the keys that most of the Open X-Embodiment sets have there, and those of
     :class:`torchrl.data.datasets.LeRobotExperienceReplay`. Berkeley's UR5 set has others::
@@ -179,7 +179,7 @@ def _images(rows: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def _count_from_start(episode: Tensor, key: NestedKey) -> Tensor:
-    """Each row's number in its episode, ``[N, 1]``."""
+    """Returns each row's number in its episode, ``[N, 1]``."""
     names, lengths = torch.unique_consecutive(episode, return_counts=True)
     if len(names.unique()) < len(names):
         torn = names[(names[:, None] == names).sum(1) > 1].unique().tolist()

@@ -18,7 +18,7 @@ _NUMBERS = ("state", "action")
 
 
 def sound_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times of an episode with values for those that are wrong, s, and which were right, bool; ``[n]`` each.
+    """Returns times of an episode with values for those that are wrong, s, and which were right, bool; ``[n]`` each.
 
     Args:
         times: as they are stored, s.
@@ -87,7 +87,7 @@ def mask_rows(rows: TensorDict, stamped: Tensor | None, source: str) -> TensorDi
 
 
 def _last_sound(episode: Tensor, finite: Tensor, name: str, source: str) -> Tensor:
-    """For each row the last one of its episode that is finite, itself included, or else the next, ``[N]``."""
+    """Returns for each row the last one of its episode that is finite, itself included, or else the next, ``[N]``."""
     row = torch.arange(len(episode))
     lengths = torch.unique_consecutive(episode, return_counts=True)[1]
     first = (lengths.cumsum(0) - lengths).repeat_interleave(lengths)

@@ -105,7 +105,7 @@ class Table:
             )
 
     def read(self) -> Readings:
-        """The whole table.
+        """Returns the whole table.
 
         Raises:
             FileNotFoundError: without the file.
@@ -193,7 +193,7 @@ def check_times(times: np.ndarray, place: Callable[[int], str], column: str) -> 
 def read_numbers(
     file: Path, time: str, columns: Sequence[str] | None
 ) -> tuple[tuple[str, ...], np.ndarray, Callable[[int], str]]:
-    """Columns of a table: their names without that of the time, numbers ``[n, 1 + C]``, and where a row is in the file.
+    """Reads columns of a table: names without the time's, numbers ``[n, 1 + C]``, each row's place in the file.
 
     Raises:
         FileNotFoundError: without the file.
@@ -226,7 +226,7 @@ def _hint(there: Sequence[str], time: str, missing: Sequence[str]) -> str:
 
 
 def _number(text: str) -> float:
-    """A finite number that float32 can hold; NaN for what is none."""
+    """Returns a finite number that float32 can hold; NaN for what is none."""
     try:
         number = read_number(text)
     except ValueError:

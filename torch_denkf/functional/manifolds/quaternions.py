@@ -9,7 +9,7 @@ __all__ = ["quaternion_of", "quaternion_product", "rotate", "rotation_matrix", "
 
 
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
-    """The rotation ``second``, then ``first``: both quaternions ``[*, 4]``, w first."""
+    """Multiplies quaternions ``[*, 4]``, w first: the rotation ``second``, then ``first``."""
     a, b = first[..., :1], first[..., 1:]
     c, d = second[..., :1], second[..., 1:]
     w = a * c - (b * d).sum(-1, keepdim=True)
@@ -17,7 +17,7 @@ def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
 
 
 def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
-    """A vector ``[*, 3]`` in the body's axes, turned into the world's by a quaternion ``[*, 4]``."""
+    """Rotates a vector ``[*, 3]`` from the body's axes to the world's by a quaternion ``[*, 4]``."""
     w, axis = quaternion[..., :1], quaternion[..., 1:]
     axis, vector = torch.broadcast_tensors(axis, vector)
     twice = 2 * torch.linalg.cross(axis, vector)
@@ -25,13 +25,13 @@ def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
 
 
 def rotation_matrix(quaternion: Tensor) -> Tensor:
-    """The matrix ``[*, 3, 3]`` of a quaternion ``[*, 4]``: its columns are the body's axes in the world's."""
+    """Returns the matrix ``[*, 3, 3]`` of a quaternion ``[*, 4]``: its columns are the body's axes in the world's."""
     axes = torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)
     return torch.stack([rotate(quaternion, axis) for axis in axes], -1)
 
 
 def quaternion_of(matrix: Tensor) -> Tensor:
-    """A quaternion ``[*, 4]`` of a rotation matrix ``[*, 3, 3]``, by the largest of its four numbers."""
+    """Returns a quaternion ``[*, 4]`` of a rotation matrix ``[*, 3, 3]``, by the largest of its four numbers."""
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
     candidates = [
         torch.stack([1 + a + e + i, h - f, c - g, d - b], -1),
@@ -46,7 +46,7 @@ def quaternion_of(matrix: Tensor) -> Tensor:
 
 
 def skew(vector: Tensor) -> Tensor:
-    """The matrix ``[*, 3, 3]`` whose product with another vector is the cross product with it."""
+    """Returns the matrix ``[*, 3, 3]`` whose product with another vector is the cross product with it."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
@@ -54,7 +54,7 @@ def skew(vector: Tensor) -> Tensor:
 
 
 def products(point: Tensor) -> Tensor:
-    """The products of a point's quaternion with i, j and k, ``[*, 4, 3]``."""
+    """Returns the products of a point's quaternion with i, j and k, ``[*, 4, 3]``."""
     w, x, y, z = point[..., :4].unbind(-1)
     rows = [[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)

@@ -20,7 +20,7 @@ from torch_denkf.functional.smoothing.backward import run_backward
 
 
 def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping: float = 1.0) -> Tensor:
-    """One step back in time: the smoothed members of t from those of t + 1.
+    """Smooths one step back in time: the members of t from those of t + 1.
 
     X + (X_s − X_f) A_f⁺ A, with A and A_f the anomalies at t and of the forecast: the gain of
     :func:`~torch_denkf.functional.smoothing.rts.rts_step` from sample covariances. The smaller of the two possible
@@ -84,7 +84,7 @@ def enrts_smooth(
     damping: float = 1.0,
     space: Space | None = None,
 ) -> Tensor:
-    """Smooth the ensembles of a whole sequence.
+    """Smooths the ensembles of a whole sequence.
 
     Args:
         ensemble: the filter's beliefs, ``[*B, T, E, S]``.

@@ -59,7 +59,7 @@ class CornerNoise:
             check_number(each.name, getattr(self, each.name), least=0, above=above)
 
     def stereo_var(self, corners: Tensor, offset: Tensor, stale: Tensor) -> Tensor:
-        """Variance of the error that stays with a corner, ``[*]`` in pixels^2, before anything is seen of it.
+        """Returns the variance of the error that stays with a corner, ``[*]`` in pixels^2, before it is observed.
 
         Args:
             corners: (u, v, disparity), ``[*, 3]``.
@@ -102,7 +102,7 @@ def corner_motion(
     start: Tensor | None = None,
     steps: int = 12,
 ) -> CornerMotion:
-    """The most likely motion by Gauss-Newton, on the corners' places and disparities.
+    """Returns the most likely motion by Gauss-Newton, on the corners' places and disparities.
 
     Each corner's place in space is known but for the noise of the earlier row. That noise goes through the motion into
     what the later row should show, so that a far corner says much of the turn and little of the way. Students's t
@@ -195,7 +195,7 @@ def corner_motions(
     steps: int = 6,
     memory: bool = True,
 ) -> CornerMotion:
-    """The motion of each row since the row before; what a corner has shown of its disparity is remembered.
+    """Returns the motion of each row since the row before; what a corner has shown of its disparity is remembered.
 
     A corner that moves shows how far it is. So the error of its disparity, which stays with it, is known better from
     row to row.

@@ -36,7 +36,7 @@ class Times(NamedTuple):
 
 
 def read_times(file: Path, rows: int) -> Times:
-    """Read the frames' times, or make nominal ones where there is no file.
+    """Reads the frames' times, or makes nominal ones if there is no file.
 
     A warning counts the stamps that do not increase, which are not used, and the gaps.
 

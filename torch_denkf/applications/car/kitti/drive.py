@@ -71,7 +71,7 @@ def read_kitti_drive(
     cache: str | Path | bool | None = True,
     progress: Callable[[int], object] | None = None,
 ) -> TensorDict:
-    """Read one drive: images of one size, and the planar state in Kloss et al.'s convention.
+    """Reads one drive: images of one size, and the planar state in Kloss et al.'s convention.
 
     Row k is frame ``first + k``, from the first to the last frame that has both an image and a pose. Frames that lack
     an image, or whose file is damaged (a warning names it), keep their row. So do frames whose time does not increase,
@@ -162,7 +162,7 @@ def read_kitti_drive(
 
 
 def choose_camera(folder: Path, camera: str | None) -> str:
-    """Name of the folder of a drive's images: the one that is asked for, or the first that there is."""
+    """Returns the name of the folder of a drive's images: the one that is asked for, or the first that there is."""
     if not folder.is_dir():
         names = sorted(e.name for e in folder.parent.iterdir() if e.is_dir()) if folder.parent.is_dir() else []
         raise FileNotFoundError(
@@ -183,7 +183,7 @@ def choose_camera(folder: Path, camera: str | None) -> str:
 
 
 def _frame_files(folder: Path) -> dict[int, Path]:
-    """Images by frame number, in order."""
+    """Returns images by frame number, in order."""
     if not folder.is_dir():
         return {}
     names = sorted(entry.name for entry in os.scandir(folder) if re.fullmatch(r"\d+\.png", entry.name))
@@ -275,6 +275,6 @@ def _is_colour(files) -> bool:
 
 
 def _read_image(file: Path, size: tuple[int, int], colour: bool) -> tuple[np.ndarray | None, tuple[int, int]]:
-    """Pixels ``[C, H, W]``, RGB or grey, and the file's own (H, W)."""
+    """Returns pixels ``[C, H, W]``, RGB or grey, and the file's own (H, W)."""
     pixels = _decode(file, cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE)
     return (None, (0, 0)) if pixels is None else (scaled(pixels, size), pixels.shape[:2])

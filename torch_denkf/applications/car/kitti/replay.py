@@ -131,7 +131,7 @@ class KITTIOdometryExperienceReplay(EpisodeReplay):
         )
 
     def _number_statistics(self, rows: TensorDictBase) -> dict[str, Any]:
-        """Also of ``"velocity"`` ``[2]``, v m/s and θ_dot rad/s; θ_dot's mean is 0 if mirrored."""
+        """Adds those of ``"velocity"`` ``[2]``, v m/s and θ_dot rad/s; θ_dot's mean is 0 if mirrored."""
         return {**super()._number_statistics(rows), "velocity": mean_and_std(rows["state"][:, 3:])}
 
     def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:

@@ -82,14 +82,14 @@ class Job:
         return False
 
     def renderer(self) -> Renderer:
-        """The drive's scene, from its name and seed."""
+        """Returns the drive's scene, from its name and seed."""
         rng = np.random.default_rng([self.options["seed"], zlib.crc32(self.name.encode()), 1])
         ground = self.poses[:, 1, 3] + self.camera.height
         scene = roadside_scene(poses_to_state(self.poses, KITTI_DT), rng, ground=ground, traffic_on=self.traffic)
         return Renderer(scene, self.camera)
 
     def draw(self, renderer: Renderer, start: int, stop: int) -> None:
-        """Write the images of frames ``start`` to ``stop``."""
+        """Writes the images of frames ``start`` to ``stop``."""
         folder = self.beside / self.folder
         folder.mkdir(parents=True, exist_ok=True)
         grey = self.folder in ("image_0", "image_1")
@@ -105,7 +105,7 @@ class Job:
                 file.write_bytes(data.tobytes())
 
     def finish(self) -> None:
-        """Write the text files and rename: a drive that is there is complete.
+        """Writes the text files and renames: a drive that exists is complete.
 
         After a power failure an image may be missing all the same: its reader says so. To wait for thousands of
         images to be on the disk would take as long as to draw them.
@@ -129,7 +129,7 @@ class Job:
 
 
 def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | None = None) -> None:
-    """Draw and write drives; what comes out does not depend on the number of processes.
+    """Draws and writes drives; the result does not depend on the number of processes.
 
     Args:
         jobs: the drives, all of one root.

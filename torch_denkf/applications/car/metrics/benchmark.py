@@ -34,7 +34,7 @@ class WindowErrors(NamedTuple):
 def kitti_pathlength_error(
     estimated: Tensor, truth: Tensor, *, windows: Sequence[int] = (100, 200, 400, 800)
 ) -> WindowErrors:
-    """Errors as in the DEnKF reference script, behind the paper's table: lengths of paths, not their ends.
+    """Returns errors as in the DEnKF reference script, behind the paper's table: lengths of paths, not their ends.
 
     Over the first N steps of a run: the difference between the lengths of both paths, and the difference between both
     headings at step N as they are, each divided by the length of the true path.

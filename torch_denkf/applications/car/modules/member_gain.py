@@ -66,7 +66,7 @@ class MemberGain(SubModel):
         self.register_buffer("quantiles", torch.stack([quantiles[order] for order in orders], -1))
 
     def compute(self, samples):
-        """The samples, each with its member's gain."""
+        """Returns the samples, each with its member's gain."""
         if samples.shape[-2:] != self.quantiles.shape:
             raise ValueError(
                 f"MemberGain was made for samples [*B, {self.quantiles.shape[0]}, {self.quantiles.shape[1]}], "

@@ -33,7 +33,7 @@ def with_history(
     ensemble_key: NestedKey = ("belief", "ensemble"),
     history_key: NestedKey = ("belief", "history"),
 ) -> AugmentedBelief:
-    """An initial belief with a past: each member has had its present velocities all along.
+    """Returns an initial belief with a past: each member has had its present velocities all along.
 
     Args:
         initial: the initial belief; writes an ensemble ``[*B, E, 5]``, see :class:`UnicycleTransition`.
@@ -122,7 +122,7 @@ class PairObservation(SubModel):
         check_values("reach", self.reach, above=0, infinite=True)
 
     def compute(self, forecast, *rest):
-        """The predicted observations, the ensemble that the analysis is to update, and the mask."""
+        """Returns the predicted observations, the ensemble that the analysis is to update, and the mask."""
         *history, steps, observed = rest
         history = history[0] if history else forecast[..., 5:].unflatten(-1, (-1, 2))
         past = within_pair(steps, history)
@@ -170,7 +170,7 @@ class ClonedPrior(AroundInitial):
         self.register_buffer("copies", torch.cat([eye, *[eye[3:]] * lags]))
 
     def on_entries(self, entries, call):
-        """The belief."""
+        """Returns the belief."""
         written = self.run_inside(entries, call)
         for key, value in written.items():
             name, copies = key[-1] if isinstance(key, tuple) else key, self.copies.to(value.dtype)
@@ -207,7 +207,7 @@ class ClonedTransition(Wrapper, Transition):
         self.history_key = self_made
 
     def on_entries(self, entries, call):
-        """The forecast ensemble."""
+        """Returns the forecast ensemble."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state = self.required(entries, key)
         work = {**entries, key: state[..., :5], self.history_key: state[..., 3:].unflatten(-1, (-1, 2))}

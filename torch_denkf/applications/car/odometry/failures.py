@@ -35,7 +35,7 @@ class CameraFailure(NamedTuple):
 
 
 def fail_frames(frames: Iterable[np.ndarray | None], failures: Sequence[CameraFailure]) -> Iterator[np.ndarray | None]:
-    """The frames of a camera that fails.
+    """Yields the frames of a camera that fails.
 
     Args:
         frames: images ``[H, W]`` or ``[H, W, 3]``, uint8; ``None`` for one that is missing.

@@ -77,20 +77,20 @@ class Drive:
     two_view: bool = False
 
     def disturbed(self) -> list[Drive]:
-        """This drive clean, and with half as much weight in all disturbances together."""
+        """Returns this drive clean, and with half as much weight in all disturbances together."""
         share = 0.5 * self.weight / len(_DISTURBANCES)
         return [self, *(replace(self, condition=name, weight=share) for name in _DISTURBANCES)]
 
     def longer(self, longest: int) -> list[Drive]:
-        """This drive in pairs of 2 to ``longest`` steps, with less weight, for the training of a sensor."""
+        """Returns this drive in pairs of 2 to ``longest`` steps, with less weight, for the training of a sensor."""
         return [replace(self, steps=steps, weight=0.5**steps * self.weight) for steps in range(2, longest + 1)]
 
     def spans(self, longest: int) -> list[Drive]:
-        """This drive in pairs of 1 to ``longest`` steps; a disturbed one in pairs of neighbours alone."""
+        """Returns this drive in pairs of 1 to ``longest`` steps; a disturbed one in pairs of neighbours alone."""
         return [replace(self, steps=steps) for steps in range(1, (longest if self.condition == "clean" else 1) + 1)]
 
     def read(self) -> TensorDict:
-        """Flow, road and the truth, ``[N]``, memory-mapped."""
+        """Returns flow, road and the truth, ``[N]``, memory-mapped."""
         drive = read_kitti_drive(
             self.root, self.name, camera=self.camera, size=self.size, colour=False, cache=self.cache
         )
@@ -110,7 +110,7 @@ class Drive:
 
 
 def rows(data: TensorDict, index: Tensor, longest: int) -> TensorDict:
-    """Rows of a drive as the sensor reads them, and what it should read.
+    """Returns rows of a drive as the sensor reads them, and what it should read.
 
     ``"target_observation"`` ``[*B, 2]`` is the sum of the true velocities over all steps of the pair.
     """
@@ -128,7 +128,7 @@ def mirror(frames: TensorDict) -> TensorDict:
 
 @torch.no_grad()
 def read_sensor(sensor: FlowSensor, data: TensorDict, longest: int, *, mirrored: bool = False) -> TensorDict:
-    """A sensor's readings of a whole drive ``[N]``, on the CPU, from the same random numbers each time."""
+    """Returns a sensor's readings of a whole drive ``[N]``, on the CPU, from the same random numbers each time."""
     readings, was_training, device = [], sensor.training, next(sensor.parameters()).device
     sensor.eval()
     with torch.random.fork_rng(devices=[]):
@@ -142,7 +142,7 @@ def read_sensor(sensor: FlowSensor, data: TensorDict, longest: int, *, mirrored:
 
 
 def read_spans(sensor: FlowSensor, drives: Sequence[TensorDict], longest: int, *, mirrored: bool = False) -> TensorDict:
-    """A sensor's readings of one drive in pairs of 1, 2, ... steps.
+    """Returns a sensor's readings of one drive in pairs of 1, 2, ... steps.
 
     Args:
         sensor: the sensor.

@@ -49,7 +49,7 @@ class Renderer:
         self._pyramid: list[np.ndarray] = []
 
     def render(self, pose: np.ndarray, frame: int | None = None) -> np.ndarray:
-        """Draw one picture.
+        """Draws one picture.
 
         Args:
             pose: camera-to-world matrix, ``[3, 4]``.
@@ -87,7 +87,7 @@ class Renderer:
             self._things.settle(self._relief, terrain.line[stretch])
 
     def _ground_depth(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """One over the ground's depth at each pixel, and the row of its upper end in each column.
+        """Returns one over the ground's depth at each pixel, and the row of its upper end in each column.
 
         In each of some columns the ground is looked up at all depths and projected; between them one over the depth
         is linear in row and column, exactly so on a plane.

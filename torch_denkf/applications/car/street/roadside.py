@@ -24,7 +24,7 @@ HOUSE, TREE, POLE, CAR, HEDGE = range(5)
 def roadside_scene(
     path: np.ndarray, rng: np.random.Generator, *, ground: np.ndarray | None = None, traffic_on: bool = False
 ) -> Scene:
-    """Put a road under a path, and houses, hedges, trees, poles and parked cars beside it.
+    """Puts a road under a path, and houses, hedges, trees, poles and parked cars beside it.
 
     Nothing stands on the road, whichever stretch of it: where a path crosses or repeats itself, one scene serves all
     visits.
@@ -84,7 +84,7 @@ def roadside_scene(
 
 
 def _exposure(frames: int, rng: np.random.Generator) -> np.ndarray:
-    """A gain that wanders by some 8 % within seconds."""
+    """Returns a gain that wanders by some 8 % within seconds."""
     knots = np.arange(0, frames + 40, 40)
     return np.interp(np.arange(frames), knots, np.exp(0.08 * rng.standard_normal(len(knots))))
 
@@ -133,7 +133,7 @@ class _Roadside:
         return True
 
     def fill(self, cars: list[list[list[np.ndarray]]], fast: bool) -> list[Box | Card]:
-        """Everything that stands beside the road, on both sides."""
+        """Returns everything that stands next to the road, on both sides."""
         rng, way = self.rng, self.way
         make = self._makers(cars)
         kinds = rng.dirichlet([0.5, 5, 3, 0.1, 3] if fast else [4, 4, 2, 3, 2])  # this drive's share of each kind

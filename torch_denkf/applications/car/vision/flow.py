@@ -14,7 +14,7 @@ _RESIDUAL = 40.0  # grey levels that count as a complete mismatch
 
 
 def dense_flow(previous: np.ndarray, current: np.ndarray, camera: CanonicalCamera) -> np.ndarray:
-    """Apparent motion of every pixel of ``current`` since ``previous``.
+    """Computes the dense optical flow: the motion of every pixel of ``current`` since ``previous``.
 
     Args:
         previous: canonical image ``[H, W]``, uint8.
@@ -33,7 +33,7 @@ def dense_flow(previous: np.ndarray, current: np.ndarray, camera: CanonicalCamer
 
 
 def coarse_flow(flow: np.ndarray, previous: np.ndarray, current: np.ndarray, camera: CanonicalCamera) -> np.ndarray:
-    """Means of the flow over a coarse grid, with a channel that tells how far to trust it.
+    """Returns means of the flow over a coarse grid, with a channel that tells how far to trust it.
 
     Args:
         flow: as :func:`dense_flow` gives it, ``[H, W, 2]``.

@@ -29,7 +29,7 @@ def road_correlation(
     turn: tuple[float, float],
     height: float = KITTI_HEIGHT,
 ) -> np.ndarray:
-    """Correlation of the road in two images, for each pitch and each distance travelled.
+    """Returns the correlation of the road in two images, for each pitch and each distance travelled.
 
     Args:
         previous: canonical image ``[H, W]``, uint8.
@@ -66,7 +66,7 @@ def _nearest(camera: CanonicalCamera, pitch: float, height: float) -> float:
 
 
 def _plan(image, camera, pitch, height, ahead, left, up) -> np.ndarray:
-    """The road seen from above, ``[len(ahead), lanes]``, by a camera turned by ``left`` and, a little, ``up``."""
+    """Maps the road to a view from above, ``[len(ahead), lanes]``, of a camera turned by ``left`` and ``up``."""
     lanes = np.linspace(-_HALF_WIDTH, _HALF_WIDTH, _LANES)
     right = lanes * np.cos(left) - ahead[:, None] * np.sin(left)
     forward = lanes * np.sin(left) + ahead[:, None] * np.cos(left)
@@ -79,7 +79,7 @@ def _plan(image, camera, pitch, height, ahead, left, up) -> np.ndarray:
 
 
 def _slide(now: np.ndarray, then: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Weighted normalised correlation of ``now`` with every window of its length in ``then``."""
+    """Returns the weighted normalised correlation of ``now`` with every window of its length in ``then``."""
     cells = len(now)
     weight = weight / weight.sum() / now.shape[1]
     now = now - (weight @ now).sum()

@@ -113,7 +113,7 @@ def picture_signs(previous: np.ndarray, current: np.ndarray, *, noise: int = 0) 
 
 
 def _largest(values: np.ndarray, side: int) -> np.ndarray:
-    """The largest value in each cell of so many pixels, those at the right and lower border included."""
+    """Returns the largest value in each cell of so many pixels, those at the right and lower border included."""
     height, width = values.shape
     padded = np.pad(values, ((0, -height % side), (0, -width % side)))
     return padded.reshape(padded.shape[0] // side, side, -1, side).max((1, 3))

@@ -33,7 +33,7 @@ def is_for_tests(demo: int) -> bool:
 
 
 def demo_rows(rows: TensorDictBase) -> TensorDict:
-    """Rows of all demos with the keys of data sets.
+    """Returns rows of all demos with the keys of data sets.
 
     Args:
         rows: see :func:`torch_denkf.applications.ur5.data.cache.read_demos`.

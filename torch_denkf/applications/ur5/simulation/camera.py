@@ -38,13 +38,13 @@ class Camera:
         self._noise = noise
 
     def lens(self, picture: np.ndarray) -> np.ndarray:
-        """The picture ``[H, W, 3]`` as the lens bends it."""
+        """Returns the picture ``[H, W, 3]`` as the lens bends it."""
         if self._map is None:
             return picture
         return cv2.remap(picture, *self._map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def expose(self, pictures: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-        """One frame, uint8 ``[H, W, 3]``: the mean of the pictures, bent by the lens, with the sensor's noise."""
+        """Exposes one frame, uint8 ``[H, W, 3]``: the mean of the pictures, bent by the lens, with sensor noise."""
         if len(pictures) == 1 and self._map is None and not any(self._noise):
             return pictures[0]
         light = self.lens(np.stack(pictures).mean(0, dtype=np.float32) if len(pictures) > 1 else pictures[0])
