@@ -37,7 +37,7 @@ def minimum_jerk(tau: np.ndarray) -> np.ndarray:
 
 
 def tool_down(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
-    """Returns the quaternion of a tool that points down, tilted in rad about the fingers' way (pitch) and across (roll)."""
+    """Returns the quaternion of a tool that points down, tilted about the fingers' way (pitch) and across (roll)."""
     out = np.array([0.0, 1.0, 0.0, 0.0])  # half a turn about x: z down
     for angle, axis in ((roll, (0, 1, 0)), (pitch, (1, 0, 0)), (yaw, (0, 0, 1))):
         turn, product = np.empty(4), np.empty(4)
