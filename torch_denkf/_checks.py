@@ -307,8 +307,8 @@ def check_covariance(name: str, cov: Tensor, size: int | None = None, layout: st
         row, column = wrong.nonzero()[0].tolist()
         raise ValueError(
             f"{name} must be a symmetric covariance; it has {matrix[row, column]:g} at {[row, column]} and "
-            f"{matrix[column, row]:g} at {[column, row]}, beside variances {variance[row]:g} and {variance[column]:g}. "
-            "Pass (P + P.T) / 2, and zero beside a variance of zero"
+            f"{matrix[column, row]:g} at {[column, row]}, with variances {variance[row]:g} and {variance[column]:g}. "
+            "Pass (P + P.T) / 2, and zero next to a variance of zero"
         )
     lowest = float(torch.linalg.eigvalsh((correlation + correlation.mT) / 2)[0]) if len(matrix) else 0.0
     if lowest < -rounding:

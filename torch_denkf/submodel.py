@@ -228,7 +228,7 @@ class SubModel(Checked, TensorDictModule):
         """Returns the entry ``key``.
 
         Raises:
-            KeyError: if it is missing; the message names it and lists what is there.
+            KeyError: if it is missing; the message names it and lists the entries.
         """
         value = entries.get(key)
         if value is None:
@@ -266,7 +266,7 @@ class SubModel(Checked, TensorDictModule):
             given = given if len(given) == len(found) else None
         if given is None:
             where: dict[str, Any] = {}
-            # Where nothing is read, what is drawn lies beside the constants.
+            # Where nothing is read, what is drawn lies next to the constants.
             for value in values if values else (*self.parameters(), *self.buffers()):
                 if value is not None and value.is_floating_point():
                     where = {"device": value.device, "dtype": value.dtype}

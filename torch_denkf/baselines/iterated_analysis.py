@@ -64,7 +64,7 @@ def _twice(prefix: str, keys: Sequence[NestedKey], space: Space | None, belief: 
 
 
 class IteratedAnalysis(Rotated):
-    r"""Finds from where the reading says that the last step began, and makes the step anew from there.
+    r"""Finds from where the reading says that the last step began, and makes the step again from there.
 
     Gauss-Newton steps in the space of the members, each with a run of transition and observation; see
     :func:`~torch_denkf.baselines.iterated_smoothing.iterated_smoothing`. Where the motion has Gaussian noise, the

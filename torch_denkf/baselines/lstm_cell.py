@@ -1,4 +1,4 @@
-r"""A recurrent network in a filter's place: it remembers what it likes, and says what it believes as a Gaussian.
+r"""A recurrent network in a filter's place: it keeps a memory, and writes its belief as a Gaussian.
 
 The baseline without any model: no motion, no noise, no gain, only a memory that is trained. It keeps the keys of the
 filters with a mean and a covariance, so that objectives, metrics and environments treat it as one of them.
@@ -82,7 +82,7 @@ class LSTMTransition(Transition):
 
 
 class LSTMUpdate(Update):
-    r"""Remembers the frame, and believes :math:`N(m + s \circ W h_t, s^2 \circ (\mathrm{softplus}(U h_t) + c))`.
+    r"""Updates the memory; the belief is :math:`N(m + s \circ W h_t, s^2 \circ (\mathrm{softplus}(U h_t) + c))`.
 
     The LSTM reads, in this order: the sensor's encoding, its reading in units of ``observation_scale``, a flag for
     each component of the reading (or one for the frame) that is 1 where it was observed, and what ``extra_keys`` name.
@@ -113,7 +113,7 @@ class LSTMUpdate(Update):
             written.
 
     Raises:
-        ValueError: if there is nothing to read, or an input has another size than was said.
+        ValueError: if there is nothing to read, or an input has another size than given.
         KeyError: if an entry is missing.
 
     Reference:

@@ -27,7 +27,7 @@ class Command:
     """The base of all sub-commands, which are dataclasses: fields are options, their comments the help.
 
     What :meth:`run` raises as ``ImportError``, ``OSError``, ``ValueError`` or one of ``mistakes``, or as a ``KeyError``
-    with a message, is told to the user in a line.
+    with a message, is printed in a line.
 
     Attributes:
         name: what comes after ``denkf``.

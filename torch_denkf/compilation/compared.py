@@ -1,4 +1,4 @@
-"""A compiled function beside the eager one, once: a compiler may be wrong, and say nothing."""
+"""A compiled function next to the eager one, once: a compiler may be wrong, and say nothing."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def stamp(file: Path) -> tuple[int, int]:
 
 
 def cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
-    """Opens a cache entry; where there is none, or a damaged one, reads its content anew and stores it.
+    """Opens a cache entry; where there is none, or a damaged one, reads its content again and stores it.
 
     Args:
         entry: folder of the entry.
@@ -83,7 +83,7 @@ def _load(entry: Path) -> TensorDict | None:
     except FileNotFoundError:
         return None
     except DamagedEntry as damage:
-        _LOG.warning("the cache entry %s is damaged, and is made anew: %s", entry, damage)
+        _LOG.warning("the cache entry %s is damaged, and is made again: %s", entry, damage)
         _set_aside(entry)
         return None
 

@@ -252,7 +252,7 @@ def _map(file: Path, dtype: torch.dtype, shape: torch.Size) -> Tensor:
     with file.open("rb") as stream:
         there = os.fstat(stream.fileno()).st_size
         if there != size:
-            raise OSError(f"{file} has {there} bytes instead of {size}; delete its folder, and it is made anew")
+            raise OSError(f"{file} has {there} bytes instead of {size}; delete its folder, and it is made again")
         if not size:
             return torch.empty(shape, dtype=dtype)
         mapped = mmap.mmap(stream.fileno(), size, _MAP, mmap.PROT_READ | mmap.PROT_WRITE)

@@ -111,7 +111,7 @@ def episode_flags(first: Tensor, last: Tensor) -> dict[str, Any]:
 
 
 def check_rows(rows: TensorDictBase, episodes: Sequence[Episode]) -> None:
-    """Refuses rows that are no data set's.
+    """Raises for rows that are no data set's.
 
     Raises:
         KeyError: if they lack ``step`` or ``time``.

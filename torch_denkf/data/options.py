@@ -37,7 +37,7 @@ class ReplayOptions(TypedDict, total=False):
 
 
 def check_options(options: Mapping[str, Any]) -> None:
-    """Refuses options that are wrong whatever the data are: reading these may take long.
+    """Raises for options that are wrong whatever the data are: reading these may take long.
 
     Raises:
         TypeError: for an option that there is not.

@@ -38,7 +38,7 @@ def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
             _refuse_bombs(file, opened.metadata)
             return opened.read(None if columns is None else list(columns))
     except (arrow.ArrowException, OSError) as error:
-        raise ValueError(f"{file} is no complete parquet file ({error}); download or copy it anew") from error
+        raise ValueError(f"{file} is no complete parquet file ({error}); download or copy it again") from error
 
 
 def _refuse_bombs(file: Path, metadata: Any) -> None:
@@ -51,5 +51,5 @@ def _refuse_bombs(file: Path, metadata: Any) -> None:
     if metadata.num_rows > MOST_ROWS or size > max(MOST_BYTES, MOST_RATIO * file.stat().st_size):
         raise ValueError(
             f"{file} has {file.stat().st_size} bytes and announces {metadata.num_rows} rows of together {size} bytes; "
-            "that much is not unpacked: download or copy it anew"
+            "that much is not unpacked: download or copy it again"
         )

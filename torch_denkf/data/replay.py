@@ -78,7 +78,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
             * ``slice_len``: rows of a slice. With ``num_slices``, too, ``batch_size`` is their product.
             * ``strict_length``: False lets episodes that are shorter than a slice come as short slices.
             * ``sampler``: by default slices if they are asked for, else single rows at random.
-            * ``writer``: by default one that refuses to write.
+            * ``writer``: by default one that raises.
             * ``collate_fn``: as in torchrl's buffers, like ``pin_memory`` and ``prefetch``.
             * ``pin_memory``: whether samples are pinned.
             * ``prefetch``: samples to prepare in advance, by threads.
@@ -269,7 +269,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         return self.root
 
     def delete(self) -> None:
-        """Refuses: what the data set reads is not its own.
+        """Raises: the files of the data set are not its own.
 
         Raises:
             RuntimeError: always.

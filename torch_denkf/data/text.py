@@ -32,5 +32,5 @@ def read_lines(file: Path) -> list[str]:
         byte = data[error.start]
         raise ValueError(
             f"{file}:{line} is no text in UTF-8 (byte 0x{byte:02x}); is the file compressed or damaged? Download or "
-            "copy it anew, or convert it to UTF-8"
+            "copy it again, or convert it to UTF-8"
         ) from error

@@ -13,7 +13,7 @@ from torch_denkf.deployment.files import name_for_c
 
 EXTRA = "pip install 'torch_denkf[lerobot]'"
 NOT_DECODED = (
-    "no frame of {} can be decoded: it is damaged (download or copy it anew), or in a codec that OpenCV here lacks, "
+    "no frame of {} can be decoded: it is damaged (download or copy it again), or in a codec that OpenCV here lacks, "
     f"such as AV1 ({EXTRA} brings PyAV, which has it)"
 )
 
@@ -90,7 +90,7 @@ def say_if_cut(file: Path, times: Sequence[float]) -> None:
     shown = times[-1] - times[0] + 1 / rate
     if count / rate > shown + 0.6 * step:
         warnings.warn(
-            f"{file} shows {shown:.4g} s, but announces {count / rate:.4g} s: is it cut? Copy it anew, or go on "
+            f"{file} shows {shown:.4g} s, but announces {count / rate:.4g} s: is it cut? Copy it again, or go on "
             "without its end",
             stacklevel=2,
         )

@@ -96,7 +96,7 @@ def replacing(file: str | Path) -> Iterator[Path]:
         file: result; its folder is made. What is no plain file, such as ``/dev/stdout``, is written to directly.
 
     Yields:
-        The path of an empty file of the same name, in a folder beside it.
+        The path of an empty file of the same name, in a folder next to it.
 
     Raises:
         OSError: if the file cannot be written; names it and the free space.
@@ -200,7 +200,7 @@ def place_beside(target: Path) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> int:
-    """Removes what killed processes left half written beside the files and folders in a folder.
+    """Removes what killed processes left half written next to the files and folders in a folder.
 
     Returns:
         How many places that were.

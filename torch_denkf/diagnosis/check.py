@@ -235,7 +235,7 @@ def _forecast(where: str, case: _Case, td: TensorDict, out: TensorDictBase) -> I
     for name, scale in (("mean", std), ("ensemble", std.unsqueeze(-2)), ("log_weight", 1.0)):
         value = out.get((case.keys.belief, name), None)
         if value is not None:
-            yield f"{where}{name}, beside the forecast's", _largest((value - td["forecast", name]) / scale), _ROUNDING
+            yield f"{where}{name}, next to the forecast's", _largest((value - td["forecast", name]) / scale), _ROUNDING
 
 
 def _gain(analysis: TensorDictModuleBase, case: _Case, tolerance: float) -> Iterator[tuple[str, float, float]]:

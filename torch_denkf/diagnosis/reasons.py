@@ -236,7 +236,7 @@ def _no_point(structure: Structure, now: Entries) -> str:
 
 
 def _process_noise(structure: Structure, now: Entries) -> str:
-    """Names the process noise, which is made anew, where it is no covariance."""
+    """Names the process noise, which is made again, where it is no covariance."""
     place, transition = structure.transition
     work = dict(now)
     for kind in structure.kinds:

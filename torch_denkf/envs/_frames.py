@@ -84,7 +84,7 @@ class ImageDisturbance(FrameTransform):
         raise NotImplementedError
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Changes nothing, but refuses entries that can be negative: those are no pictures.
+        """Changes nothing; raises for entries that can be negative: those are no pictures.
 
         Raises:
             ValueError: if an entry's lowest value is negative.

@@ -27,7 +27,7 @@ __all__ = ["BlackFrames", "Blur", "Brightness", "OccludingBox", "SaltAndPepper"]
 class SaltAndPepper(ImageDisturbance):
     """Makes a share of the pixels white and as many others black, in all channels.
 
-    The counts are exact: ``round(fraction * H * W)`` of each, drawn anew for each frame.
+    The counts are exact: ``round(fraction * H * W)`` of each, drawn again for each frame.
 
     Args:
         fraction: share of white pixels, and of black ones; by default 9000 each of 1242 x 375 (the paper's code draws

@@ -76,7 +76,7 @@ class Filter(Checked, TensorDictSequential):
             :class:`torchrl.envs.InitTracker` and torchrl's ``SliceSampler``; one of its name in a group of agents
             counts, too.
         update_at_reset: whether the initial belief is updated with the first frame.
-        forecast_keys: the forecast of each carried entry, where it cannot be told by its name.
+        forecast_keys: the forecast of each carried entry, where its name does not tell.
         variance_ceiling: the belief's variances are clamped to it, so that an unstable system that nobody observes
             stays finite, with one warning; in the state's units squared. ``None`` for no ceiling.
         check_finite: whether a step raises where its new belief is not finite, and any run where the noise of a reading

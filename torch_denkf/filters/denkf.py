@@ -42,7 +42,7 @@ class DEnKF(Filter):
         analysis: the update; ``EnsembleAnalysis("sensor")`` by default, and ``EnsembleAnalysis("perturbed")`` without a
             sensor.
         initial: the initial belief, which also fixes the number of members.
-        process_noise: Q of the motion, beside the noise of the transition's network: standard deviations ``[S]`` (a
+        process_noise: Q of the motion, besides the noise of the transition's network: standard deviations ``[S]`` (a
             number for all, 0 for none), or a module that writes Q, see :mod:`torch_denkf.modules.process_noise`. An
             ensemble without any process noise collapses. ``None``: the transition's own noise alone.
         **options: ``reading_space``, ``observation_key``, ``observed_key``, for the default ``analysis``,

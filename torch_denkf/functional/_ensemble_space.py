@@ -82,7 +82,7 @@ def analyse_in_tiles(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Computes :func:`~torch_denkf.functional.analyse` in ensemble space, without gradients, in little memory.
 
-    Beside the arguments and the result it holds a few tiles ``[*B, E, columns]``, rows ``[*B, O]`` and matrices
+    Besides the arguments and the result it holds a few tiles ``[*B, E, columns]``, rows ``[*B, O]`` and matrices
     ``[*B, E, E]``. Arguments and results are those of ``analyse``, checked there.
 
     With ``total`` the columns are a share of all there are, and it adds up sums over columns with those of the other

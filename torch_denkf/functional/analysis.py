@@ -97,7 +97,7 @@ def analyse(
             ``[*B, S, O]`` and of the predicted observations ``[*B, O, O]``, before anything is solved (Houtekamer
             & Mitchell 2001). Batch dimensions may be left out. Not for ``"etkf"``; needs observation space.
         significance: localisation by what the members themselves say, see :func:`significant`: how many standard
-            deviations a sample correlation must be away from zero to be believed, such as 3. ``None`` believes all. The
+            deviations a sample correlation must be away from zero to be used, such as 3. ``None`` uses all. The
             components of the reading are then taken in one after the other, each with the correlations that the one
             before left (Whitaker & Hamill 2002; Anderson 2003). Needs observation space.
         space: where to solve: ``"observation"`` costs O(O³ + O E S), ``"ensemble"`` O(E³ + E² (S + O));
@@ -184,7 +184,7 @@ def _in_few_launches(
 def check_analysis_arguments(
     forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, significance, space
 ) -> None:
-    """Refuses arguments of :func:`analyse` that do not fit each other."""
+    """Raises for arguments of :func:`analyse` that do not fit each other."""
     batch, size, dim = forecast.shape[:-2], forecast.shape[-2:-1], predicted.shape[-1:]
     each, single = (*batch, *size, *dim), (*batch, *dim)
     fits = forecast.ndim > 1 and predicted.shape == each and noise.shape == single and size[0] > 1
@@ -340,7 +340,7 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
         cross: products of the anomalies, ``[*B, O, S]``.
         predicted: anomalies of the predicted observations, ``[*B, E, O]``, in any unit.
         state: anomalies of the state, ``[*B, E, S]``.
-        threshold: :math:`z_0`, positive, one number or ``[S]``; below :math:`\sqrt{E - 1}`, or nothing is believed.
+        threshold: :math:`z_0`, positive, one number or ``[S]``; below :math:`\sqrt{E - 1}`, or nothing is used.
 
     Returns:
         Factors in [0, 1), ``[*B, O, S]``.

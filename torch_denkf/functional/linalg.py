@@ -205,7 +205,7 @@ def is_covariance(cov: Tensor) -> Tensor:
     variance, rounding = cov.diagonal(dim1=-2, dim2=-1), 100 * cov.shape[-1] * torch.finfo(cov.dtype).eps
     largest = rounding**2 * (variance.unsqueeze(-1) * variance.unsqueeze(-2))
     symmetric = ((cov - cov.mT).square() <= largest).flatten(-2).all(-1)
-    # A variance of zero is one, but beside a covariance, which the factor's next row divides by it.
+    # A variance of zero is one, but next to a covariance, which the factor's next row divides by it.
     ridge = rounding * variance + torch.finfo(cov.dtype).tiny
     return symmetric & cholesky(cov + ridge.diag_embed())[..., -1, -1].isfinite()
 
@@ -239,7 +239,7 @@ def _correlation(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     inverse = torch.where(std > 0, 1 / torch.where(std > 0, std, 1), 0)
     ridge = 10 * dim * torch.finfo(cov.dtype).eps
     diagonal = ((std <= 0).to(std) + ridge).diag_embed()
-    # A variance of less than zero is not taken for one of zero, unless it is round-off beside the largest.
+    # A variance of less than zero is not taken for one of zero, unless it is round-off next to the largest.
     negative = (variance < -ridge * variance.abs().amax(-1, keepdim=True)).any(-1, keepdim=True)
     std, inverse = torch.where(negative, torch.nan, std), torch.where(negative, torch.nan, inverse)
     correlation = (cov * inverse.unsqueeze(-1) * inverse.unsqueeze(-2) + diagonal) / (1 + ridge)

@@ -176,7 +176,7 @@ def letkf(
         noise: variances R, ``[*B, O]``, positive.
         near: which observations count where, see :func:`neighbours`.
         observed: boolean, ``[*B, 1]`` or ``[*B, O]``; what is False counts nowhere, and may be NaN.
-        significance: also weigh each observation by how far its correlation with the component is to be believed, see
+        significance: also weigh each observation by how far its correlation with the component is significant, see
             :func:`~torch_denkf.functional.analysis.significant`: one number, such as 1.5. ``None`` for no such weights.
         tile: components to analyse in one go; memory is ``E * L * tile`` for each element of the batch.
 

@@ -48,7 +48,7 @@ class FusedFilter(Filter):
     after the other, or all in one update. For linear Gaussian systems both give the same. The first takes less where
     sensors are many, and lets each linearise at the belief that the sensors before it left.
 
-    Readings that come late need the last L states beside the belief, L the largest delay. An ensemble carries them as
+    Readings that come late need the last L states next to the belief, L the largest delay. An ensemble carries them as
     :class:`~torch_denkf.smoothers.FixedLag` does; a mean and a covariance as one joint Gaussian, which for linear
     systems gives what readings in their order give. With process noise and few members, the sample covariances of an
     ensemble make a difference between late and in order, which falls with more members; with :class:`Refiltering` there
@@ -57,7 +57,7 @@ class FusedFilter(Filter):
 
     An analysis' inflation and relaxation spread the belief of the present, once in each update that observes anything.
     A late reading would have to spread a belief of the past, of which the updates since did not know: with a delay both
-    are refused, and so they are with the lag of a mean and a covariance. :class:`Refiltering` and
+    raise, and so they do with the lag of a mean and a covariance. :class:`Refiltering` and
     :class:`~torch_denkf.smoothers.FixedLag` take them.
 
     Diagnostics of the sensors stand under ``("info", NAME, ...)``, their sums under ``("info", "nis")`` and
@@ -84,7 +84,7 @@ class FusedFilter(Filter):
 
     Raises:
         ValueError: if there is no sensor, a delay is negative or beyond the lag, process noise is missing or given
-            twice, an analysis inflates or relaxes where that is refused or names a ``reading_space``, or a sensor has
+            twice, an analysis inflates or relaxes where it must not or names a ``reading_space``, or a sensor has
             errors that last and its readings live on a space.
         TypeError: for particles, sensors that are no dict, an analysis in the place of what makes it, or one that
             cannot correct earlier states.
@@ -174,7 +174,7 @@ def _refuse_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, j
         why = "belongs to the step at which a reading is taken, and with delay= others have been made since"
         cure = "Leave delay= out and let Refiltering make them again"
     elif joint_past:
-        why = "would spread the past anew with each reading: with lag= it is one Gaussian with the present"
+        why = "would spread the past again with each reading: with lag= it is one Gaussian with the present"
         cure = "Leave lag= out and put FixedLag(filter, lag) around the filter"
     else:
         return

@@ -168,7 +168,7 @@ class _Stream:
         knots = np.unique(np.concatenate([times, self.times]))
         on = np.stack([np.interp(knots, self.times, column) for column in self.values.T], 1)
         area = np.append(np.diff(knots)[:, None] * (on[1:] + on[:-1]) / 2, np.zeros_like(on[:1]), 0)
-        # Each row sums its own pieces: one reading that is absurd must not spoil the rows that follow.
+        # Each row sums its own pieces: one outlier must not spoil the rows that follow.
         total, step = np.add.reduceat(area, np.searchsorted(knots, times), 0)[:-1], np.diff(times)[:, None]
         now[1:] = np.where(step > 0, total / np.where(step > 0, step, 1.0), now[1:])
         return now
@@ -229,7 +229,7 @@ def _by_sensor(messages: Iterable[Sequence[Any]], unit: str) -> dict[str, _Strea
             )
         name, source = message[1], f"Message {number}, of {message[1]!r},"
         if any(np.ma.is_masked(part) for part in message):
-            raise ValueError(f"{source} has masked elements: leave it out, or give what is there a sensor of its own.")
+            raise ValueError(f"{source} has masked elements: leave it out, or give the others a sensor of their own.")
         stamp = float(_floats(f"{source} has a stamp", message[0], 0)) * SECONDS[unit]
         value = np.atleast_1d(_floats(f"{source} has a value", message[2]))
         if not np.isfinite(stamp) or value.ndim != 1:

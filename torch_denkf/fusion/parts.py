@@ -55,7 +55,7 @@ class Renamed(Wrapper, Sensor):
 
 
 class OfOwnErrors(Wrapper):
-    """An observation model of one sensor, of a state that holds the lasting errors of several behind its system.
+    """An observation model of one sensor, of a state that has the biases of several behind its system.
 
     Args:
         observation: of the system, and of the sensor's own errors behind it, where it has some.

@@ -104,7 +104,7 @@ class Refiltering(Checked):
 
         Args:
             window: the last steps; it is not changed.
-            row: what :meth:`Filter.step` reads, ``[*B]``, beside the belief.
+            row: what :meth:`Filter.step` reads, ``[*B]``, besides the belief.
 
         Returns:
             The window with this step, whose ``belief`` is that of t.

@@ -48,7 +48,7 @@ class SensorAttention(nn.Module):
         features: number of features of each sensor that has any.
         size: D, of a token.
         floor: :math:`w_0`, the smallest weight. It keeps a way back: a sensor that was distrusted still corrects
-            the belief a little. A thousand readings of weight 0.001 count as one that is believed: where a sensor reads
+            the belief a little. A thousand readings of weight 0.001 count as one of full weight: where a sensor reads
             much more often than the others, or is much more exact, take a smaller one.
         slope: a, before training; 0 leaves the term out. A filter that has followed a sensor finds nothing wrong with
             it any more, and a loss does not tell how it could have known. With a slope of 2 a reading three standard

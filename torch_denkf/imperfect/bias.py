@@ -1,7 +1,7 @@
 r"""A sensor's slow errors as part of the state: biases that fade, in any filter.
 
 A sensor that reads wrongly often reads wrongly in the next frame, too. A filter that takes such errors for white noise
-believes them more with each frame, and its intervals become too narrow. Here the state is :math:`(x, b)`: S numbers of
+averages them out with each frame, and its intervals become too narrow. Here the state is :math:`(x, b)`: S numbers of
 the system, then K biases of the sensor, each an Ornstein-Uhlenbeck process with its own standard deviation and its own
 time; the reading is :math:`h(x) + b`. With several times for each component of the reading the errors may be slow and
 slower.

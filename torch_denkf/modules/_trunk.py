@@ -29,7 +29,7 @@ def _tensors(values: Any) -> Iterator[Tensor]:
 
 
 class _Allocations(TorchDispatchMode):
-    """Adds up the bytes of all storages that operations return anew."""
+    """Adds up the bytes of all new storages that operations return."""
 
     def __init__(self):
         super().__init__()

@@ -28,18 +28,18 @@ class EnsembleAnalysis(EnsembleUpdate):
             plus N(0, R)), ``"etkf"`` (symmetric square root) or ``"sakov"`` (Sakov & Oke's deterministic update).
         inflation: factor on the analysis anomalies, where anything is observed; 1 for none.
         inflated: components of the state that the inflation multiplies; ``None`` for all. Where nothing observes a
-            component, or where it is the past, which is not forecast anew, factors pile up in it.
+            component, or where it is the past, which is not forecast again, factors pile up in it.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         rotate: random mean-preserving rotation of the anomalies (``"etkf"`` only).
         taper: localisation: factors on the covariances of state and observation ``[S, O]`` and of the observations
             ``[O, O]``, see :func:`~torch_denkf.functional.analyse`; ``None`` for none. Where one observation can say
             nothing about a component of the state but what E members happen to show, the factor is 0.
-        localisation: ``"significance"`` believes a covariance of state and observation as far as E members can tell it
+        localisation: ``"significance"`` uses a covariance of state and observation as far as E members can tell it
             from chance, see :func:`~torch_denkf.functional.analysis.significant`. It keeps 32 to 64 members honest
-            where fast sensors make thousands of updates. ``None`` believes all.
+            where fast sensors make thousands of updates. ``None`` uses all.
         threshold: of ``"significance"``, in standard deviations: one number or ``[S]``; a ``Parameter`` is trained. The
             more updates a component sees between two readings about it, the larger. One that is trained beyond
-            sqrt(E - 1) believes nothing, and has no gradient that would bring it back.
+            sqrt(E - 1) ignores all, and has no gradient that would bring it back.
         space: in which the state lives, such as ``Product(SO3(), Euclidean(3))``: members are points, the update is
             made with the tangents at the forecast's mean, and ``var`` is of the tangents at the belief's. See
             :mod:`torch_denkf.functional.manifolds`.

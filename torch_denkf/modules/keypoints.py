@@ -55,7 +55,7 @@ class KeypointTrunk(nn.Module):
         channels: of the convolutions, of stride 2 each; group normalisation and ReLU behind each.
         keypoints: channels whose places are read.
         features: width of the output.
-        pooled: the last map is averaged over a grid of so many rows and columns beside the keypoints.
+        pooled: the last map is averaged over a grid of so many rows and columns besides the keypoints.
 
     Shape:
         ``[N, C, H, W]`` to ``[N, features]``, for any H and W from ``2 ** (len(channels) - 1)`` on.

@@ -1,6 +1,6 @@
 r"""Weighted particles: their weights, resampling, the update.
 
-Weights are normalised log-weights ``[*B, E]`` beside the ensemble. The order of a step is
+Weights are normalised log-weights ``[*B, E]`` next to the ensemble. The order of a step is
 
     resample -- move -- observe -- weight
 
@@ -70,7 +70,7 @@ class ResampledTransition(Transition):
     missing frames particles and weights go on as they are.
 
     A particle that the motion throws out of the numbers (so far that its cube would leave the precision) loses its
-    weight to the others, and goes on beside the heaviest. ``"transport"`` averages particles: one that runs away while
+    weight to the others, and goes on next to the heaviest. ``"transport"`` averages particles: one that runs away while
     it has weight takes the others with it.
 
     Args:

@@ -15,14 +15,14 @@ IDENTITY = torch.arange(len(_LEVELS) + 2.0).repeat(2, 1)
 
 
 def check_observation_dim(expected: int, innovation: Tensor, name: str) -> None:
-    """Raises unless the innovations ``[*B, O]`` have as many components as ``name`` was told.
+    """Raises unless the innovations ``[*B, O]`` have the number of components that ``name`` was given.
 
     Raises:
         ValueError: if they have not.
     """
     if innovation.shape[-1] != expected:
         raise ValueError(
-            f"{name} was told observation_dim={expected}, and the reading has {innovation.shape[-1]} components; "
+            f"{name} was given observation_dim={expected}, and the reading has {innovation.shape[-1]} components; "
             f"pass observation_dim={innovation.shape[-1]}."
         )
 

@@ -15,7 +15,7 @@ __all__ = ["BlackIsMissing"]
 class BlackIsMissing(Sensor):
     """Marks pictures that are black all over as not observed: no scene is.
 
-    A sensor reads something in a black picture, too, and a filter believes it. Put this module in front of the sensor,
+    A sensor reads something in a black picture, too, and a filter uses it. Put this module in front of the sensor,
     ``TensorDictSequential(BlackIsMissing(), sensor)``, and let the filter read its mask, ``observed_key="seen"``. The
     filter then goes by its motion until the camera is back, and its spread grows.
 

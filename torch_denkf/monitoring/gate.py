@@ -1,4 +1,4 @@
-"""An analysis that believes a reading as far as its last innovations deserve it."""
+"""An analysis with gating: outliers are rejected, or their variances enlarged."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ class GateOptions(TypedDict, total=False):
     """Arguments of :class:`GatedAnalysis` besides the analysis.
 
     Attributes:
-        response: what happens to a reading that is not believed: ``"reject"`` takes it out, ``"student"`` and
+        response: what happens to an outlier: ``"reject"`` takes it out, ``"student"`` and
             ``"huber"`` enlarge its variances, see :func:`~torch_denkf.monitoring.gating.disbelief`; ``"student"`` by
             default. ``"reject"`` may take surprising motions for faults, and the belief then runs away.
         window: observed steps whose normalised innovations squared are summed up; 3 by default.
         rate: probability that the sum of a sound sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
             acts.
         freedom: of Student's t; 4 by default.
-        patience: after so many steps in a row at which a reading was not believed the gate opens: the forecast, and the
+        patience: after so many steps in a row at which a reading was rejected the gate opens: the forecast, and the
             past states that are carried next to it, are spread until they reach the reading, and the window is emptied.
             Set more than the longest fault has readings; 50 by default.
         by_component: whether each component of the reading is judged by itself; for ensembles alone, False by default.
@@ -81,14 +81,14 @@ class GatedAnalysis(Around):
     The analysis runs twice: as it would, to see the innovation, and then with the variances, mask and spread that
     follow. With ``rate=0`` and no adaptation the second gives bit for bit what the analysis gives.
 
-    What is written beside the belief, K being the number of components with ``by_component`` and else 1:
+    What is written next to the belief, K being the number of components with ``by_component`` and else 1:
 
     ========================= ============ ============================================================================
     entry                     shape        content
     ========================= ============ ============================================================================
     (key, ``terms``)          ``[W,K,2]``  normalised innovations squared of the last observed steps, the latest first,
                                            and their degrees of freedom
-    (key, ``shut``)           ``[K]``      steps in a row at which a reading was not believed
+    (key, ``shut``)           ``[K]``      steps in a row at which a reading was rejected
     (key, ``log_noise``)      ``[K]``      logarithm of the adapted factor on the variances
     (key, ``log_inflation``)  ``[1]``      logarithm of the adapted factor on the forecast's variances
     (key, ``factor``)         ``[K]``      factor on the variances by which the gate answered; infinite where rejected
@@ -97,7 +97,7 @@ class GatedAnalysis(Around):
     (key, ``part_nis``)       ``[K]``      of each component by itself
     ========================= ============ ============================================================================
 
-    A reading that was rejected is believed again when the sum falls to what one in twenty exceeds.
+    Hysteresis: after a rejection, readings are accepted again when the sum falls to what one in twenty exceeds.
 
     The diagnostics of the analysis, such as ``("info", "nis")``, are those of the second run. A filter needs the state
     to begin somewhere: :class:`~torch_denkf.monitoring.Gated` sees to that.
@@ -106,7 +106,7 @@ class GatedAnalysis(Around):
         analysis: :class:`EnsembleAnalysis`, :class:`LocalEnsembleAnalysis`, :class:`KalmanAnalysis`,
             :class:`EKFAnalysis` or :class:`UKFAnalysis`; :class:`~torch_denkf.imperfect.Visible` of one of these, whose
             readings the gate does not count while their probability of being about the state is below one half; or a
-            :class:`LaggedAnalysis`, whose past a reading then corrects as far as it is believed. Its keys and its noise
+            :class:`LaggedAnalysis`, whose past a reading then corrects likewise. Its keys and its noise
             are kept.
         observation_dim: O, components of the reading.
         **options: see :class:`GateOptions`.
@@ -240,7 +240,7 @@ class GatedAnalysis(Around):
         if self.rate:
             evidence, total = terms.sum(-3).unbind(-1)
             limit = self.limits[total.long()] * self.slack
-            if rejects:  # what was rejected is believed again when it fits well, not when it is just within the limit
+            if rejects:  # hysteresis: accepted again when it fits well, not when it is just within the limit
                 limit = torch.where(shut > 0, self.usual[total.long()], limit)
             limit = limit.to(dtype)
             factor = torch.where(seen, disbelief(evidence, limit, self.response, freedom=self.freedom), 1)

@@ -1,4 +1,4 @@
-"""Watches the innovations of a filter's sensors, and says which of them is not to be believed."""
+"""Watches the innovations of a filter's sensors, and raises an alarm for each that is inconsistent."""
 
 from __future__ import annotations
 

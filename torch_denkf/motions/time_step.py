@@ -31,5 +31,5 @@ def check_dt(dt: float | NestedKey) -> None:
 
 
 def for_members(dt: float | Tensor) -> float | Tensor:
-    """Returns a time step ``[*B, 1]`` as ``[*B, 1, 1]``, beside ensembles ``[*B, E, S]``."""
+    """Returns a time step ``[*B, 1]`` as ``[*B, 1, 1]``, next to ensembles ``[*B, E, S]``."""
     return dt.unsqueeze(-2) if isinstance(dt, Tensor) else dt

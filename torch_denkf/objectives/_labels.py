@@ -44,7 +44,7 @@ class Keys:
         observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``; by default the one that the sensor's update reads.
         sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``, or the name of one sensor of several; by
             default those that the filter's one sensor writes.
-        visible: probability that the reading is about the state, ``[*B, 1]``, as a head beside the sensor says.
+        visible: probability that the reading is about the state, ``[*B, 1]``, as a head next to the sensor says.
         target_visible: whether it is, ``[*B, 1]``, bool or 0 and 1; NaN where that is not known.
         visible_observed: where it is known, ``[*B, 1]``, bool; by default its name and ``_observed``.
     """
@@ -335,7 +335,7 @@ def check_row_mask(key: NestedKey, mask: Tensor, values: Tensor) -> None:
 
 
 def mask_of(key: NestedKey) -> NestedKey:
-    """Returns the mask that data sets write beside an entry.
+    """Returns the mask that data sets write next to an entry.
 
     Example:
         >>> mask_of("state"), mask_of(("truth", "x"))

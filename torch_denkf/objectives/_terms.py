@@ -140,7 +140,7 @@ class Visible(Term):
     needs_state = False
 
     def forward(self, out, truth):
-        p = truth.entry(truth.keys.visible, "A Visibility beside the sensor writes it. ")
+        p = truth.entry(truth.keys.visible, "A Visibility next to the sensor writes it. ")
         labels = truth.visible()
         target = labels.values.to(p.dtype)
         return labels.mean(nn.functional.binary_cross_entropy(p, target, reduction="none")), labels.rows

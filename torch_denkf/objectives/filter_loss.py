@@ -146,7 +146,7 @@ class Term(nn.Module):
 
 @dataclass
 class SequenceKeys(Keys):
-    """The entries that losses of whole filters read beside those of all losses.
+    """The entries that losses of whole filters read besides those of all losses.
 
     Attributes:
         belief: prefix of the belief's entries: ``mean`` and ``cov``, or ``ensemble`` and ``log_weight``.

@@ -199,7 +199,7 @@ class TransitionLoss(FilterLoss):
             ``"crps"``, ``"nll"`` or ``"mse"`` of a Gaussian, as in :class:`~torch_denkf.objectives.GaussianLoss`. A
             transition without noise has no spread but ``spread``: teach it by ``"mse"``.
         spread: standard deviation around the truth, in the state's units: a number or ``[S]``, of a space of tangents
-            ``[D]``. Members are drawn anew in each call.
+            ``[D]``. Members are drawn again in each call.
         members: E; by default as many as the initial belief has. One is a point, for ``"mse"`` alone.
         belief: prefix of the carried ``ensemble``, or of ``mean`` and ``cov``.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).

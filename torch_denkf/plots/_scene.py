@@ -104,7 +104,7 @@ class Scene:
                 line.set_path_effects([withStroke(linewidth=line.get_linewidth() + 1, foreground="white")])
 
     def _shrink_labels(self) -> None:
-        """Makes the bands' names fit beside their Axes, all of one size."""
+        """Makes the bands' names fit next to their Axes, all of one size."""
         self.figure.draw_without_rendering()
         labels = [axes.yaxis.label for axes in self.bands]
         needed = [label.get_window_extent().height for label in labels]

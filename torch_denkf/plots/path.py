@@ -1,4 +1,4 @@
-"""The path that a filter believes in, against the truth."""
+"""The path of the belief, against the truth."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def plot_path(
     legend: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draws the believed path with its spread, the true one and others, with one scale for both axes.
+    """Draws the mean path with its spread, the true one and others, with one scale for both axes.
 
     Args:
         run: a roll-out or sequence of T steps with ``("belief", "mean")`` ``[T, S]`` or ``("belief", "ensemble")``

@@ -1,4 +1,4 @@
-"""Videos: frames to a file, and a belief that grows with time beside what the camera saw."""
+"""Videos: frames to a file, and a belief that grows with time next to what the camera saw."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def belief_video(
     Raises:
         ImportError: without matplotlib or pillow; the message names the extra.
         KeyError: if the roll-out lacks a key that was named.
-        ValueError: if there is nothing to draw, and for all that the functions above refuse.
+        ValueError: if there is nothing to draw, and for all errors of the functions above.
 
     Example:
         >>> import tempfile

@@ -83,7 +83,7 @@ def save_pretrained(
 ) -> Path:
     """Writes a filter to a folder that :func:`from_pretrained` reads.
 
-    The filter is built anew from its settings, and compared with the one that is to be stored: numbers of members,
+    The filter is built again from its settings, and compared with the one that is to be stored: numbers of members,
     keys, schemes, shapes, whatever does not come back with the weights. Where the two differ, nothing is written.
 
     Args:

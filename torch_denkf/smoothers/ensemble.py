@@ -112,7 +112,7 @@ class EnKS(Smoother):
         self.prefix = prefix_of(filter, "ensemble", self)
         keys = [(self.prefix, "ensemble")] + [(self.prefix, "past")] * (lag != 0)
         super().__init__(filter, lag, keys, ("ensemble", "mean", "var"))
-        self._filter_for(2)  # refuses what a lag cannot be added to
+        self._filter_for(2)  # raises for modules that cannot have a lag
 
     def _extended(self, lag):
         return FixedLag(self.filter, lag) if lag else self.filter

@@ -32,7 +32,7 @@ class CrossTransition(Wrapper, Transition):
         transition: :class:`LinearTransition`, :class:`EKFTransition` or :class:`UKFTransition`; its keys and its noise
             are kept.
         with_open: whether it also writes ``"open"``, the covariance of the state before the step where that after it is
-            known, ``[*B, S, S]``; ``"cross"`` has rows before the step, ``[*B, S, S]``, and both stand beside the mean.
+            known, ``[*B, S, S]``; ``"cross"`` has rows before the step, ``[*B, S, S]``, and both stand by the mean.
 
     Raises:
         TypeError: for another transition.
@@ -80,7 +80,7 @@ def _oldest_carried(prefix: str, lag: int, entries: Entries, *, space: Space | N
 
 
 def _oldest(cov: torch.Tensor, past_mean, past_cov, past_gain) -> tuple[torch.Tensor, ...]:
-    """Returns mean, covariance and variance of the oldest state, beside the covariance of the present one."""
+    """Returns mean, covariance and variance of the oldest state, next to the covariance of the present one."""
     gain = past_gain[..., -1, :, :]
     smoothed = past_cov[..., -1, :, :] + gain @ cov @ gain.mT
     smoothed = (smoothed + smoothed.mT) / 2
@@ -127,7 +127,7 @@ class MomentsPast(SubModel):
 
 
 class LaggedMoments(SubModel):
-    """The past after a reading, and what is believed of the state L steps ago.
+    """The past after a reading, and the smoothed belief of the state L steps ago.
 
     Args:
         belief_prefix: prefix of ``mean``, ``cov`` and of the past that is carried on, see ``MOMENTS_PAST``.

@@ -152,7 +152,7 @@ class FilterTrainer(HookPoints):
         """Trains to the end; where a checkpoint is, from there.
 
         Args:
-            resume: ``False`` removes an earlier run's checkpoints and logs from ``out`` and starts anew.
+            resume: ``False`` removes an earlier run's checkpoints and logs from ``out`` and restarts.
 
         Returns:
             for each stage: ``value`` of the monitored error (``None`` without validation) at its best ``update``, all
@@ -304,12 +304,12 @@ class FilterTrainer(HookPoints):
             self._logs.open(state["logs"])
             if state["stage"] == len(self.stages):
                 _LOG.warning(
-                    "The training in %s is finished: its result is read and nothing is trained. Start anew with "
+                    "The training in %s is finished: its result is read and nothing is trained. Start again with "
                     "fit(resume=False), or give another out.",
                     self.out,
                 )
             return state
-        if self.last_checkpoint.exists():  # the caller wants to start anew
+        if self.last_checkpoint.exists():  # the caller wants to start again
             for file in (self.last_checkpoint, *self.out.glob("best_*.pt")):
                 file.unlink(missing_ok=True)
         else:

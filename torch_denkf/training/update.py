@@ -127,7 +127,7 @@ class Updates:
         return {**values, "skipped": float(self.skipped)}
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that the next update depends on, beside the model."""
+        """Returns all that the next update depends on, besides the model."""
         return {
             "optimiser": self.optimiser.state_dict(),
             "schedule": self.schedule.state_dict(),

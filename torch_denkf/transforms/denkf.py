@@ -46,8 +46,8 @@ class DEnKFTransform(Checked, Transform):
     the frame already, and count each reading twice. In one process a warning says so; across processes, or where the
     belief is copied on its way, it is not noticed. Behind this transform, torchrl's ``FrameSkipTransform`` makes
     one step of the belief a skip, with the last frame; put it in front, where it skips for the environment alone. With
-    groups of agents, the belief is the environment's, and starts anew where the environment's own ``done`` says so; an
-    environment without one is refused.
+    groups of agents, the belief is the environment's, and is reset where the environment's own ``done`` says so; an
+    environment without one raises an error.
 
     Args:
         filter: any :class:`~torch_denkf.filters.Filter`, also one inside a :class:`~torch_denkf.smoothers.FixedLag` or
@@ -209,7 +209,7 @@ class DEnKFTransform(Checked, Transform):
         masks = [mask for mask in (tensordict.get(key, None) for key in keys) if mask is not None]
         if not masks:
             return None
-        # The belief is the environment's: it starts anew where any group or agent does.
+        # The belief is the environment's: it is reset where any group or agent does.
         return torch.stack([mask.reshape(*tensordict.batch_size, -1).any(-1) for mask in masks]).any(0)
 
     def _trial(self, row: TensorDictBase) -> dict[NestedKey, torch.Tensor]:
@@ -311,7 +311,7 @@ class DEnKFTransform(Checked, Transform):
         """Filters a sequence ``[*B, T]``, e.g. a sample of a replay buffer; see :class:`Filter`.
 
         torchrl's buffers apply their transforms before ``SliceSampler`` marks the slices: a buffer of flat slices is
-        refused. Filter what it returns, or store whole windows ``[T]`` as its items.
+        an error. Filter what it returns, or store whole windows ``[T]`` as its items.
 
         Raises:
             ValueError: if a flat batch seems to hold several sequences that are not marked.

@@ -16,7 +16,7 @@ def refuse_resets_of_groups(reset_keys: Sequence[NestedKey], kept: Iterable[Nest
 
     Args:
         reset_keys: of the environment.
-        kept: keys that start anew with each episode.
+        kept: keys that are reset with each episode.
 
     Raises:
         ValueError: if episodes end in groups of agents alone, and an entry stands outside of them.
@@ -35,7 +35,7 @@ def refuse_resets_of_groups(reset_keys: Sequence[NestedKey], kept: Iterable[Nest
 
 
 class LastAction(TensorDictPrimer):
-    """Keeps the action that led to an observation, as ``("previous", "action")`` beside it; zero after a reset.
+    """Keeps the action that led to an observation, as ``("previous", "action")`` next to it; zero after a reset.
 
     A filter in a policy runs before the next action is chosen, and needs the last one.
     :meth:`torch_denkf.filters.Filter.make_tensordict_primer` brings it where actions drive the filter; append it

@@ -89,7 +89,7 @@ class BaseVelocity(SubModel):
 
 
 class StartEnsemble(AroundState):
-    """Members around where a robot starts that stands still, with the base's velocity beside them.
+    """Members around where a robot starts that stands still, with the base's velocity next to them.
 
     Args:
         std: standard deviations of tangents, as of :class:`AroundState`.
@@ -114,7 +114,7 @@ class StartEnsemble(AroundState):
 
 
 class StartMoments(GaussianAround):
-    """A mean and a covariance around where a robot starts that stands still, with the base's velocity beside them.
+    """A mean and a covariance around where a robot starts that stands still, with the base's velocity next to them.
 
     Args:
         std: standard deviations of tangents, as of :class:`GaussianAround`.

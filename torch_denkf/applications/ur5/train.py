@@ -220,7 +220,7 @@ def _believe(behind: Filter, readings: TensorDict, seed: int = 0) -> TensorDict:
 def evaluate_ur5_table(
     model: UR5TableFilter, demos: str | Path, *, missing: float = 0.0, cache: Path | bool = True, progress: bool = True
 ) -> dict[str, Any]:
-    """Returns errors on whole demos of the test side, beside the sensor alone.
+    """Returns errors on whole demos of the test side, next to the sensor alone.
 
     Args:
         model: the filter.

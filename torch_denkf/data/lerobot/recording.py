@@ -240,7 +240,7 @@ def _check_seen(episode: EpisodeFiles, seen: np.ndarray) -> None:
     source = episode.video or episode.data
     if not seen.any():
         raise ValueError(
-            f"{source} shows none of the {episode.length} frames of episode {episode.number}; download it anew"
+            f"{source} shows none of the {episode.length} frames of episode {episode.number}; download it again"
         )
     missing = np.flatnonzero(~seen).tolist()
     if missing:

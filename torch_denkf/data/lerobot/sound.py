@@ -31,20 +31,20 @@ def sound_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray,
     try:
         times = np.asarray(times, np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{source}: a timestamp is no number ({error}); download it anew") from error
+        raise ValueError(f"{source}: a timestamp is no number ({error}); download it again") from error
     good = sound(times)
     wrong = np.flatnonzero(~good)
     if len(wrong) > MOST_WRONG * len(times):
         raise ValueError(
             f"{source}: the timestamp {times[wrong[0]]:g} of frame {wrong[0]} does not increase, nor do "
-            f"{len(wrong) - 1} others of {len(times)}; expected seconds that count frames, k / fps: download it anew, "
-            "or write them anew"
+            f"{len(wrong) - 1} others of {len(times)}; expected seconds that count frames, k / fps: download it again, "
+            "or write them again"
         )
     step = float(np.median(np.diff(times[good]))) if good.sum() > 1 else 1 / fps
     if abs(step * fps - 1) > OFF:
         raise ValueError(
             f"{source}: timestamps are {step:.4g} s apart, but fps in meta/info.json is {fps:g}, which makes "
-            f"{1 / fps:.4g} s; correct fps there, or write the timestamps anew"
+            f"{1 / fps:.4g} s; correct fps there, or write the timestamps again"
         )
     return (filled(times, good, 1 / fps) if len(wrong) else times), good
 
@@ -99,7 +99,7 @@ def _last_sound(episode: Tensor, finite: Tensor, name: str, source: str) -> Tens
     if bool(empty.any()):
         number = int(episode[empty][0])
         raise ValueError(
-            f"{source}: no row of episode {number} has a {name!r} that is finite; download it anew, or leave the "
+            f"{source}: no row of episode {number} has a {name!r} that is finite; download it again, or leave the "
             "episode out"
         )
     return index

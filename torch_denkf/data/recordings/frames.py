@@ -184,7 +184,7 @@ class Images(Frames):
             that is missing is a picture that is missing; a warning counts them.
 
     Raises:
-        ValueError: as :class:`Frames`, for a ``rate`` that is not positive, and for ``times`` beside it.
+        ValueError: as :class:`Frames`, for a ``rate`` that is not positive, and for ``times`` next to it.
 
     Examples:
         >>> Images("run1/images", rate=10.0).sample

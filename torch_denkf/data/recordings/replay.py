@@ -135,7 +135,7 @@ class RecordingReplay(EpisodeReplay):
     With ``"linear"`` every value counts as observed. Readings that come late, of a :class:`~torch_denkf.data.Table`
     with ``arrived``, are observed in the first row after they arrived.
 
-    Pictures are decoded once, scaled to ``size`` and memory-mapped. Tables are read anew each time.
+    Pictures are decoded once, scaled to ``size`` and memory-mapped. Tables are read again each time.
 
     Args:
         recordings: one, or several with the same streams; each is an episode.

@@ -69,7 +69,7 @@ class Table:
 
     Raises:
         ValueError: for an unknown ``unit``, ``sample`` or ``repeats``, tolerances that are not positive, and
-            ``arrived`` beside another ``sample`` than ``"last"``.
+            ``arrived`` with another ``sample`` than ``"last"``.
 
     Examples:
         >>> from tempfile import mkdtemp
@@ -138,7 +138,7 @@ class Table:
                     "s; a reading arrives after it was taken: exchange the two columns, or correct them"
                 )
         if not names:
-            raise ValueError(f"{self.file} has no column to read beside {self.time!r}; leave the stream out")
+            raise ValueError(f"{self.file} has no column to read besides {self.time!r}; leave the stream out")
         if unknown := set(self.origin or ()) - set(names):
             raise ValueError(f"origin names {sorted(map(str, unknown))}, but {self.file} is read for {list(names)}")
         for name, origin in (self.origin or {}).items():
@@ -152,7 +152,7 @@ class Table:
 
 
 def check_stream(sample: str, ways: Sequence[str], tolerance: float | None, unit: str) -> None:
-    """Refuses options that no stream has.
+    """Raises for options that no stream has.
 
     Raises:
         ValueError: if there is one.
@@ -166,7 +166,7 @@ def check_stream(sample: str, ways: Sequence[str], tolerance: float | None, unit
 
 
 def check_times(times: np.ndarray, place: Callable[[int], str], column: str) -> None:
-    """Refuses times that stand still or go back.
+    """Raises for times that stand still or go back.
 
     Args:
         times: s, ``[n]``.
@@ -272,9 +272,9 @@ def _read_csv(file: Path, time: str, columns: Sequence[str] | None):
                     raise _no_number(place, name, text)
                 lines.append(reader.line_num)
     except UnicodeDecodeError as error:
-        raise ValueError(f"{file} is no text in UTF-8 ({error}); store it anew as CSV in UTF-8") from error
+        raise ValueError(f"{file} is no text in UTF-8 ({error}); store it again as CSV in UTF-8") from error
     except csv.Error as error:
-        raise ValueError(f"{file}:{reader.line_num}: {error}; store it anew as CSV") from error
+        raise ValueError(f"{file}:{reader.line_num}: {error}; store it again as CSV") from error
     table = np.array(numbers, dtype=np.float64).reshape(-1, len(names))
     return tuple(names[1:]), table, lambda row: f"{file}:{lines[row]}" if lines else str(file)
 

@@ -31,7 +31,7 @@ def backward_weights(log_weights: Tensor, log_transition: Tensor, log_smoothed: 
         ValueError: if the shapes do not fit.
 
     Examples:
-        Two particles, of which only the second can have led to the later one that is believed:
+        Two particles, of which only the second can have led to the later one with all weight:
 
         >>> import torch
         >>> even = torch.tensor([0.5, 0.5]).log()

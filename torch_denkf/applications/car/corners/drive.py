@@ -113,7 +113,7 @@ def corner_replay(drives: dict[str, TensorDict], **options) -> EpisodeReplay:
 def _read_entries(file: Path) -> dict[str, np.ndarray]:
     if not file.is_file():
         raise FileNotFoundError(f"no file {file}; check the path")
-    damaged = f"{file} is no npz file of numbers ({{}}); download or copy it anew"
+    damaged = f"{file} is no npz file of numbers ({{}}); download or copy it again"
     try:
         with zipfile.ZipFile(file) as archive:
             if (size := sum(part.file_size for part in archive.infolist())) > MOST_BYTES:

@@ -95,7 +95,7 @@ def read_kitti_drive(
     exactly them. The first pose of the file has none and takes that of the next. v is signed: negative in reverse.
     After a gap both are means over it, and no image pair reaches over it.
 
-    Reading a drive anew decodes each image; the result is kept as a memory-mapped TensorDict, whose key covers the
+    Reading a drive again decodes each image; the result is kept as a memory-mapped TensorDict, whose key covers the
     folder, the options, and the names, times and sizes of all files read. Old entries may be deleted at any time.
 
     Args:
@@ -249,7 +249,7 @@ def _read(
             pool.shutdown(wait=False, cancel_futures=True)  # without it, thousands of images would still be decoded
             raise
     if native is None:
-        raise ValueError(f"none of the {len(numbers)} images in {folder / camera} can be read; download them anew")
+        raise ValueError(f"none of the {len(numbers)} images in {folder / camera} can be read; download them again")
     calibration = scale_calibration(read_calibration(folder / "calib.txt", camera), native, size)
     return TensorDict(
         {

@@ -80,7 +80,7 @@ def _check_poses(file: Path, poses: np.ndarray) -> None:
 
 
 def check_speeds(file: Path, poses: np.ndarray, dt: np.ndarray) -> None:
-    """Refuses poses that no robot goes through.
+    """Raises for poses that no robot goes through.
 
     Args:
         file: that they are from.
@@ -96,7 +96,7 @@ def check_speeds(file: Path, poses: np.ndarray, dt: np.ndarray) -> None:
         row = int(wrong[0])
         raise ValueError(
             f"{file}:{row + 2}: the position is {ways[row]:g} m from that of the row before, {dt[row]:g} s earlier; "
-            f"expected metres, and at most {FASTEST:g} m/s. Correct the row, or write the poses anew"
+            f"expected metres, and at most {FASTEST:g} m/s. Correct the row, or write the poses again"
         )
 
 

@@ -45,7 +45,7 @@ class KITTIOdometryExperienceReplay(EpisodeReplay):
     sampled, from the drives' memory-mapped frames, so that neither float images nor mirrored copies are kept. All of
     KITTI takes 0.5 GB on disk at 50 x 150 in colour for each camera.
 
-    Poses are those of the left grey camera, as in the benchmark; the others are beside it, at most 0.5 m.
+    Poses are those of the left grey camera, as in the benchmark; the others are next to it, at most 0.5 m.
 
     ``drives`` names the drives of the split ``"train"``, the default: none is for tests unless ``test_share`` says so.
     All cameras and mirror images of a drive are on the same side.

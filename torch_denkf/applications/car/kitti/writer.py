@@ -25,7 +25,7 @@ from torch_denkf.deployment.workers import follow_parent
 
 FORMAT = 3  # raise it when drives of the same options come out differently
 MARKER = "drive.json"
-STRETCH = 500  # frames that a process draws at a time; another process would have to make the scene anew
+STRETCH = 500  # frames that a process draws at a time; another process would have to make the scene again
 REPORTED = 40  # frames after which the only process says how far it is
 GRAIN = 1.5  # grey values: standard deviation of the images' noise
 

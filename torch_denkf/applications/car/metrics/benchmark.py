@@ -44,7 +44,7 @@ def kitti_pathlength_error(
     errors on the way may cancel; it is not wrapped, so that an estimate that is right but for a whole turn scores
     360 deg, and wrapped angles must be unwrapped first. One run counts, from its first row. Report
     the mean of :func:`~torch_denkf.applications.car.metrics.odometry.kitti_endpoint_error` over the same windows
-    beside it, which is what the other papers' numbers are.
+    next to it, which is what the other papers' numbers are.
 
     Args:
         estimated: poses (x m, y m, θ rad), θ unwrapped, ``[*B, T, 3]``.

@@ -18,7 +18,7 @@ __all__ = ["MemberGain"]
 class MemberGain(SubModel):
     r"""Multiplies the sensor's samples by factors that belong to the members: :math:`\tilde y^i e^{\sigma z^i}`.
 
-    A camera that is mounted a little lower reads all speeds a little too high, today and tomorrow. Drawn anew for each
+    A camera that is mounted a little lower reads all speeds a little too high, today and tomorrow. Drawn again for each
     frame, such an error averages out over time, and the filter becomes too sure of itself; or its noise model takes the
     error for white noise, and the filter follows too slowly. Here the :math:`z^i` are the normal quantiles of E
     members, always the same: each member keeps its calibration, the ensemble its doubt. Put it behind the sensor.

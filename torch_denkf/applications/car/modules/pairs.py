@@ -1,7 +1,7 @@
 r"""Readings that span several steps: where frames are missing, a sensor can compare a frame with the last that arrived.
 
 What it reads then is the way over the whole gap. A filter that is to learn from it must remember its own velocities of
-the past steps, "clones" in the words of Roumeliotis & Burdick (2002): either beside the state (:func:`with_history`,
+the past steps, "clones" in the words of Roumeliotis & Burdick (2002): either next to the state (:func:`with_history`,
 for :class:`torch_denkf.applications.car.UnicycleMotion`) or in it (:class:`ClonedPrior`, :class:`ClonedTransition`, for
 filters whose covariance or weights carry the pose along).
 """
@@ -68,7 +68,7 @@ class PairObservation(SubModel):
 
     Where frames are missing, a pair of the last frame that arrived and the present one still measures the whole way
     between them. The members carry their velocities of the past steps, and the analysis corrects those, too
-    ("stochastic cloning"); :class:`UnicycleMotion` then moves the pose over the gap anew. Use with
+    ("stochastic cloning"); :class:`UnicycleMotion` then moves the pose over the gap again. Use with
     ``EnsembleAnalysis(forecast_key=("forecast", "clone"), observed_key=("forecast", "observed"),
     belief_prefix="analysis")`` and an initial belief :func:`with_history`.
 
@@ -127,7 +127,7 @@ class PairObservation(SubModel):
         history = history[0] if history else forecast[..., 5:].unflatten(-1, (-1, 2))
         past = within_pair(steps, history)
         way = forecast[..., 3:5] + torch.where(past, history, 0.0).sum(-2)
-        # Neighbours are always read, and so is what the forecast knows little of: a filter that believes itself too
+        # Neighbours are always read, and so is what the forecast knows little of: a filter whose belief is too
         # fast would otherwise stay blind.
         least = way.mean(-2).abs()
         if way.shape[-2] > 1:  # an extended Kalman filter asks at one point

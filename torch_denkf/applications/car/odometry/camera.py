@@ -103,7 +103,7 @@ class CarCamera:
     def motion(self, previous: np.ndarray, current: np.ndarray) -> tuple[dict[str, Tensor], float]:
         """Returns flow and road of a pair, rounded as for the training; and how corners moved, where they are tracked.
 
-        Beside it the share of the picture that stands still.
+        Next to it the share of the picture that stands still.
         """
         static = static_region(previous, current)
         hidden = {"hidden": static} if self.repair and static.any() else {}
@@ -117,7 +117,7 @@ class CarCamera:
 
 
 class _Watch:
-    """Warns, once each, where the readings contradict what is said about the camera."""
+    """Warns, once each, where the readings contradict the given calibration."""
 
     def __init__(self, pitch: float):
         self.pitch, self.said = pitch, False

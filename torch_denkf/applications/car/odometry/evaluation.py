@@ -1,4 +1,4 @@
-"""Errors of a car filter on drives with known poses, beside dead reckoning on the same readings."""
+"""Errors of a car filter on drives with known poses, next to dead reckoning on the same readings."""
 
 from __future__ import annotations
 

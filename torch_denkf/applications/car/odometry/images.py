@@ -112,7 +112,7 @@ def read_times(file: str | Path) -> list[float]:
 
 
 class FrameSource:
-    """Frames of a folder or a video, one at a time, each time anew; see :func:`read_frames`.
+    """Frames of a folder or a video, one at a time, each time again; see :func:`read_frames`.
 
     Attributes:
         first: number of the first frame: that of its name in a folder of numbered images, else 0.

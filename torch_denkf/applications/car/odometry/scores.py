@@ -59,7 +59,7 @@ def belief_loss(model: Filter, unit: Tensor) -> DEnKFLoss:
 
 
 class EndToEndLoss(nn.Module):
-    """The filter's loss, and the sensor's own beside it."""
+    """The filter's loss, and the sensor's own next to it."""
 
     def __init__(self, belief: nn.Module, sensor: SensorLoss):
         super().__init__()

@@ -96,7 +96,7 @@ def track(
         Beliefs, one for each frame that is used, from the first pair on.
 
     Raises:
-        ValueError: if calibration, height, times or images are not as said above.
+        ValueError: if calibration, height, times or images are not as above.
 
     Example:
         >>> from torch_denkf.applications.car.odometry.filter import car_filter

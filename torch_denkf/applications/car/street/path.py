@@ -75,7 +75,7 @@ class Path:
         return np.stack([-np.cos(self.heading), -np.sin(self.heading)], -1)
 
     def at(self, along: np.ndarray, aside: np.ndarray | float = 0.0) -> np.ndarray:
-        """Places on or beside the line.
+        """Places on or next to the line.
 
         Args:
             along: m from the line's first point, ``[T]``.
@@ -91,7 +91,7 @@ class Path:
 
 
 def check_length(name: str, points: np.ndarray) -> None:
-    """Refuses paths that are too long to lay a scene out along them.
+    """Raises for paths that are too long to lay a scene out along them.
 
     Args:
         name: of the path, for the message.

@@ -1,4 +1,4 @@
-"""Lays out a random scene along a path: the road's surface, and what stands beside it."""
+"""Lays out a random scene along a path: the road's surface, and what stands next to it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HOUSE, TREE, POLE, CAR, HEDGE = range(5)
 def roadside_scene(
     path: np.ndarray, rng: np.random.Generator, *, ground: np.ndarray | None = None, traffic_on: bool = False
 ) -> Scene:
-    """Puts a road under a path, and houses, hedges, trees, poles and parked cars beside it.
+    """Puts a road under a path, and houses, hedges, trees, poles and parked cars next to it.
 
     Nothing stands on the road, whichever stretch of it: where a path crosses or repeats itself, one scene serves all
     visits.

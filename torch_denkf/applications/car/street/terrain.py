@@ -68,7 +68,7 @@ class Terrain:
         ticks = CELL * np.arange(nodes)
         x, z = ((origin[k] + ticks)[:, None] - self.line[piece, k] for k in (0, 1))
         x, z = x.astype(np.float32) ** 2, z.astype(np.float32) ** 2
-        # Weights fall with the twelfth power of the distance: on the path the height is the path's, beside it the
+        # Weights fall with the twelfth power of the distance: on the path the height is the path's, next to it the
         # nearest points', and there is no step anywhere.
         weight = z[:, None] + (x + 6.0)
         weight *= weight * weight

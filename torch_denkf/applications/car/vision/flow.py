@@ -26,7 +26,7 @@ def dense_flow(previous: np.ndarray, current: np.ndarray, camera: CanonicalCamer
     """
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(0)
-    previous, current = (np.ascontiguousarray(image) for image in (previous, current))  # OpenCV refuses cut-outs
+    previous, current = (np.ascontiguousarray(image) for image in (previous, current))  # OpenCV takes no views
     # Searched from the current image, so that the vectors stand on its grid.
     flow = dis.calc(current, previous, None)  # type: ignore[call-overload]  # cv2 does not say that None is one to make
     return -flow / camera.focal

@@ -74,7 +74,7 @@ def static_region(previous: np.ndarray, current: np.ndarray, *, noise: int = 0, 
 def picture_signs(previous: np.ndarray, current: np.ndarray, *, noise: int = 0) -> np.ndarray:
     """Numbers that are small for two pictures of a sound camera, and large for those of one that fails.
 
-    An :class:`torch_denkf.monitoring.InnovationMonitor` watches them beside the innovations, and a
+    An :class:`torch_denkf.monitoring.InnovationMonitor` watches them besides the innovations, and a
     :class:`torch_denkf.monitoring.SignGate` takes readings out by them; both take from clean data what is large.
 
     ============ ======================================================================================================
@@ -124,7 +124,7 @@ def plane_distance(flow: Tensor, *, height: float = KITTI_HEIGHT) -> Tensor:
     r"""Estimates the distance moved over a road from the flow below the horizon, as a cross-check.
 
     A point of the road at p, in tangents, is :math:`h / y` away, where y is how far it lies below the focus of
-    expansion e. A camera that drives d moves it by :math:`d\, y / h\, (p - e)`, beside its turn. Each cell of the flow
+    expansion e. A camera that drives d moves it by :math:`d\, y / h\, (p - e)`, besides its turn. Each cell of the flow
     gives a distance, and their median stands even where a car hides the lane, which :func:`road_correlation` reads.
 
     It is too small, because dense flow shrinks on the near road: by 11 % on rendered drives, with a scatter of 5 %.

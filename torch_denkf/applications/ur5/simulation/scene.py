@@ -112,7 +112,7 @@ class UR5Scene:
             mujoco.mj_resetData(self.model, data)
 
     def reset(self, joints: np.ndarray, position: np.ndarray, rotation: np.ndarray, settle: int = 0) -> None:
-        """Starts anew, at rest, with these joints ``[7]`` and the object there (quaternion).
+        """Resets the scene, at rest, with these joints ``[7]`` and the object there (quaternion).
 
         Args:
             joints: rad, true ones; the commands are theirs less the offset.

@@ -90,7 +90,7 @@ def _free_pose(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 def _home(scene: UR5Scene, rng: np.random.Generator, opening: float) -> np.ndarray:
     position, rotation = _free_pose(rng)
     start = READY.copy()
-    # The arm's plane lies 109 mm beside the base's axis.
+    # The arm's plane lies 109 mm next to the base's axis.
     x, y = position[0] + 0.55, position[1]
     start[0] = np.arctan2(y, x) - np.arcsin(min(0.9, 0.109 / np.hypot(x, y)))
     return np.append(inverse_kinematics(scene, position, rotation, start), opening)
