@@ -43,7 +43,7 @@ def test_what_is_read(tmp_path, text, options):
         (GOOD.split("\n", 1)[1], "its first line must name the columns"),
         ("# a run\n" + GOOD, "pass time= for the column of times"),
         (GOOD.replace("x,y", "x,x"), "has two columns 'x'"),
-        ("time\n0\n1\n", "has no column to read beside 'time'"),
+        ("time\n0\n1\n", "has no column to read besides 'time'"),
         (GOOD.replace("1,11", "1,11,5"), r"run.csv:3: 4 cells for 3 columns; write decimals with points"),
         (GOOD.replace("11", "1_1"), r"run.csv:3: 'y' is '1_1'"),
         (GOOD.replace("11", "1e39"), r"run.csv:3: 'y' is '1e39'"),  # infinite in float32
