@@ -22,7 +22,7 @@ from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.ensemble import Rotated
 from torch_denkf.modules.gaussian import further_keys
 from torch_denkf.modules.motion_noise import NoisyTransition
-from torch_denkf.modules.spaces import mean_reading, told
+from torch_denkf.modules.spaces import mean_reading, narrowed_mask
 from torch_denkf.running import check_module, random_parts, run_module
 from torch_denkf.submodel import Call, Entries, Initial, flat_noise, role
 
@@ -114,7 +114,7 @@ class IteratedAnalysis(Rotated):
         check_module("observation", observation)
         check_count("iterations", iterations)
         check_number("inflation", inflation, above=0)
-        _refuse_other_noise(transition, observation)
+        _check_same_noise(transition, observation)
         self_made = [ensemble_key, *map(unravel_key, transition.out_keys)]
         further, optional = further_keys([transition, observation], [*self_made, observation_key, noise_variance_key])
         out_keys = [(belief_prefix, name) for name in ("ensemble", "mean", "var")]
@@ -139,7 +139,7 @@ class IteratedAnalysis(Rotated):
         """Returns the belief, the smoothed belief, and the diagnostics."""
         ensemble, reading, variance = (self.required(entries, key) for key in self.in_keys[:3])
         space, on = self.space, self.reading_space
-        observed = told(on, entries.get(self.observed_key))
+        observed = narrowed_mask(on, entries.get(self.observed_key))
         if reading.ndim == ensemble.ndim:
             reading = mean_reading(on, reading, observed)
         center = ensemble[..., :1, :] if space is None else space.mean(ensemble).unsqueeze(-2)
@@ -202,7 +202,7 @@ class IteratedAnalysis(Rotated):
         return changed if observed is None else torch.where(observed.any(-1)[..., None, None], changed, smoothed)
 
 
-def _refuse_other_noise(transition: TensorDictModuleBase, observation: TensorDictModuleBase) -> None:
+def _check_same_noise(transition: TensorDictModuleBase, observation: TensorDictModuleBase) -> None:
     parts: Sequence = [*random_parts(transition, "transition"), *random_parts(observation, "observation")]
     other = [f"{place} ({type(part).__name__})" for place, part in parts if not isinstance(part, NoisyTransition)]
     if other or any(place.startswith("observation") for place, _ in parts):

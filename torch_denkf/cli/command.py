@@ -105,8 +105,8 @@ class Command:
 
         drawn = io.StringIO()
         try:
-            _refuse_empty(words)
-            _refuse_unknown(cls, words)
+            _check_no_empty_word(words)
+            _check_known(cls, words)
             with contextlib.redirect_stderr(drawn):
                 return tyro.cli(
                     cls,
@@ -147,14 +147,14 @@ def say(text: str) -> None:
     sys.stdout.write(f"{text}\n")
 
 
-def _refuse_empty(words: Sequence[str]) -> None:
+def _check_no_empty_word(words: Sequence[str]) -> None:
     """Raises for an empty word: a variable of the shell that is not set, and as a path the working folder."""
     for before, word in zip(["", *words], words, strict=False):
         if not word or (word.startswith("--") and word.endswith("=")):
             raise ValueError(f"argument {word.rstrip('=') or before}: must not be empty")
 
 
-def _refuse_unknown(command: type, words: Sequence[str]) -> None:
+def _check_known(command: type, words: Sequence[str]) -> None:
     """Raises for a misspelt option by its name: a parser would first miss the one that was meant."""
     known = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(command)]
     allowed = {"--help", *known, *(f"--no-{option[2:]}" for option in known)}

@@ -10,7 +10,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-__all__ = ["placed", "put_back", "refuse_other_numbers", "tensors"]
+__all__ = ["check_same_numbers", "placed", "put_back", "tensors"]
 
 #: Roundings by which two orders of the same sums may differ: of the largest number in a column, and in an entry.
 _OF_COLUMN, _OF_ENTRY = 1000, 10
@@ -18,7 +18,7 @@ _OF_COLUMN, _OF_ENTRY = 1000, 10
 _NUDGE, _NUDGES = 8, 32
 
 
-def refuse_other_numbers(
+def check_same_numbers(
     compiled: Callable,
     eager: Callable,
     inputs: Sequence[Any],

@@ -12,7 +12,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf._checks import has_values
-from torch_denkf.compilation.compared import placed, refuse_other_numbers, tensors
+from torch_denkf.compilation.compared import check_same_numbers, placed, tensors
 from torch_denkf.compilation.libraries import clear_damaged_libraries
 from torch_denkf.compilation.options import need_compiler, options_for_processors
 from torch_denkf.filters.scan import Steps
@@ -120,7 +120,7 @@ class CompiledSteps:
         function, compared = self._functions[kind]
         mode = torch.is_grad_enabled(), some.dtype  # torch.compile compiles again for each
         if mode not in compared and self._checked(device) and has_values(some):
-            refuse_other_numbers(
+            check_same_numbers(
                 function,
                 make(),
                 inputs,

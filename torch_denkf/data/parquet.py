@@ -35,13 +35,13 @@ def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
             missing = sorted(set(columns or ()) - set(there))
             if missing:
                 raise ValueError(f"{file} lacks the columns {missing}; it has {there}")
-            _refuse_bombs(file, opened.metadata)
+            _check_unpacked_size(file, opened.metadata)
             return opened.read(None if columns is None else list(columns))
     except (arrow.ArrowException, OSError) as error:
         raise ValueError(f"{file} is no complete parquet file ({error}); download or copy it again") from error
 
 
-def _refuse_bombs(file: Path, metadata: Any) -> None:
+def _check_unpacked_size(file: Path, metadata: Any) -> None:
     """Raises for decompression bombs, before anything is unpacked.
 
     Raises:

@@ -18,7 +18,7 @@ from torchrl.envs.transforms import Transform
 
 from torch_denkf.data.episodes import ROW, Episode, check_rows, roles_of, rows_of, select_episodes
 from torch_denkf.data.options import ReplayOptions, check_options
-from torch_denkf.data.slices import choose_sampler, refuse_short_episodes, slices_of
+from torch_denkf.data.slices import check_episode_lengths, choose_sampler, slices_of
 from torch_denkf.data.statistics import mean_and_std
 
 __all__ = ["EpisodeReplay"]
@@ -142,7 +142,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
                 "of their names has it; pass split='all', or add episodes"
             )
         stored, self.episodes = select_episodes(rows, chosen, single)
-        refuse_short_episodes(self.episodes, sampler, batch_size)
+        check_episode_lengths(self.episodes, sampler, batch_size)
         self._add_pictures = _AddPictures(pictures)
         writer, transform = options.get("writer"), options.get("transform")
         super().__init__(
@@ -192,7 +192,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         rows = (sampler.num_slices or self.batch_size // own) * length
         try:
             sampler.slice_len = None if own is None else length
-            refuse_short_episodes(self.episodes, sampler, rows)
+            check_episode_lengths(self.episodes, sampler, rows)
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "Got conflicting batch_sizes")  # another length is what is wanted
                 return self.sample(rows)

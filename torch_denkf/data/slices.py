@@ -12,7 +12,7 @@ from torchrl.data.replay_buffers.samplers import Sampler
 
 from torch_denkf.data.episodes import Episode
 
-__all__ = ["Slices", "choose_sampler", "refuse_short_episodes", "slices_of"]
+__all__ = ["Slices", "check_episode_lengths", "choose_sampler", "slices_of"]
 
 
 def choose_sampler(options: Mapping[str, Any]) -> tuple[Sampler | None, int | None]:
@@ -80,7 +80,7 @@ class Slices(SampleUnit):
         return index, {key: shaped(value) for key, value in info.items()}
 
 
-def refuse_short_episodes(episodes: Sequence[Episode], sampler: Sampler | None, batch_size: int | None) -> None:
+def check_episode_lengths(episodes: Sequence[Episode], sampler: Sampler | None, batch_size: int | None) -> None:
     """Raises for episodes that are too short; TorchRL's samplers leave them out without a warning.
 
     Raises:

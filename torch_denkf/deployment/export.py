@@ -13,10 +13,10 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf.compilation import (
+    check_same_numbers,
     clear_damaged_libraries,
     clear_full_cache,
     need_compiler,
-    refuse_other_numbers,
     trace_below_autograd,
 )
 from torch_denkf.deployment.files import write_bytes
@@ -160,7 +160,7 @@ def export_step(
                 _write(program, package, signature, compiled)
                 run, what, maker = _run(package, compiled), "compiled package", "torch's compiler"
                 instead = "the graph, compiled=False, which is slower" if compiled else ""
-            refuse_other_numbers(
+            check_same_numbers(
                 run,
                 step,
                 values,

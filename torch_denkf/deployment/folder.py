@@ -19,7 +19,7 @@ from torch import Tensor, nn
 import torch_denkf
 from torch_denkf.compilation.lock import locked
 from torch_denkf.deployment.files import sync, write_bytes, write_text
-from torch_denkf.deployment.rebuilt import build_from, refuse_another
+from torch_denkf.deployment.rebuilt import build_from, check_rebuilt
 
 __all__ = ["described", "load_folder", "read_folder_config", "save_folder"]
 
@@ -78,7 +78,7 @@ def save_folder(
     except (TypeError, ValueError) as error:
         raise TypeError(f"settings and training are plain values, as JSON knows them: {error}") from error
     if build is not None:
-        refuse_another(model, builder, build, json.loads(json.dumps(config["settings"])))
+        check_rebuilt(model, builder, build, json.loads(json.dumps(config["settings"])))
     # Copies: safetensors raises for tensors that share memory.
     weights = save({name: value.detach().cpu().clone().contiguous() for name, value in model.state_dict().items()})
     config["sha256"] = hashlib.sha256(weights).hexdigest()

@@ -34,7 +34,7 @@ from torch_denkf.filters.gather import gather_rows, of_one_robot
 from torch_denkf.filters.noise import Draws
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.filters.scan import Steps, where_rows
-from torch_denkf.filters.structure import KNOWN, Structure, previous_key
+from torch_denkf.filters.structure import HAS_PREVIOUS, Structure, previous_key
 from torch_denkf.modules.variance_ceiling import VarianceCeiling
 from torch_denkf.running import check_module, named_modules_of, reads, run_module
 from torch_denkf.submodel import Call, Entries, Initial, Transition, flat_noise, in_role, role
@@ -314,7 +314,7 @@ class Filter(Checked, TensorDictSequential):
             value = belief[key]
             kept = self.outer(previous_key(key))
             found[kept] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
-        found[self.outer(KNOWN)] = Unbounded(shape=(1,), dtype=torch.bool, device=value.device)
+        found[self.outer(HAS_PREVIOUS)] = Unbounded(shape=(1,), dtype=torch.bool, device=value.device)
         actions = {key: self.outer(previous_key(key)) for key in self.structure.controls}
         return primers().LastAction(actions, primers=found)
 
@@ -371,7 +371,7 @@ class Filter(Checked, TensorDictSequential):
         if not entries.keys() >= structure.must:
             diagnosis().check_inputs(structure, type(self).__name__, entries, tensordict)
         # A mark may be that of a slice of data, which goes on from the belief before it.
-        known = entries.get(KNOWN)
+        known = entries.get(HAS_PREVIOUS)
         reset = starts_of(tensordict, self.init_key, step=True) if known is None else ~known.reshape(*size, 1)
         if reset is None:
             written = self.take_step(entries, size)
@@ -382,7 +382,7 @@ class Filter(Checked, TensorDictSequential):
             # What went before does not count where an episode begins.
             entries.update({key: where_rows(reset, written[key], entries[key]) for key in structure.carry})
         following = {("next", *previous_key(key)): written[key] for key in structure.carry}
-        following["next", *KNOWN] = torch.ones(*size, 1, dtype=torch.bool, device=written[structure.carry[0]].device)
+        following["next", *HAS_PREVIOUS] = written[structure.carry[0]].new_ones(*size, 1, dtype=torch.bool)
         record = Record("policy", tensordict, size, entries, {**written, **following})
         return self.write(tensordict, self.finished(record, given))
 
@@ -597,7 +597,7 @@ class Filter(Checked, TensorDictSequential):
         first = first if marks is None else first | marks.reshape(size)
         if any(tensordict.get(self.outer(previous_key(key)), None) is None for key in self.structure.carry):
             return ~first
-        known = tensordict.get(self.outer(KNOWN), None)  # a policy's data: what has a belief before it is a step
+        known = tensordict.get(self.outer(HAS_PREVIOUS), None)  # a policy's data: what has a belief before it is a step
         return torch.ones_like(first) if known is None else known.reshape(size)
 
     def like(self) -> Tensor | None:

@@ -19,15 +19,15 @@ from torch_denkf.running import (
 )
 from torch_denkf.submodel import Entries, Initial, Update, in_role, role
 
-__all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "previous_key"]
+__all__ = ["HAS_PREVIOUS", "FROM_STORED", "Placed", "Structure", "previous_key"]
 
 #: A module and its place in the filter, which names its noise.
 Placed = tuple[str, TensorDictModuleBase]
 
-#: Whether a policy has a belief before this element.
-KNOWN = ("previous", "known")
-#: Whether an element of a sequence begins with the belief that is stored before it.
-RESUMES = ("previous", "resumes")
+#: Key of a flag: a policy has a belief before this element.
+HAS_PREVIOUS = ("previous", "known")
+#: Key of a flag: an element of a sequence begins with the belief that is stored before it.
+FROM_STORED = ("previous", "resumes")
 
 
 def previous_key(key: NestedKey) -> tuple[str, ...]:
@@ -100,7 +100,7 @@ class Structure(NamedTuple):
 
     def in_keys(self, init_key: NestedKey) -> list[NestedKey]:
         """Returns all that a filter reads: also stored beliefs, those of a policy, and what marks a beginning."""
-        keys = [*self.needed, *self.controls, *self.carry, *map(previous_key, self.carry), KNOWN]
+        keys = [*self.needed, *self.controls, *self.carry, *map(previous_key, self.carry), HAS_PREVIOUS]
         keys += [*map(previous_key, self.controls), *self.belief, init_key, *self.optional]
         return list(dict.fromkeys(keys))
 

@@ -153,7 +153,7 @@ class FusedFilter(Filter):
             modules.update(build.weighted(prefix, sensors, wired, weights))
         last = "fused" if gaussian and lag else "belief"
         updates = (build.joint if joint else build.in_turn)(prefix, last, sensors, wired)
-        _refuse_inflation(updates, any(sensor.delay for sensor in sensors.values()), gaussian and lag > 0)
+        _check_inflation(updates, any(sensor.delay for sensor in sensors.values()), gaussian and lag > 0)
         modules.update(updates)
         if lag:
             modules["smoothed"] = PresentOfJoint(lag + 1, last) if gaussian else LaggedBelief(space=space)
@@ -168,7 +168,7 @@ def _is_gaussian(initial: TensorDictModuleBase) -> bool:
     return ("belief", "ensemble") not in written
 
 
-def _refuse_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, joint_past: bool) -> None:
+def _check_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, joint_past: bool) -> None:
     """Raises where an update would spread other states than the present one that is read."""
     if late:
         why = "belongs to the step at which a reading is taken, and with delay= others have been made since"

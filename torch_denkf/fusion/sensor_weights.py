@@ -14,7 +14,7 @@ from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import StateObservation
-from torch_denkf.modules.spaces import told
+from torch_denkf.modules.spaces import narrowed_mask
 from torch_denkf.modules.tensors import mean_of_members
 from torch_denkf.running import reads
 from torch_denkf.submodel import Sensor
@@ -196,7 +196,7 @@ class SensorWeights(Sensor):
             variance = noise if noise.ndim == size + 1 else noise.diagonal(dim1=-2, dim2=-1)
             predicted, observed = model.seen(entries, call._replace(sample=False).part(name))
             if (space := self.spaces[name]) is not None:
-                observed = told(space, observed)
+                observed = narrowed_mask(space, observed)
                 predicted, reading = space.align(predicted, reading, observed)
             reading, mean = mean_of_members(reading, call.batch_size), ensemble_mean(predicted)
             observed = (

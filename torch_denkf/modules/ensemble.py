@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_choice, check_number, check_values
 from torch_denkf.functional.inflation import random_rotation
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.modules.spaces import told
+from torch_denkf.modules.spaces import narrowed_mask
 from torch_denkf.submodel import Call, Entries, Update
 
 __all__ = ["EnsembleAnalysisKeys", "EnsembleOptions", "EnsembleUpdate", "Rotated"]
@@ -172,7 +172,7 @@ class EnsembleUpdate(Rotated):
         """
         if self.reading_space is None:
             return entries
-        keys, observed = self.in_keys[1:3], told(self.reading_space, entries.get(self.observed_key))
+        keys, observed = self.in_keys[1:3], narrowed_mask(self.reading_space, entries.get(self.observed_key))
         predicted, reading = (self.required(entries, key) for key in keys)
         aligned = dict(zip(keys, self.reading_space.align(predicted, reading, observed), strict=True))
         return {**entries, **aligned, **({} if observed is None else {self.observed_key: observed})}

@@ -14,7 +14,7 @@ from torch_denkf._checks import check_number
 from torch_denkf.functional.gaussian import GaussianUpdate
 from torch_denkf.functional.linalg import as_covariance
 from torch_denkf.functional.manifolds import Space, check_space, is_flat
-from torch_denkf.modules.spaces import mean_reading, told
+from torch_denkf.modules.spaces import mean_reading, narrowed_mask
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.running import check_module, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, SubModel, Transition, Update
@@ -68,7 +68,7 @@ class GaussianTransition(Transition):
     ):
         check_module("transition", transition)
         check_module("process_noise", process_noise)
-        refuse_random_layers(transition, type(self).__name__)
+        check_no_random_layers(transition, type(self).__name__)
         in_keys, out_keys = ([(key, name) for name in ("mean", "cov")] for key in (belief_prefix, forecast_prefix))
         self_made = [unravel_key(ensemble_key), *out_keys]
         further, optional = further_keys((transition, process_noise), [*in_keys, *self_made])
@@ -175,7 +175,7 @@ class GaussianAnalysis(Update):
         predicted_key: NestedKey = ("forecast", "observation"),
     ):
         check_module("observation", observation)
-        refuse_random_layers(observation, type(self).__name__)
+        check_no_random_layers(observation, type(self).__name__)
         in_keys = [(forecast_prefix, "mean"), (forecast_prefix, "cov"), observation_key, noise_variance_key]
         further, optional = further_keys([observation], [*in_keys, ensemble_key])
         out_keys = [(belief_prefix, name) for name in ("mean", "cov", "var")]
@@ -240,7 +240,7 @@ class GaussianAnalysis(Update):
             written = run_module(self.module, {**entries, self.ensemble_key: states}, call)
         given, made = entries.get(self.observed_key), written.get(self.observed_key)
         mask = given if made is None else made if given is None else made & given
-        return written[self.predicted_key], told(self.reading_space, mask)
+        return written[self.predicted_key], narrowed_mask(self.reading_space, mask)
 
 
 def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: float = 1.0) -> tuple[torch.Tensor, ...]:
@@ -265,7 +265,7 @@ def further_keys(
     return list(dict.fromkeys(needed)), list(dict.fromkeys(optional))
 
 
-def refuse_random_layers(module: nn.Module, owner: str) -> None:
+def check_no_random_layers(module: nn.Module, owner: str) -> None:
     """Raises where a module would stay random although its stochastic networks run their deterministic forward.
 
     Raises:

@@ -12,7 +12,7 @@ from torch import nn
 
 from torch_denkf._checks import check_choice, check_count
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.modules.spaces import mean_reading, told
+from torch_denkf.modules.spaces import mean_reading, narrowed_mask
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import as_vector, mean_of_members
 from torch_denkf.submodel import Update
@@ -78,7 +78,7 @@ class GaussianLikelihood(Update):
                 f"GaussianLikelihood takes variances [*B, O]; {self.in_keys[2]!r} has shape {list(variance.shape)}. "
                 "Use DiagonalNoise or ConstantNoise."
             )
-        observed = told(self.reading_space, observed)
+        observed = narrowed_mask(self.reading_space, observed)
         if reading.ndim > len(batch_size) + 1:
             reading = mean_reading(self.reading_space, reading, observed)
         reading = reading.unsqueeze(-2)

@@ -12,7 +12,7 @@ from torch_denkf.functional import ensemble_mean, ensemble_var, letkf, neighbour
 from torch_denkf.functional.inflation import relax_to_prior_spread
 from torch_denkf.functional.localisation import Neighbours, neighbours_of_taper
 from torch_denkf.modules.ensemble import EnsembleOptions, EnsembleUpdate
-from torch_denkf.modules.tensors import mean_of_members, refuse_trained
+from torch_denkf.modules.tensors import check_untrained, mean_of_members
 
 __all__ = ["LocalEnsembleAnalysis"]
 
@@ -84,7 +84,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         if isinstance(near, torch.Tensor):
             near = neighbours_of_taper(near, tile=tile)
         check_values("near's taper", near.taper, least=0)
-        refuse_trained("near", near.taper, _CHOSEN_ONCE)
+        check_untrained("near", near.taper, _CHOSEN_ONCE)
         self.register_buffer("index", near.index, persistent=False)
         self.register_buffer("taper", near.taper, persistent=False)
         self.tile = tile
@@ -112,7 +112,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         Raises:
             ValueError: if the radius is not positive, or asks for a gradient.
         """
-        refuse_trained("radius", radius, _CHOSEN_ONCE)
+        check_untrained("radius", radius, _CHOSEN_ONCE)
         period = None if period is None else torch.as_tensor(period, dtype=states.dtype)
         return cls(neighbours(states, observations, radius, period=period), **kwargs)
 

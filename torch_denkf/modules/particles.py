@@ -28,7 +28,7 @@ from torch_denkf.functional.resampling import effective_sample_size, jitter_copi
 from torch_denkf.functional.weighted import weighted_innovation
 from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.likelihood import GaussianLikelihood
-from torch_denkf.modules.spaces import told
+from torch_denkf.modules.spaces import narrowed_mask
 from torch_denkf.running import check_module, reads, run_module
 from torch_denkf.submodel import Entries, Transition, Update
 
@@ -339,7 +339,7 @@ class ParticleAnalysis(Update):
 
     def _innovation(self, prior, predicted, reading, variance, observed=None) -> tuple[torch.Tensor, torch.Tensor]:
         if self.reading_space is not None:
-            observed = told(self.reading_space, observed)
+            observed = narrowed_mask(self.reading_space, observed)
             predicted, reading = self.reading_space.align(predicted, reading, observed)
         if reading.ndim == predicted.ndim:
             reading = reading.mean(-2)

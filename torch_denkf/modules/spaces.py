@@ -7,10 +7,10 @@ from torch import Tensor
 
 from torch_denkf.functional.manifolds import Space
 
-__all__ = ["mean_and_tangents", "mean_reading", "told"]
+__all__ = ["mean_and_tangents", "mean_reading", "narrowed_mask"]
 
 
-def told(space: Space | None, observed: Tensor | None) -> Tensor | None:
+def narrowed_mask(space: Space | None, observed: Tensor | None) -> Tensor | None:
     """Narrows the mask of a reading to whole rotations and vectors, see :meth:`Space.told`."""
     return observed if space is None or observed is None else space.told(observed)[1]
 

@@ -18,7 +18,7 @@ __all__ = [
     "check_dims",
     "mask_of",
     "mean_of_members",
-    "refuse_trained",
+    "check_untrained",
     "register_constant",
     "register_matrix",
     "register_location_and_scale",
@@ -43,7 +43,7 @@ def as_floating(value: Any, name: str = "the constant") -> Tensor:
         raise TypeError(f"{name} must be numbers, in a tensor or in lists of one length; got {value!r}") from error
     if tensor.is_complex():
         raise TypeError(f"{name} must be real; got {tensor.dtype}. Real and imaginary parts are two components each")
-    refuse_trained(name, tensor, "it is copied into a constant")
+    check_untrained(name, tensor, "it is copied into a constant")
     keeps = isinstance(value, Tensor) and tensor.is_floating_point()
     return tensor.detach().to(tensor.dtype if keeps else torch.get_default_dtype(), copy=True)
 
@@ -75,7 +75,7 @@ def register_matrix(
     check_values(name, matrix)
 
 
-def refuse_trained(name: str, value: Any, why: str) -> None:
+def check_untrained(name: str, value: Any, why: str) -> None:
     """Raises where what is kept as a constant asks for a gradient: it would be accepted and never trained.
 
     Raises:

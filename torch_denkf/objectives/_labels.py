@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from torch_denkf.filters import Filter
     from torch_denkf.objectives.filter_loss import FilterLoss
 
-__all__ = ["Keys", "Labels", "Reading", "Truth", "check_row_mask", "mean_of"]
+__all__ = ["Keys", "Labels", "Reading", "Targets", "check_row_mask", "mean_of"]
 
 
 @dataclass
@@ -183,7 +183,7 @@ class Labels(NamedTuple):
         return self._replace(values=values, mask=mask, scale=scale)
 
 
-class Truth:
+class Targets:
     """Holds the labels of a batch that terms are scored against, and what the filter wrote.
 
     Args:

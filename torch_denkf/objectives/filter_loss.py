@@ -18,7 +18,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.tensors import as_floating, check_dims
-from torch_denkf.objectives._labels import Keys, Reading, Truth
+from torch_denkf.objectives._labels import Keys, Reading, Targets
 
 __all__ = ["FilterLoss", "ReadingsOptions", "Scale", "SequenceKeys", "SequenceOptions", "StateOptions", "Term"]
 
@@ -126,7 +126,7 @@ class Term(nn.Module):
             check_number(self.name, weight, least=0, cure="It is a term's weight")
         self.weight = weight
 
-    def forward(self, out: TensorDictBase, truth: Truth) -> tuple[Tensor, Tensor | None]:
+    def forward(self, out: TensorDictBase, truth: Targets) -> tuple[Tensor, Tensor | None]:
         """Returns the term's value in each element.
 
         Args:
@@ -289,7 +289,7 @@ class FilterLoss(Checked, LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the weighted terms; ``tensordict`` is left as it is."""
         out = self._run(tensordict)
-        truth, losses = Truth(self, tensordict, out), TensorDict({}, batch_size=[])
+        truth, losses = Targets(self, tensordict, out), TensorDict({}, batch_size=[])
         for term in self.terms:
             if term.name not in self.weights:
                 continue

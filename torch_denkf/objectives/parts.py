@@ -22,7 +22,7 @@ from torch_denkf.filters.gather import controls_of
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules.tensors import as_floating
 from torch_denkf.objectives import _terms
-from torch_denkf.objectives._labels import Keys, Truth
+from torch_denkf.objectives._labels import Keys, Targets
 from torch_denkf.objectives.filter_loss import FilterLoss, ReadingsOptions, StateOptions, Term
 from torch_denkf.running import reads, reads_of, run_module, run_modules
 from torch_denkf.submodel import Call, Entries, Initial, role
@@ -263,7 +263,7 @@ class TransitionLoss(FilterLoss):
         if not tensordict.ndim:
             raise ValueError("A step needs two times, the last batch dimension; this tensordict has batch_size [].")
         self.filter.observe(Record("data", tensordict, tensordict.batch_size, {}, {}))
-        truth = Truth(self, tensordict, tensordict).whole_state().values
+        truth = Targets(self, tensordict, tensordict).whole_state().values
         # Whatever else reads the true state finds no NaN either.
         known = tensordict.copy().set(self.tensor_keys.state, truth)
         around = {"spread": self.spread, "members": self.members, "space": self.space}
@@ -273,7 +273,7 @@ class TransitionLoss(FilterLoss):
     def _counts(self, tensordict):
         # Without a stored belief, which would let the first element of a slice count: its truth before is unknown.
         stepped = self.filter.stepped(tensordict.exclude("previous"))
-        known = Truth(self, tensordict, tensordict).whole_state().rows
+        known = Targets(self, tensordict, tensordict).whole_state().rows
         return stepped & one_earlier(known, tensordict.ndim - 1)
 
 

@@ -14,7 +14,7 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 
-Truth: TypeAlias = Tensor | NestedKey | None
+TensorOrKey: TypeAlias = Tensor | NestedKey | None
 
 
 class Belief(NamedTuple):
@@ -50,8 +50,8 @@ class Belief(NamedTuple):
 
 def read_belief(
     run: TensorDictBase | Tensor,
-    truth: Truth = None,
-    observed: Truth = None,
+    truth: TensorOrKey = None,
+    observed: TensorOrKey = None,
     *,
     belief: NestedKey = "belief",
     one_sequence: bool = False,

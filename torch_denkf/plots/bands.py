@@ -26,7 +26,7 @@ from torch_denkf.plots._axes import (
     step_bounds,
     times_of,
 )
-from torch_denkf.plots._belief import Belief, Truth, dims_of, number, read_belief, with_truth
+from torch_denkf.plots._belief import Belief, TensorOrKey, dims_of, number, read_belief, with_truth
 from torch_denkf.plots._space import angles_of, in_components, names_of
 
 if TYPE_CHECKING:
@@ -37,14 +37,14 @@ __all__ = ["plot_bands"]
 
 def plot_bands(
     run: TensorDictBase | Tensor,
-    truth: Truth = None,
+    truth: TensorOrKey = None,
     *,
     belief: NestedKey = "belief",
     dims: Sequence[int] | None = None,
     names: Sequence[str] | None = None,
     factors: Sequence[float] | None = None,
     readings: Mapping[int, Tensor] | None = None,
-    observed: Truth | Mapping[int, Truth] = None,
+    observed: TensorOrKey | Mapping[int, TensorOrKey] = None,
     gap: float | None = None,
     time: float | Tensor | None = None,
     level: float = 0.9,
@@ -167,7 +167,7 @@ def _seen(read: Belief) -> Tensor | None:
     return None if read.observed is None else read.observed.any(-1)
 
 
-def _masks(run: TensorDictBase | Tensor, observed: Mapping[int, Truth]) -> dict[int, Tensor | None]:
+def _masks(run: TensorDictBase | Tensor, observed: Mapping[int, TensorOrKey]) -> dict[int, Tensor | None]:
     """Returns the steps at which each component's sensor observed, ``[T]``."""
     return {dim: _seen(read_belief(run, None, mask, one_sequence=True)) for dim, mask in observed.items()}
 

@@ -12,7 +12,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torch_denkf.plots._axes import BELIEF, DASHES, OTHERS, READING, TRUTH, axes_for, legend_above, new_figure
-from torch_denkf.plots._belief import Belief, Truth, covariance_at, dims_of, number, read_belief, with_truth
+from torch_denkf.plots._belief import Belief, TensorOrKey, covariance_at, dims_of, number, read_belief, with_truth
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +24,7 @@ MEMBERS, ELLIPSES = 32, 12  # that are drawn: the first ones; evenly over time
 
 def plot_path(
     run: TensorDictBase | Tensor,
-    truth: Truth = None,
+    truth: TensorOrKey = None,
     *,
     belief: NestedKey = "belief",
     others: Mapping[str, Tensor] | None = None,

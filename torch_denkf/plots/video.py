@@ -12,7 +12,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torch_denkf.plots._axes import times_of
-from torch_denkf.plots._belief import Truth, entry_of, read_belief
+from torch_denkf.plots._belief import TensorOrKey, entry_of, read_belief
 from torch_denkf.plots._frames import as_picture, write_gif, write_mp4
 from torch_denkf.plots._scene import Scene
 from torch_denkf.plots.bands import plot_bands
@@ -64,8 +64,8 @@ def belief_video(
     pixels: Tensor | np.ndarray | NestedKey | None = None,
     *,
     belief: NestedKey = "belief",
-    truth: Truth = None,
-    observed: Truth = None,
+    truth: TensorOrKey = None,
+    observed: TensorOrKey = None,
     time: float | Tensor | None = None,
     path: Mapping[str, Any] | None = None,
     on_picture: bool = False,

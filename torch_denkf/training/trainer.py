@@ -16,9 +16,9 @@ from torchrl.record.loggers.common import Logger
 from torch_denkf._checks import check_count
 from torch_denkf.compilation.lock import locked
 from torch_denkf.deployment.progress import progress_bar
+from torch_denkf.training.backups import back_up
 from torch_denkf.training.checkpoint import check_settings, check_state, read_checkpoint, write_checkpoint
 from torch_denkf.training.distributed import Processes
-from torch_denkf.training.earlier import set_aside
 from torch_denkf.training.hooks import HookPoints
 from torch_denkf.training.logs import RunLogs
 from torch_denkf.training.stage import Stage, only_trainable
@@ -313,7 +313,7 @@ class FilterTrainer(HookPoints):
             for file in (self.last_checkpoint, *self.out.glob("best_*.pt")):
                 file.unlink(missing_ok=True)
         else:
-            set_aside(self.out, [*self.out.glob("best_*.pt"), *self._logs.files()])
+            back_up(self.out, [*self.out.glob("best_*.pt"), *self._logs.files()])
         self._logs.open({})
         state = {"stage": 0, "update": 0, "updates": None, "results": {}, "best": None, "last_metrics": {}, "hooks": {}}
         return {**state, "model": self._model_on_cpu()}

@@ -19,7 +19,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record, check_belief
 from torch_denkf.filters.scan import where_rows
 from torch_denkf.submodel import Entries
-from torch_denkf.transforms.primer import refuse_resets_of_groups
+from torch_denkf.transforms.primer import check_no_group_resets
 
 __all__ = ["DEnKFTransform"]
 
@@ -263,7 +263,7 @@ class DEnKFTransform(Checked, Transform):
                 if a transform behind this one writes over the belief that the filter goes on with.
         """
         keys = [key for key in self._keep if key not in self._dropped_keys]
-        refuse_resets_of_groups(self.parent.reset_keys, self.out_keys)
+        check_no_group_resets(self.parent.reset_keys, self.out_keys)
         diagnosis().check_behind(self, [self._names[key] for key in self.filter.structure.carry])
         taken = [name for name in self.out_keys if name in observation_spec.keys(True, True)]
         if taken:

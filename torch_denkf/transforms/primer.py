@@ -8,10 +8,10 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
-__all__ = ["LastAction", "refuse_resets_of_groups"]
+__all__ = ["LastAction", "check_no_group_resets"]
 
 
-def refuse_resets_of_groups(reset_keys: Sequence[NestedKey], kept: Iterable[NestedKey]) -> None:
+def check_no_group_resets(reset_keys: Sequence[NestedKey], kept: Iterable[NestedKey]) -> None:
     """Raises where torchrl would not reset what is kept: it resets the entries of the group that is done, no others.
 
     Args:
@@ -78,7 +78,7 @@ class LastAction(TensorDictPrimer):
         """
         self._with_actions()
         if self.parent is not None:
-            refuse_resets_of_groups(self.parent.reset_keys, self.primers.keys(True, True))
+            check_no_group_resets(self.parent.reset_keys, self.primers.keys(True, True))
         taken = [key for key in self._carried if key in observation_spec.keys(True, True)]
         if taken:
             raise ValueError(

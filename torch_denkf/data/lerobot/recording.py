@@ -27,7 +27,7 @@ from torch_denkf.data.lerobot.files import (
     rows_of_episode,
     vectors,
 )
-from torch_denkf.data.lerobot.sound import mask_rows, sound_times
+from torch_denkf.data.lerobot.masking import mask_invalid_rows, repaired_times
 from torch_denkf.data.pictures import image_store, scaled, text_of_size
 from torch_denkf.data.video import frames_at_times
 from torch_denkf.deployment.progress import progress_bar
@@ -45,7 +45,7 @@ class DecodedRecording:
             zeros where it is missing, ``observed`` bool ``[N,1]``, ``state`` float32 ``[N,S]``, maybe ``action``
             float32 ``[N,A]``, ``time`` float64 ``[N,1]`` s, ``frame`` int64 ``[N,1]``, counted from 0 in each episode,
             and ``episode`` int64 ``[N]``. Where a row's state or action is not finite, also the masks of
-            :func:`~torch_denkf.data.lerobot.sound.mask_rows`.
+            :func:`~torch_denkf.data.lerobot.masking.mask_invalid_rows`.
         fps: rows a second.
         names: of the state's numbers, if they have any.
         source: folder that it was read from, if there is one.
@@ -189,7 +189,7 @@ def _read(
                     swallowed.add(key)
             if "timestamp" in rows.column_names:
                 source = f"{opened}, episode {episode.number}"
-                time[at], stamped[at] = sound_times(rows["timestamp"].to_numpy(), layout.fps, source)
+                time[at], stamped[at] = repaired_times(rows["timestamp"].to_numpy(), layout.fps, source)
             else:
                 time[at] = np.arange(episode.length) / layout.fps
             if episode.video is None:
@@ -217,7 +217,7 @@ def _read(
         },
         batch_size=[int(starts[-1])],
     )
-    return mask_rows(out, torch.from_numpy(stamped), str(layout.root))
+    return mask_invalid_rows(out, torch.from_numpy(stamped), str(layout.root))
 
 
 def _check_columns(file: Path, table, columns: Sequence[str]) -> None:

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from torch_denkf._checks import check_number
+from torch_denkf.data.lerobot.masking import mask_invalid_rows
 from torch_denkf.data.lerobot.recording import DecodedRecording, look_for_actions
-from torch_denkf.data.lerobot.sound import mask_rows
 from torch_denkf.data.pictures import image_store, scaled
 
 __all__ = ["recording_from_rows"]
@@ -131,7 +131,7 @@ def recording_from_rows(
             "frame": frame,
         }
     )
-    return DecodedRecording(mask_rows(out, None, "the rows"), float(fps), names)
+    return DecodedRecording(mask_invalid_rows(out, None, "the rows"), float(fps), names)
 
 
 def _get(rows: TensorDictBase, key: NestedKey) -> Tensor | TensorDictBase:

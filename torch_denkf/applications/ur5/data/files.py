@@ -131,7 +131,7 @@ def _read_arrays(data: bytes, entry: Entry) -> dict[str, np.ndarray]:
     """
     arrays = {}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        _refuse_other_arrays(archive, entry)
+        _check_arrays(archive, entry)
         for member in archive.namelist():
             stream = io.BytesIO(archive.read(member))
             with _HEADERS:
@@ -139,7 +139,7 @@ def _read_arrays(data: bytes, entry: Entry) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _refuse_other_arrays(archive: zipfile.ZipFile, entry: Entry) -> None:
+def _check_arrays(archive: zipfile.ZipFile, entry: Entry) -> None:
     """Looks at the headers alone: the rest could be of any size.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Rows of a recording that are not sound: kept in their place, masked and counted."""
+"""Masks invalid rows of a recording: they stay in their place, and are counted."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torch import Tensor
 
 from torch_denkf.data.times import MOST_WRONG, filled, sound
 
-__all__ = ["mask_rows", "sound_times"]
+__all__ = ["mask_invalid_rows", "repaired_times"]
 
 OFF = 0.25  # a share of 1 / fps, by which the usual step may be off
 _NUMBERS = ("state", "action")
 
 
-def sound_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray, np.ndarray]:
+def repaired_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray, np.ndarray]:
     """Returns times of an episode with values for those that are wrong, s, and which were right, bool; ``[n]`` each.
 
     Args:
@@ -49,7 +49,7 @@ def sound_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray,
     return (filled(times, good, 1 / fps) if len(wrong) else times), good
 
 
-def mask_rows(rows: TensorDict, stamped: Tensor | None, source: str) -> TensorDict:
+def mask_invalid_rows(rows: TensorDict, stamped: Tensor | None, source: str) -> TensorDict:
     """Masks rows whose numbers or times are not sound, where there are any.
 
     ``state`` and ``action`` of a row that are not finite hold those of the last row of the episode that are. The row is

@@ -1,4 +1,4 @@
-"""The rows that lie between a recording's pictures and its states."""
+"""Estimates the latency between a recording's pictures and its states, in rows."""
 
 from __future__ import annotations
 
