@@ -9,7 +9,7 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number, check_values
-from torch_denkf.functional.manifolds import SE2, SE3, SE23, SO3, Circle, Euclidean, Product, Space, rotate
+from torch_denkf.functional.manifolds import SE2, SE3, SE23, SO3, Circle, Euclidean, Product, Space, rotate, skew
 from torch_denkf.modules.tensors import register_constant
 from torch_denkf.submodel import SubModel
 
@@ -36,17 +36,32 @@ class _Reading(SubModel):
             names = " or ".join(f"{kind.__name__}()" for kind in self.kinds)
             raise TypeError(f"{type(self).__name__} reads a part that is {names}; part {part} of {space} is none.")
         self.space, self.read_space = space, parts[part]
-        self.reading_space = self.read_space if reading_space is None else reading_space
+        self._of_readings(self.read_space if reading_space is None else reading_space)
         self.begin = sum(each.point_dim for each in parts[:part])
+        before = sum(each.tangent_dim for each in parts[:part])
+        self._beside = before, space.tangent_dim - before - self.read_space.tangent_dim
+
+    def _of_readings(self, space: Space) -> None:
+        self.reading_space, self.tangents_of = space, (self.space, space)
 
     def observe(self, point: Tensor) -> Tensor:
         """Returns the observation ``[*, Q]`` of the part's points ``[*, P]``."""
+        raise NotImplementedError
+
+    def gradient(self, point: Tensor, reading: Tensor) -> Tensor:
+        """The Jacobian of :meth:`observe` from the part's tangents to those of the reading; it may be left out."""
         raise NotImplementedError
 
     def compute(self, ensemble):
         """Returns the predicted readings."""
         self.space.check(point=ensemble)
         return self.observe(ensemble.narrow(-1, self.begin, self.read_space.point_dim))
+
+    def jacobian(self, ensemble):
+        """Zero but for the part that is read."""
+        reading = self.compute(ensemble)
+        matrix = self.gradient(ensemble.narrow(-1, self.begin, self.read_space.point_dim), reading)
+        return reading, nn.functional.pad(matrix, self._beside) if any(self._beside) else matrix
 
 
 class PoseOf(_Reading):
@@ -81,6 +96,10 @@ class PoseOf(_Reading):
     def observe(self, point):
         """Returns the point itself."""
         return point
+
+    def gradient(self, point, reading):
+        """The identity."""
+        return torch.eye(self.read_space.tangent_dim, dtype=point.dtype, device=point.device)
 
 
 class Magnetic(_Reading):
@@ -122,6 +141,11 @@ class Magnetic(_Reading):
     def observe(self, point):
         """Returns the direction in the body's axes."""
         return rotate(_inverse(point), self.field)
+
+    def gradient(self, point, reading):
+        """A turn of the body turns the direction back."""
+        others = self.read_space.tangent_dim - 3
+        return nn.functional.pad(skew(reading), (0, others)) if others else skew(reading)
 
 
 class Gravity(Magnetic):
@@ -195,10 +219,26 @@ class PositionInBody(_Reading):
         super().__init__(space, part, None, in_key, out_key)
         size = 2 if isinstance(self.read_space, SE2) else 3
         _register_vectors(self, "landmark", landmark, [size], [len(landmark), size])
-        self.reading_space = Euclidean(self.landmark.numel())
+        self._of_readings(Euclidean(self.landmark.numel()))
 
     def observe(self, point):
-        """Returns the landmarks in the body's axes."""
+        """The landmarks in the body's axes."""
+        return self._seen(point)
+
+    def gradient(self, point, reading):
+        """A turn of the body turns landmarks back; they come nearer as it moves towards them."""
+        return self._by_pose(reading)
+
+    def _by_pose(self, seen: Tensor) -> Tensor:
+        """The Jacobian ``[*, N L, D]`` of landmarks that lie at ``seen`` ``[*, N L]``."""
+        size = self.landmark.shape[-1]
+        seen = seen.unflatten(-1, (-1, size))
+        turn = skew(seen) if size == 3 else torch.stack([seen[..., 1], -seen[..., 0]], -1).unsqueeze(-1)
+        nearer = -torch.eye(size, dtype=seen.dtype, device=seen.device).expand(*seen.shape, size)
+        between = seen.new_zeros(*seen.shape, self.read_space.tangent_dim - turn.shape[-1] - size)
+        return torch.cat([turn, between, nearer], -1).flatten(-3, -2)
+
+    def _seen(self, point: Tensor) -> Tensor:
         size = self.landmark.shape[-1]
         away = self.landmark.reshape(-1, size) - point[..., -size:].unsqueeze(-2)
         if size == 3:
@@ -245,15 +285,27 @@ class RangeBearing(PositionInBody):
         super().__init__(space, landmark, part=part, in_key=in_key, out_key=out_key)
         if self.landmark.ndim != 1:
             raise ValueError(f"landmark is one, [2]; got {list(self.landmark.shape)}.")
-        self.reading_space = Product(Euclidean(1), Circle())
+        self._of_readings(Product(Euclidean(1), Circle()))
 
     def observe(self, point):
-        """Returns range and bearing; at the landmark itself zero, and so is their gradient."""
-        away = super().observe(point)
+        """Range and bearing; at the landmark itself zero, and so is their gradient."""
+        away = self._seen(point)
         there = (away == 0).all(-1, keepdim=True)
         away = torch.where(there, torch.ones_like(away), away)
         polar = torch.stack([torch.linalg.vector_norm(away, dim=-1), torch.atan2(away[..., 1], away[..., 0])], -1)
         return torch.where(there, torch.zeros_like(polar), polar)
+
+    def gradient(self, point, reading):
+        """That of range and bearing by where the landmark lies, times that of this."""
+        away = self._seen(point)
+        x, y = away.unbind(-1)
+        there = (away == 0).all(-1)
+        square = torch.where(there, 1, away.square().sum(-1))
+        distance = square.sqrt()
+        rows = torch.stack(
+            [torch.stack([x / distance, y / distance], -1), torch.stack([-y, x], -1) / square[..., None]], -2
+        )
+        return rows @ self._by_pose(away)
 
 
 def _inverse(pose: Tensor) -> Tensor:
