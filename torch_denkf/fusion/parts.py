@@ -68,12 +68,12 @@ class OfOwnErrors(Wrapper):
         self.own, self.total = list(own), total
 
     def on_entries(self, entries, call):
-        """The predicted observations."""
+        """Returns the predicted observations."""
         key, state = self._seen(entries)
         return self.run_inside({**entries, key: state}, call)
 
     def linearised(self, entries, call):
-        """That of the model, and zeros by the errors of others."""
+        """Returns the Jacobian of the model, and zeros by the errors of others."""
         key, state = self._seen(entries)
         found = linearise(self.module, {**entries, key: state}, call)
         if found is None:
@@ -84,7 +84,7 @@ class OfOwnErrors(Wrapper):
         return written, whole.index_add(-1, _places(self.own, begin, whole), matrix[..., begin:]), sides
 
     def _seen(self, entries: Entries) -> tuple[NestedKey, Tensor]:
-        """The key and the value of what the sensor sees of the state."""
+        """Returns the key and the value of what the sensor sees of the state."""
         key = unravel_key(self.in_keys[0])
         system, errors = self.required(entries, key).tensor_split([-self.total], -1)
         return key, torch.cat([system, errors[..., self.own]], -1)
@@ -113,7 +113,7 @@ class LinearMembers(SubModel):
         return moved if not action else moved + (action[0].to(moved.dtype) @ self.module.control.mT).unsqueeze(-2)
 
     def jacobian(self, ensemble, *action):
-        """F."""
+        """Returns the forecast and F."""
         return self.compute(ensemble, *action), self.module.matrix
 
     def process_noise(self) -> TensorDictModuleBase:
@@ -202,7 +202,7 @@ class StateObservation(Wrapper, Update):
         return {self.predicted_key: self.run_inside({**entries, self._in_key: states}, call)[self._out_key], **written}
 
     def linearised(self, entries, call):
-        """That of the model, where it sees the present state alone."""
+        """Returns the Jacobian of the model, if it sees the present state alone."""
         if self.state_dim is not None:
             return None
         found = linearise(self.module, {**entries, self._in_key: self.required(entries, self.ensemble_key)}, call)
@@ -264,12 +264,12 @@ class JoinedObservation(SubModel):
         return dict(self.module.items())
 
     def on_entries(self, entries, call):
-        """The predicted observations, and the mask."""
+        """Returns the predicted observations, and the mask."""
         pairs = [model.seen(entries, call.part(name)) for name, model in self.module.items()]
         return self._joined([predicted for predicted, _ in pairs], [mask for _, mask in pairs])
 
     def linearised(self, entries, call):
-        """Their Jacobians below each other, where all are of plain numbers."""
+        """Returns their Jacobians below each other, where all are of plain numbers."""
         given = [linearise(model, entries, call) for model in self.module.values()]
         found = [each for each in given if each is not None and is_flat(*each[2] or ())]
         if len(found) < len(given):

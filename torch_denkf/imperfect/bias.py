@@ -254,7 +254,7 @@ class BiasedTransition(Wrapper, Transition):
         return {**written, out_key: torch.cat([written[out_key], self.bias.decay * slow], -1)}
 
     def linearised(self, entries, call):
-        """That of the transition, and behind it the decay."""
+        """Returns the Jacobian of the transition, and behind it the decay."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, slow = _split(self.required(entries, key), self.bias, self)
         found = linearise(self.module, {**entries, key: state}, call.part(self.place))
@@ -342,7 +342,7 @@ class BiasedObservation(Wrapper):
         return {**written, out_key: read * (1 + own) if self.bias.factor else read + own}
 
     def linearised(self, entries, call):
-        """That of the model, and behind it that by the biases."""
+        """Returns the Jacobian of the model, and behind it that by the biases."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, slow = _split(self.required(entries, key), self.bias, self)
         found = linearise(self.module, {**entries, key: state}, call.part(self.place))

@@ -28,7 +28,7 @@ from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional.weighted import weighted_innovation
 from torch_denkf.imperfect.mixed import MixedUpdate, kind_of_update
 from torch_denkf.imperfect.mixture import log_mixture, responsibility
-from torch_denkf.modules.spaces import told
+from torch_denkf.modules.spaces import narrowed_mask
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import mean_of_members
 from torch_denkf.submodel import Call, Entries, Sensor, Update
@@ -161,7 +161,7 @@ class Visible(MixedUpdate):
         """Returns the belief and the diagnostics."""
         if self.observed_key is not None:
             entries = self.with_mask(entries, call)
-        mask = None if self.observed_key is None else told(self.reading_space, entries.get(self.observed_key))
+        mask = None if self.observed_key is None else narrowed_mask(self.reading_space, entries.get(self.observed_key))
         visible = entries.get(self.visible_key)
         if visible is None:  # where a step is taken without the reading, nothing says whether it sees
             like = self.required(entries, self.in_keys[0])

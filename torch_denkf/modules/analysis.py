@@ -34,9 +34,9 @@ class EnsembleAnalysis(EnsembleUpdate):
         taper: localisation: factors on the covariances of state and observation ``[S, O]`` and of the observations
             ``[O, O]``, see :func:`~torch_denkf.functional.analyse`; ``None`` for none. Where one observation can say
             nothing about a component of the state but what E members happen to show, the factor is 0.
-        localisation: ``"significance"`` believes a covariance of state and observation as far as E members can tell it
+        localisation: ``"significance"`` uses a covariance of state and observation as far as E members can tell it
             from chance, see :func:`~torch_denkf.functional.analysis.significant`. It keeps members honest that are too
-            few for exact draws, where fast sensors make thousands of updates. ``None`` believes all.
+            few for exact draws, where fast sensors make thousands of updates. ``None`` uses all.
         threshold: of ``"significance"``, in standard deviations: one number or ``[S]``; a ``Parameter`` is trained. The
             more updates a component sees between two readings about it, the larger. One that is trained beyond
             sqrt(E - 1) ignores all, and has no gradient that would bring it back.

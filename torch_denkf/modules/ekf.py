@@ -120,7 +120,7 @@ def _linearise(
     key: NestedKey,
     sides: tuple[Space | None, Space | None] | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Value, Jacobian and mask of the model inside a step, which knows its Jacobian or is differentiated.
+    """Returns value, Jacobian and mask of the model inside a step, which knows its Jacobian or is differentiated.
 
     Args:
         step: around the model.

@@ -245,7 +245,7 @@ class GaussianAnalysis(Update):
     def mask_of(self, entries: Entries, written: Entries) -> torch.Tensor | None:
         """Returns the mask of what the observation model was given, and of what it wrote."""
         given, made = entries.get(self.observed_key), written.get(self.observed_key)
-        return told(self.reading_space, given if made is None else made if given is None else made & given)
+        return narrowed_mask(self.reading_space, given if made is None else made if given is None else made & given)
 
 
 def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: float = 1.0) -> tuple[torch.Tensor, ...]:

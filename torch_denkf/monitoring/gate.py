@@ -307,7 +307,7 @@ class GatedAnalysis(Around):
         return {**entries, self.noise_variance_key: noise * factor}
 
     def _wider(self, entries: Entries, factor: Tensor) -> Entries:
-        """The entries with the forecast's covariance times a factor ``[*B, 1]``."""
+        """Returns the entries with the forecast's covariance times a factor ``[*B, 1]``."""
         return wider_forecast(self.module, entries, factor, members=self.of_ensemble)
 
     def _without(self, entries: Entries, call: Call, rejected: Tensor) -> Entries:

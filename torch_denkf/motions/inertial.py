@@ -113,7 +113,7 @@ class InertialMotion(Motion):
         return torch.cat([moved, gyro_bias, accelerometer_bias], -1)
 
     def gradient(self, state, *readings, dt):
-        """That of the pose by itself and by the biases, which stay."""
+        """Returns the Jacobian of the pose by itself and by the biases, which stay."""
         gyro, accelerometer = readings if len(readings) == 2 else readings[0].split(3, -1)
         _, gyro_bias, accelerometer_bias = self.space.points(state)
         rate, force = torch.broadcast_tensors(gyro - gyro_bias, accelerometer - accelerometer_bias)
@@ -174,7 +174,7 @@ class AttitudeMotion(Motion):
         return torch.cat([SO3().plus(orientation, (gyro - bias) * dt), bias], -1)
 
     def move_and_gradient(self, state, gyro, *, dt):
-        """By the orientation itself, and by the bias, which stays."""
+        """Returns the Jacobian by the orientation itself, and by the bias, which stays."""
         orientation, bias = self.space.points(state)
         turn, by_rate = SO3().exp_and_jacobian((gyro - bias) * dt)
         moved = torch.cat([SO3().compose(orientation, turn), bias], -1)
@@ -244,7 +244,7 @@ _sixth = Function(
 
 
 def _inertial_jacobian(rate: Tensor, force: Tensor, dt: float | Tensor) -> Tensor:
-    """The Jacobian of :func:`move_inertially`, ``[*, 9, 15]``: of the pose's tangent by itself, and by biases.
+    """Returns the Jacobian of :func:`move_inertially`, ``[*, 9, 15]``: of the pose's tangent by itself, and by biases.
 
     Velocity and position are seen from the body's axes, before the step and behind it. What the force adds to the
     velocity is what a twist of turn and force moves a body by; to the position it adds the integral of that.

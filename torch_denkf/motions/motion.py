@@ -56,11 +56,11 @@ class Motion(Transition):
         raise NotImplementedError
 
     def gradient(self, *values: Any, **_: Any) -> Tensor:
-        """The Jacobian ``[*, D, D]`` of :meth:`move`, between tangents, from the same values; it may be left out."""
+        """Returns the Jacobian ``[*, D, D]`` of :meth:`move`, between tangents, from the same values; optional."""
         raise NotImplementedError
 
     def move_and_gradient(self, *values: Any, **dt: Any) -> tuple[Tensor, Tensor]:
-        """Both, which may share what they need."""
+        """Returns both, which may share what they need."""
         return self.move(*values, **dt), self.gradient(*values, **dt)
 
     def noise_of_step(self, dt: Any) -> list:
@@ -88,17 +88,17 @@ class Motion(Transition):
         return self.noise_of_step(self.dt) if isinstance(self.dt, (int, float)) else NoiseOfStep(self)
 
     def compute(self, ensemble, *others):
-        """The forecast ensemble."""
+        """Returns the forecast ensemble."""
         actions, dt = self._drivers(ensemble, *others)
         return self.move(ensemble, *actions, dt=dt)
 
     def jacobian(self, ensemble, *others):
-        """The forecast ensemble, and the Jacobian between tangents."""
+        """Returns the forecast ensemble, and the Jacobian between tangents."""
         actions, dt = self._drivers(ensemble, *others)
         return self.move_and_gradient(ensemble, *actions, dt=dt)
 
     def _drivers(self, ensemble: Tensor, *others: Tensor) -> tuple[list[Tensor], Any]:
-        """The actions and the length of the step, beside an ensemble."""
+        """Returns the actions and the length of the step, next to an ensemble."""
         actions: list[Any]
         dt: Any
         *actions, dt = others if self._timed else (*others, self.dt)
@@ -131,7 +131,7 @@ class NoiseOfStep(SubModel):
 
 
 def carried(space: Space, twist: Tensor, dt: Any) -> tuple[Tensor, Tensor]:
-    r"""The Jacobians of :math:`x \exp(d)` by x, and by the rate r of which :math:`d = r \Delta t`: ``[*, D, D]`` each.
+    r"""Returns the Jacobians of :math:`x \exp(d)` by x, and by the rate r with :math:`d = r \Delta t`: ``[*, D, D]``.
 
     Args:
         space: of x.
@@ -144,7 +144,7 @@ def carried(space: Space, twist: Tensor, dt: Any) -> tuple[Tensor, Tensor]:
 
 
 def corner(above: Tensor, below: Tensor) -> Tensor:
-    """Rows ``[*, N, D]``, and below them those of numbers that a motion does not mix, ``[*, D - N, D - N]``."""
+    """Returns rows ``[*, N, D]``, and below them those of numbers that a motion does not mix, ``[*, D - N, D - N]``."""
     padded = nn.functional.pad(below, (above.shape[-2], 0))
     return torch.cat([above, padded.expand(*above.shape[:-2], *padded.shape[-2:])], -2)
 

@@ -74,7 +74,7 @@ class PlanarMotion(Motion):
         return torch.cat([SE2().plus(pose, arc), speed, kept * turn, errors], -1)
 
     def gradient(self, state, *, dt):
-        """That of the pose by itself, by the speed ahead and by the turn rate; and the damping of these."""
+        """Returns the Jacobian of the pose by itself, speed ahead and turn rate; and the damping of these."""
         speed, turn = state[..., 3:4], state[..., 4:5]
         arc = torch.cat([turn * dt, speed * dt, torch.zeros_like(turn)], -1)
         by_pose, by_rate = carried(SE2(), arc, dt)

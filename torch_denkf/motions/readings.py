@@ -49,7 +49,7 @@ class _Reading(SubModel):
         raise NotImplementedError
 
     def gradient(self, point: Tensor, reading: Tensor) -> Tensor:
-        """The Jacobian of :meth:`observe` from the part's tangents to those of the reading; it may be left out."""
+        """Returns the Jacobian of :meth:`observe` from the part's tangents to those of the reading; optional."""
         raise NotImplementedError
 
     def compute(self, ensemble):
@@ -58,7 +58,7 @@ class _Reading(SubModel):
         return self.observe(ensemble.narrow(-1, self.begin, self.read_space.point_dim))
 
     def jacobian(self, ensemble):
-        """Zero but for the part that is read."""
+        """Returns zero but for the part that is read."""
         reading = self.compute(ensemble)
         matrix = self.gradient(ensemble.narrow(-1, self.begin, self.read_space.point_dim), reading)
         return reading, nn.functional.pad(matrix, self._beside) if any(self._beside) else matrix
@@ -98,7 +98,7 @@ class PoseOf(_Reading):
         return point
 
     def gradient(self, point, reading):
-        """The identity."""
+        """Returns the identity."""
         return torch.eye(self.read_space.tangent_dim, dtype=point.dtype, device=point.device)
 
 
@@ -143,7 +143,7 @@ class Magnetic(_Reading):
         return rotate(_inverse(point), self.field)
 
     def gradient(self, point, reading):
-        """A turn of the body turns the direction back."""
+        """Returns the Jacobian: a turn of the body turns the direction back."""
         others = self.read_space.tangent_dim - 3
         return nn.functional.pad(skew(reading), (0, others)) if others else skew(reading)
 
@@ -222,15 +222,15 @@ class PositionInBody(_Reading):
         self._of_readings(Euclidean(self.landmark.numel()))
 
     def observe(self, point):
-        """The landmarks in the body's axes."""
+        """Returns the landmarks in the body's axes."""
         return self._seen(point)
 
     def gradient(self, point, reading):
-        """A turn of the body turns landmarks back; they come nearer as it moves towards them."""
+        """Returns the Jacobian: a turn of the body turns landmarks back; they come nearer as it moves towards them."""
         return self._by_pose(reading)
 
     def _by_pose(self, seen: Tensor) -> Tensor:
-        """The Jacobian ``[*, N L, D]`` of landmarks that lie at ``seen`` ``[*, N L]``."""
+        """Returns the Jacobian ``[*, N L, D]`` of landmarks that lie at ``seen`` ``[*, N L]``."""
         size = self.landmark.shape[-1]
         seen = seen.unflatten(-1, (-1, size))
         turn = skew(seen) if size == 3 else torch.stack([seen[..., 1], -seen[..., 0]], -1).unsqueeze(-1)
@@ -288,7 +288,7 @@ class RangeBearing(PositionInBody):
         self._of_readings(Product(Euclidean(1), Circle()))
 
     def observe(self, point):
-        """Range and bearing; at the landmark itself zero, and so is their gradient."""
+        """Returns range and bearing; at the landmark itself zero, and so is their gradient."""
         away = self._seen(point)
         there = (away == 0).all(-1, keepdim=True)
         away = torch.where(there, torch.ones_like(away), away)
@@ -296,7 +296,7 @@ class RangeBearing(PositionInBody):
         return torch.where(there, torch.zeros_like(polar), polar)
 
     def gradient(self, point, reading):
-        """That of range and bearing by where the landmark lies, times that of this."""
+        """Returns the Jacobian of range and bearing by the landmark's place, times that of the place."""
         away = self._seen(point)
         x, y = away.unbind(-1)
         there = (away == 0).all(-1)

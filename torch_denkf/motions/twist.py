@@ -61,7 +61,7 @@ class ConstantTwist(Motion):
         return torch.cat([self.pose_space.plus(pose, twist * dt), twist], -1)
 
     def gradient(self, state, *, dt):
-        """That of the pose by itself and by its twist; the twist stays."""
+        """Returns the Jacobian of the pose by itself and by its twist; the twist stays."""
         twist = self.space.points(state)[1]
         by_pose, by_rate = carried(self.pose_space, twist * dt, dt)
         return corner(torch.cat([by_pose, by_rate], -1), torch.eye(self.pose_space.tangent_dim).to(state))

@@ -53,7 +53,7 @@ def quaternion_of(matrix: Tensor) -> Tensor:
 
 
 def skew(vector: Tensor) -> Tensor:
-    """The matrix ``[*, 3, 3]`` whose product with another vector is the cross product with it."""
+    """Returns the matrix ``[*, 3, 3]`` whose product with another vector is the cross product with it."""
     axes = torch.eye(3, dtype=vector.dtype, device=vector.device)
     return _cross(vector.unsqueeze(-2), axes).mT
 

@@ -209,7 +209,7 @@ class _RotationAndVectors(Space):
         return self._matrix(block, low)
 
     def exp_and_jacobian(self, tangent):
-        """For a rotation alone from three functions of its angle."""
+        """Returns point and Jacobian; for a rotation alone from three functions of its angle."""
         if self.vectors or torch.compiler.is_compiling():
             return super().exp_and_jacobian(tangent)
         w, share, third = several(tangent.square().sum(-1, keepdim=True), cos_half, sinc_half, one_minus_sinc)
