@@ -111,7 +111,7 @@ class LearnedTransition(MemberNetwork, Transition):
         return torch.cat([features, action.expand(*state.shape[:-1], action.shape[-1])], -1)
 
     def jacobian(self, state, action=None, dt=None):
-        """Returns the network's Jacobian in the state's units times the step's length, plus the identity if residual."""
+        """Returns the network's Jacobian in the state's units times the step's length, plus identity if residual."""
         found = jacobian_of_network(self.module, self.features(state, action), state.shape[-1])
         if found is None:
             return None
