@@ -415,10 +415,11 @@ class Update(SubModel):
     reading_space: Space | None = None
     observation_dim: int | None = None
 
-    def reading_dims(self, entries: Entries, call: Call) -> Sequence[int]:
+    def reading_dims(self, entries: Entries, call: Call) -> Sequence[int | tuple[int, ...]]:
         """Returns how many numbers each of ``reading_keys`` has, to put zeros behind a mask where it is missing.
 
-        By default O: ``observation_dim``, or what :attr:`predicted_key` holds. On a space the noise is of tangents.
+        Of samples ``(E, O)``. By default O: ``observation_dim``, or what :attr:`predicted_key` holds. On a space the
+        noise is of tangents.
 
         Raises:
             KeyError: if that is not known.

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch_denkf.data.video import EXTRA
 
-__all__ = ["read_parquet"]
+__all__ = ["parquet_names", "read_parquet"]
 
 MOST_ROWS = 10**8
 MOST_BYTES, MOST_RATIO = 1 << 30, 64  # more than so many bytes may not be more than so many times the file
@@ -41,8 +41,16 @@ def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
         raise ValueError(f"{file} is no complete parquet file ({error}); download or copy it again") from error
 
 
-def _check_unpacked_size(file: Path, metadata: Any) -> None:
-    """Raises for decompression bombs, before anything is unpacked.
+def parquet_names(file: Path) -> list[str]:
+    """Names of the columns of a parquet file; raises as :func:`read_parquet`."""
+    read_parquet(file, [])
+    import pyarrow.parquet as parquet
+
+    return list(parquet.read_schema(file).names)
+
+
+def _refuse_bombs(file: Path, metadata: Any) -> None:
+    """Before anything is unpacked.
 
     Raises:
         ValueError: for a small file that announces a huge table.

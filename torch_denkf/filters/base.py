@@ -83,6 +83,9 @@ class Filter(Checked, TensorDictSequential):
             is no covariance. In a sequence the NaN of a belief that diverges goes on to its end, and one warning names
             its cause. Readings are checked, or rejected, by ``torch_denkf.imperfect.RejectReadings`` in front of the
             filter. On a GPU nothing is looked at: each step would wait for it.
+        keep_noise: whether a step in a policy writes the noise that it drew, under ``("drawn", place)``. Recurrent mode
+            then filters the collected data with the same draws, so that a policy's probabilities are those with which
+            it was collected as long as nothing has been learned.
         prefix: name under which all stands that the filter writes, carries on or finds as noise: with ``"imu"`` the
             mean is ``("imu", "belief", "mean")``. Two filters of one environment or policy need one. ``None`` for none.
 
@@ -124,6 +127,7 @@ class Filter(Checked, TensorDictSequential):
         forecast_keys: Mapping[NestedKey, NestedKey] | None = None,
         variance_ceiling: float | None = 1e12,
         check_finite: bool = True,
+        keep_noise: bool = True,
         prefix: str | None = None,
     ):
         if len(modules) == 1 and isinstance(modules[0], Mapping):
@@ -137,18 +141,18 @@ class Filter(Checked, TensorDictSequential):
         super().__init__(*modules)
         self.initial = initial
         fixed = {"update_at_reset": update_at_reset, "variance_ceiling": variance_ceiling, "prefix": prefix}
-        self._set_options(control_keys, init_key, forecast_keys, check_finite, **fixed)
+        self._set_options(control_keys, init_key, forecast_keys, check_finite, keep_noise, **fixed)
         self.compiled: Any = None
         #: Called with the filter and a :class:`Record` of each run, before anything is written.
         self.observers: list[Observer] = diagnosis().default_observers()
         diagnosis().check_precision(self)
         self._sort()
 
-    def _set_options(self, control_keys, init_key, forecast_keys, check_finite, **fixed: Any) -> None:
+    def _set_options(self, control_keys, init_key, forecast_keys, check_finite, keep_noise, **fixed: Any) -> None:
         if fixed["prefix"] == "next":
             raise ValueError('prefix="next" is where torchrl keeps the next step: give the filter another name')
         self.init_key, self.control_keys = unravel_key(init_key), list(control_keys)
-        self.forecast_keys, self.check_finite = dict(forecast_keys or {}), check_finite
+        self.forecast_keys, self.check_finite, self.keep_noise = dict(forecast_keys or {}), check_finite, keep_noise
         self.fixed_options = fixed
 
     def _sort(self) -> None:
@@ -165,7 +169,9 @@ class Filter(Checked, TensorDictSequential):
         self._own_keys = {*written, *map(unravel_key, self.initial.out_keys)}
         self.in_keys = [self.outer(key) for key in structure.in_keys(self.init_key)]
         self.out_keys = [self.outer(key) for key in written]
-        self._noise_key = self.outer("noise")
+        self._noise_key, self._drawn_key = self.outer("noise"), self.outer("drawn")
+        self.keeps_noise = self.keep_noise and bool(self.draws.places)
+        self.in_keys += [self._drawn_key] * self.keeps_noise
         everything = [*structure.in_keys(self.init_key), *chain(*reads(self.initial))]
         a_step = [*structure.needed, *structure.optional, *structure.controls, *structure.carry]
         self._all_keys, self._step_keys = ({key: self.outer(key) for key in keys} for keys in (everything, a_step))
@@ -274,7 +280,7 @@ class Filter(Checked, TensorDictSequential):
         names = (key,) if isinstance(key, str) else key
         if names[0] == "next":
             return ("next", self.prefix, *names[1:])
-        own = key in self._own_keys or names[0] in ("noise", "previous")
+        own = key in self._own_keys or names[0] in ("noise", "drawn", "previous")
         return (self.prefix, *names) if own else key
 
     def inside(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -376,6 +382,11 @@ class Filter(Checked, TensorDictSequential):
         # A mark may be that of a slice of data, which goes on from the belief before it.
         known = entries.get(HAS_PREVIOUS)
         reset = starts_of(tensordict, self.init_key, step=True) if known is None else ~known.reshape(*size, 1)
+        drawn: Entries = {}
+        if self.keeps_noise:
+            places = (*dict(structure.modules), *([] if reset is None else ["initial"]))
+            drawn = self.draws.missing(entries, size, places=places)
+            entries.update(drawn)
         if reset is None:
             written = self.take_step(entries, size)
         else:
@@ -385,7 +396,8 @@ class Filter(Checked, TensorDictSequential):
             # What went before does not count where an episode begins.
             entries.update({key: where_rows(reset, written[key], entries[key]) for key in structure.carry})
         following = {("next", *previous_key(key)): written[key] for key in structure.carry}
-        following["next", *HAS_PREVIOUS] = written[structure.carry[0]].new_ones(*size, 1, dtype=torch.bool)
+        following["next", *KNOWN] = torch.ones(*size, 1, dtype=torch.bool, device=written[structure.carry[0]].device)
+        following.update({("drawn", *key[1:]): value for key, value in drawn.items()})
         record = Record("policy", tensordict, size, entries, {**written, **following})
         return self.write(tensordict, self.finished(record, given))
 
@@ -619,6 +631,9 @@ class Filter(Checked, TensorDictSequential):
             value = tensordict.get(outer, None)
             if value is not None:
                 entries[key] = value
+        drawn = tensordict.get(self._drawn_key, None) if recurrent_mode() and self.keeps_noise else None
+        if drawn is not None:  # those of other modules are not this filter's
+            entries.update((key, value) for key, value in flat_noise(drawn).items() if key[1] in self.draws.places)
         given = tensordict.get(self._noise_key, None)
         if given is not None:
             noise = flat_noise(given)

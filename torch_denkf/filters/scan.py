@@ -195,6 +195,9 @@ def _masked(module: Update, entries: Entries, call: Call) -> Entries:
     """Returns the entries with ones in the place of missing observations, and a mask that says so."""
     like = next(entries[key] for key in module.in_keys if key in entries)
     dims = zip(module.reading_keys, module.reading_dims(entries, call), strict=True)
-    ones = {unravel_key(key): like.new_ones(*call.batch_size, dim) for key, dim in dims}
+    ones = {
+        unravel_key(key): like.new_ones(*call.batch_size, *torch.Size([dim] if isinstance(dim, int) else dim))
+        for key, dim in dims
+    }
     mask = torch.zeros(*call.batch_size, 1, dtype=torch.bool, device=like.device)
     return {**ones, **entries, module.observed_key: mask}

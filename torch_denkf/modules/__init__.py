@@ -17,7 +17,6 @@ from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise, ScaledNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
 from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise, as_process_noise
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
-from torch_denkf.modules.sharded_analysis import ShardedEnsembleAnalysis
 from torch_denkf.modules.stochastic import StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
@@ -50,7 +49,6 @@ __all__ = [
     "FromSensor",
     "EnsembleAnalysis",
     "LocalEnsembleAnalysis",
-    "ShardedEnsembleAnalysis",
     "MomentPrior",
     "LinearTransition",
     "KalmanAnalysis",

@@ -132,6 +132,11 @@ class EnsembleAnalysis(EnsembleUpdate):
         size = predicted.shape[-1] if self.reading_space is None else self.reading_space.tangent_dim
         return {**super().noise_sizes(forecast), "observation_dim": size}
 
+    def reading_dims(self, entries, call):
+        """Returns how many numbers the reading has; of samples, ``(E, O)``."""
+        (dim, *others), forecast = super().reading_dims(entries, call), entries.get(self.in_keys[0])
+        return [dim if self.scheme != "sensor" or forecast is None else (forecast.shape[-2], dim), *others]
+
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """Returns the belief and the diagnostics."""
         center = None

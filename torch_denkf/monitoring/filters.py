@@ -222,7 +222,8 @@ def _dim(filter: Filter, analysis: Update) -> int:
         if dim is not None and not noise.isdisjoint(writes(part)):
             return dim
     try:
-        return analysis.reading_dims({}, Call(torch.Size()))[0]
+        found = analysis.reading_dims({}, Call(torch.Size()))[0]
+        return found if isinstance(found, int) else found[-1]
     except KeyError:
         raise ValueError(
             f"how many components the reading of {type(analysis).__name__} has is not known; pass observation_dim"

@@ -305,7 +305,9 @@ def sensor_samples(truth: Targets) -> tuple[Tensor, Labels]:
     target, model = data.get(keys.target_observation, None), reading.model
     if target is None:
         if model is None or learns(model):
+            named = sorted({key[1] for key in filter.structure.frame_keys if beliefs.is_samples(key) and key[2:]})
             several = "has no observation model with an observe() method, or several sensors, of which none is named"
+            several += f" (there are {named})" * bool(named)
             why = several if model is None else "learns its observation model"
             raise KeyError(
                 f"loss_sensor needs the true observation in {keys.target_observation!r}, because the filter {why}. Add "

@@ -15,6 +15,7 @@ from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
 
 from torch_denkf._arguments import check_key
 from torch_denkf._checks import check_count, check_values, flag_value
+from torch_denkf._registered import diagnosis
 from torch_denkf._slices import one_earlier
 from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record
@@ -175,6 +176,9 @@ class SensorLoss(FilterLoss):
     def _run(self, tensordict):
         size, out = tensordict.batch_size, tensordict.copy()
         call = Call(size, time=len(size) > 1)
+        missing = [key for key in reads_of(self._trained())[0] if tensordict.get(key, None) is None]
+        if missing:
+            raise diagnosis().missing_entry(type(self).__name__, missing, tensordict.keys(True, True))
         # As in Filter.sequence: a recurrent network among these modules reads whole sequences.
         with set_recurrent_mode(True) if call.time else nullcontext():
             written = run_modules(self._placed(), self.filter.entries_of(tensordict), call)

@@ -98,6 +98,7 @@ _STATE = {
     "results": dict,
     "best": (dict, type(None)),
     "last_metrics": dict,
+    "first": (float, type(None)),
     "logs": dict,
     "hooks": dict,
 }

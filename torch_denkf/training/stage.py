@@ -152,6 +152,32 @@ class Stage:
         }
 
 
+def why_no_gain(stage: Stage, first: float, value: float, update: int) -> str:
+    """Returns what a stage that gained less than 1 % is to be told, or nothing.
+
+    Args:
+        stage: the stage.
+        first: the monitored error before its first update.
+        value: the one that was kept.
+        update: after which it was found.
+
+    Example:
+        >>> why_no_gain(Stage("whole", dict, dict, 100, lengths={0: 6}), 2.0, 2.0, 0)[:67]
+        "Stage 'whole' gained nothing: the error is 2 as before it. Likely: "
+    """
+    if not first - value < 0.01 * abs(first):
+        return ""
+    said = f"made the error worse, {first:.4g} to {value:.4g}" if value > first else "gained nothing: the error is "
+    if value <= first:
+        said += f"{value:.4g} as before it" if update == 0 else f"{value:.4g}, and {first:.4g} before it"
+    causes = [f"lr={stage.lr:g} is too high" if update == 0 or value > first else f"lr={stage.lr:g} is too low"]
+    if stage.lengths is not None:
+        longest = max(stage.lengths.values())
+        causes.append(f"windows of {longest} steps are too short to show what the filter does later")
+    causes.append("the loss and the validation ask for different things, or the training batches are learned by heart")
+    return f"Stage {stage.name!r} {said}. Likely: {'; '.join(causes)}."
+
+
 @contextmanager
 def only_trainable(model: nn.Module, parameters: Iterable[nn.Parameter]) -> Iterator[None]:
     """Freezes all of ``model`` but ``parameters``; afterwards every parameter is as it was."""
