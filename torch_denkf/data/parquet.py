@@ -49,7 +49,7 @@ def parquet_names(file: Path) -> list[str]:
     return list(parquet.read_schema(file).names)
 
 
-def _refuse_bombs(file: Path, metadata: Any) -> None:
+def _check_unpacked_size(file: Path, metadata: Any) -> None:
     """Before anything is unpacked.
 
     Raises:

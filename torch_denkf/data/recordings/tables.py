@@ -176,7 +176,7 @@ class Table:
 
 
 def check_stream(sample: str, ways: Sequence[str], tolerance: float | None, unit: str | None) -> None:
-    """Refuses options that no stream has.
+    """Raises for options that no stream has.
 
     Raises:
         ValueError: if there is one.
