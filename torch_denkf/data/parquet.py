@@ -50,7 +50,7 @@ def parquet_names(file: Path) -> list[str]:
 
 
 def _check_unpacked_size(file: Path, metadata: Any) -> None:
-    """Before anything is unpacked.
+    """Raises for decompression bombs, before anything is unpacked.
 
     Raises:
         ValueError: for a small file that announces a huge table.
