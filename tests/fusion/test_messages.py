@@ -9,17 +9,8 @@ from torch.testing import assert_close
 from torch_denkf import FusedFilter, FusedSensor, ParticleFilter
 from torch_denkf.functional.manifolds import SE2, SE3
 from torch_denkf.fusion import message_rows
-from torch_denkf.modules import (
-    AroundState,
-    ConstantNoise,
-    ContinuousMotion,
-    ContinuousNoise,
-    EKFTransition,
-    GaussianAround,
-    MomentPrior,
-    Select,
-)
-from torch_denkf.motions import AttitudeMotion, ConstantTwist, Gravity, PoseOf
+from torch_denkf.modules import AroundState, ConstantNoise, EKFTransition, GaussianAround, MomentPrior, Select
+from torch_denkf.motions import AttitudeMotion, ConstantTwist, ContinuousMotion, ContinuousNoise, Gravity, PoseOf
 from torch_denkf.smoothers import ParticleSmoother
 
 

@@ -6,7 +6,6 @@ Import from here: ``from torch_denkf.modules import EnsembleAnalysis, ImageSenso
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.around import Around
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
-from torch_denkf.modules.continuous import ContinuousMotion, ContinuousNoise, NoisePerSecond
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules.keypoints import KeypointTrunk
@@ -31,9 +30,6 @@ __all__ = [
     "StochasticMLP",
     "deterministic",
     "LearnedTransition",
-    "ContinuousMotion",
-    "ContinuousNoise",
-    "NoisePerSecond",
     "LearnedObservation",
     "LinearObservation",
     "Select",

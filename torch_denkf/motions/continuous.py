@@ -8,9 +8,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_covariance, check_square, check_values
-from torch_denkf.functional.continuous import discretise
 from torch_denkf.modules.around import Wrapper
 from torch_denkf.modules.tensors import as_floating, register_constant
+from torch_denkf.motions.discretisation import discretise
 from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["ContinuousMotion", "ContinuousNoise", "NoisePerSecond"]
