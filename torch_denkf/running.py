@@ -112,7 +112,7 @@ def is_sequence(module: Any) -> TypeGuard[TensorDictSequential]:
 
 
 def named_modules_of(sequence: TensorDictSequential) -> list[tuple[str, TensorDictModuleBase]]:
-    """The modules of a sequence and their names, which are numbers unless it was made of a dictionary."""
+    """Returns the modules of a sequence and their names, which are numbers unless it was made of a dictionary."""
     return list(sequence.module._modules.items())
 
 
@@ -144,7 +144,7 @@ def writes(module: TensorDictModuleBase) -> list[NestedKey]:
 
 
 def in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
-    """The module, or those of a plain sequence."""
+    """Yields the module, or those of a plain sequence."""
     if is_sequence(module):
         for _, part in named_modules_of(module):
             yield from in_sequences(part)
@@ -159,12 +159,12 @@ def reading_of(sensor: TensorDictModuleBase) -> NestedKey:
 
 
 def marks_of(module: TensorDictModuleBase) -> dict[NestedKey, NestedKey]:
-    """The masks that a module makes where it finds readings that are missing, and of which masks it makes them."""
+    """Maps each mask that a module derives, for readings that it finds missing, to the mask that it derives it from."""
     return {made: given for part in in_sequences(module) for made, given in role(part, Sensor).marks.items()}
 
 
 def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str, SubModel]]:
-    """The sub-models that draw noise, and their places, in the order in which they run."""
+    """Yields the sub-models that draw noise, and their places, in the order in which they run."""
     parts: Iterable[tuple[str, TensorDictModuleBase]]
     if isinstance(module, SubModel):
         if module.noise_names:

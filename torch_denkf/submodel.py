@@ -52,12 +52,12 @@ class Call(NamedTuple):
     raw: bool = False
 
     def part(self, name: str) -> Call:
-        """The call of a part of the module."""
+        """Returns the call of a part of the module."""
         return self._replace(place=name if self.place == "self" else f"{self.place}.{name}")
 
 
 def flat_noise(noise: Noise | TensorDictBase, *place: str) -> Entries:
-    """Noise as entries ``("noise", *place)``, or ``("noise", *place, name)`` where it is several tensors."""
+    """Returns noise as entries ``("noise", *place)``, or ``("noise", *place, name)`` where it is several tensors."""
     if noise is None:
         return {}
     if isinstance(noise, Tensor):
@@ -103,7 +103,7 @@ class SubModel(Checked, TensorDictModule):
 
         @property
         def noise_names(self) -> tuple[str, ...]:
-            """A tuple in the class, or a property."""
+            """Names the noise of a call: a tuple in the class, or a property."""
 
     else:
         noise_names = ()
@@ -195,7 +195,7 @@ class SubModel(Checked, TensorDictModule):
         return None
 
     def noise_sizes(self, *values: Any, **_: Any) -> dict[str, int]:
-        """The sizes that :meth:`draw_noise` needs, from the values that :meth:`compute` gets by position."""
+        """Returns the sizes that :meth:`draw_noise` needs, from the values that :meth:`compute` gets by position."""
         return {}
 
     def parts(self) -> dict[str, TensorDictModuleBase]:
@@ -231,7 +231,7 @@ class SubModel(Checked, TensorDictModule):
         return self.by_key(out)
 
     def values(self, entries: Entries) -> list[Any]:
-        """The entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
+        """Returns the entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
 
         Raises:
             KeyError: if an entry of ``in_keys`` is missing.
@@ -254,10 +254,10 @@ class SubModel(Checked, TensorDictModule):
         return dict(zip(self.out_keys, values, strict=True))
 
     def required(self, entries: Entries, key: NestedKey) -> Tensor:
-        """The entry ``key``.
+        """Returns the entry ``key``.
 
         Raises:
-            KeyError: if it is missing; the message names it and lists what is there.
+            KeyError: if it is missing; the message names it and lists the entries.
         """
         value = entries.get(key)
         if value is None:
@@ -295,7 +295,7 @@ class SubModel(Checked, TensorDictModule):
             given = given if len(given) == len(found) else None
         if given is None:
             where: dict[str, Any] = {}
-            # Where nothing is read, what is drawn lies beside the constants.
+            # Where nothing is read, what is drawn lies next to the constants.
             for value in values if values else (*self.parameters(), *self.buffers()):
                 if value is not None and value.is_floating_point():
                     where = {"device": value.device, "dtype": value.dtype}

@@ -19,7 +19,7 @@ _OWN = {
 
 
 def commands() -> dict[str, tuple[str, str]]:
-    """By name: where the command is, and what it does; applications register theirs.
+    """Maps names of commands to their place and their purpose; applications register theirs.
 
     Example:
         >>> sorted(commands())[:2]
@@ -29,7 +29,7 @@ def commands() -> dict[str, tuple[str, str]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a sub-command.
+    """Runs a sub-command.
 
     Args:
         arguments: words of the command line; by default the process's own.

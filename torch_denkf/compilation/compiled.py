@@ -15,7 +15,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf._checks import has_values
-from torch_denkf.compilation.compared import placed, refuse_other_numbers, tensors
+from torch_denkf.compilation.compared import check_same_numbers, placed, tensors
 from torch_denkf.compilation.libraries import clear_damaged_libraries
 from torch_denkf.compilation.options import need_compiler, options_for_processors
 from torch_denkf.filters.scan import Steps
@@ -86,7 +86,7 @@ class CompiledSteps:
         whole, named = count, {**inputs}
         if resets is not None:
             # One graph for all chunks: each step may reset rows, and what is left over is a chunk whose last steps are
-            # of no use. They begin anew, so that no number of theirs grows without bound.
+            # of no use. They begin again, so that no number of theirs grows without bound.
             whole = -(-count // length) * length
             named |= {
                 _GOES_ON: filled(~resets, time, count, True),
@@ -139,7 +139,7 @@ class CompiledSteps:
             with said_when_long(
                 f"The {what} of the filter is made: once for each kind of call, and for later processes."
             ):
-                refuse_other_numbers(
+                check_same_numbers(
                     function,
                     make(),
                     inputs,
@@ -227,7 +227,7 @@ def of_one_kind(value: Tensor) -> Tensor:
 
 
 def _laid_out(value: Tensor) -> Tensor:
-    """In the order of its dimensions, for the same reason; dimensions along which nothing changes take no memory."""
+    """Orders strides by dimension, for the same reason; dimensions along which nothing changes take no memory."""
     return value if 0 in value.stride() else value.contiguous().view(value.shape)
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torch_denkf.compilation.compiled import filled
 from torch_denkf.filters.scan import Steps
-from torch_denkf.filters.structure import RESUMES
+from torch_denkf.filters.structure import FROM_STORED
 from torch_denkf.functional.gaussian import hide, kalman_update, solve_for_gain
 from torch_denkf.functional.linalg import as_covariance
 from torch_denkf.functional.smoothing.rts import smoothing_gain
@@ -182,7 +182,7 @@ class StepsInTime(NamedTuple):
         """Returns what :meth:`Steps.scan` does: the beliefs of all times, and then each step from the one before."""
         structure, time, count = self.steps.structure, len(call.batch_size), len(cuts)
         given = carry, inputs, call, resets, starts, cuts, keep
-        if any(cuts) or RESUMES in inputs:
+        if any(cuts) or FROM_STORED in inputs:
             return self.steps.scan(*given)
         begin = None
         if resets is not None:
@@ -207,7 +207,7 @@ class StepsInTime(NamedTuple):
         return last, {key: out[key] for key in keep}
 
     def _elements(self, inputs: Entries, resets: Tensor | None, begin: Sequence[Tensor] | None) -> list[Tensor]:
-        """A, b, C, eta, J and where nothing goes on, ``[*B, T, ...]``."""
+        """Returns A, b, C, eta, J and where nothing goes on, ``[*B, T, ...]``."""
         move, q, matrix, r = self.motion.matrix, self.motion.noise, self.update.matrix, self.update.noise
         reading = inputs[self.update.in_keys[2]]
         if reading.ndim > (resets if resets is not None else reading).ndim:

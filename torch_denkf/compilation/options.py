@@ -19,7 +19,7 @@ _said = False
 
 
 def options_for_processors() -> dict[str, Any]:
-    """Options of ``torch.compile`` for small steps on a processor."""
+    """Returns options of ``torch.compile`` for small steps on a processor."""
     global _said
     version = ".".join(torch.__version__.split(".")[:2])
     if version in TESTED_VERSIONS:

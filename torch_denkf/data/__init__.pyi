@@ -1,5 +1,5 @@
 from .episodes import Episode
-from .lerobot.lag import lag_errors
+from .lerobot.latency import lag_errors
 from .lerobot.replay import LeRobotReplay
 from .recordings.frames import Images, Video
 from .recordings.offsets import clock_offsets

@@ -34,7 +34,7 @@ from torch_denkf.filters.gather import gather_rows, of_one_robot
 from torch_denkf.filters.noise import Draws
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.filters.scan import Steps, where_rows
-from torch_denkf.filters.structure import KNOWN, Structure, previous_key
+from torch_denkf.filters.structure import HAS_PREVIOUS, Structure, previous_key
 from torch_denkf.modules.variance_ceiling import VarianceCeiling
 from torch_denkf.running import check_module, named_modules_of, reads, run_module
 from torch_denkf.submodel import Call, Entries, Initial, Transition, flat_noise, in_role, role
@@ -76,7 +76,7 @@ class Filter(Checked, TensorDictSequential):
             :class:`torchrl.envs.InitTracker` and torchrl's ``SliceSampler``; one of its name in a group of agents
             counts, too.
         update_at_reset: whether the initial belief is updated with the first frame.
-        forecast_keys: the forecast of each carried entry, where it cannot be told by its name.
+        forecast_keys: the forecast of each carried entry, where its name does not tell.
         variance_ceiling: the belief's variances are clamped to it, so that an unstable system that nobody observes
             stays finite, with one warning; in the state's units squared. ``None`` for no ceiling.
         check_finite: whether a step raises where its new belief is not finite, and any run where the noise of a reading
@@ -183,12 +183,12 @@ class Filter(Checked, TensorDictSequential):
 
     @property
     def variance_ceiling(self) -> float | None:
-        """Ceiling of the belief's variances."""
+        """Returns the ceiling of the belief's variances."""
         return self.fixed_options["variance_ceiling"]
 
     @property
     def prefix(self) -> str | None:
-        """Name under which the filter's own entries stand."""
+        """Returns the name under which the filter's own entries stand."""
         return self.fixed_options["prefix"]
 
     def with_options(self, **options: Unpack[FilterOptions]) -> Filter:
@@ -260,17 +260,17 @@ class Filter(Checked, TensorDictSequential):
 
     @property
     def carry_keys(self) -> list[NestedKey]:
-        """The entries of the belief that go on from step to step."""
+        """Returns the entries of the belief that go on from step to step."""
         return [self.outer(key) for key in self.structure.carry]
 
     @property
     def belief_keys(self) -> list[NestedKey]:
-        """All entries of the belief: the carry, and what follows from it."""
+        """Returns all entries of the belief: the carry, and what follows from it."""
         return [self.outer(key) for key in self.structure.belief]
 
     @property
     def transition_module(self) -> TensorDictModuleBase:
-        """The module that forecasts the carry: the first that depends on the belief."""
+        """Returns the module that forecasts the carry: the first that depends on the belief."""
         return self.structure.transition[1]
 
     def outer(self, key: NestedKey) -> NestedKey:
@@ -284,7 +284,7 @@ class Filter(Checked, TensorDictSequential):
         return (self.prefix, *names) if own else key
 
     def inside(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """A shallow copy that holds the filter's own entries as they would be without a prefix."""
+        """Returns a shallow copy that holds the filter's own entries as they would be without a prefix."""
         out = tensordict.copy()
         return out if self.prefix is None else out.update(tensordict.get(self.prefix))
 
@@ -320,12 +320,12 @@ class Filter(Checked, TensorDictSequential):
             value = belief[key]
             kept = self.outer(previous_key(key))
             found[kept] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
-        found[self.outer(KNOWN)] = Unbounded(shape=(1,), dtype=torch.bool, device=value.device)
+        found[self.outer(HAS_PREVIOUS)] = Unbounded(shape=(1,), dtype=torch.bool, device=value.device)
         actions = {key: self.outer(previous_key(key)) for key in self.structure.controls}
         return primers().LastAction(actions, primers=found)
 
     def compile(self, *, chunk: int | None = None, **options) -> Filter:
-        """From now on runs steps, and sequences in chunks of steps, through ``torch.compile``.
+        """Runs steps, and sequences in chunks of steps, through ``torch.compile`` from now on.
 
         The first call of each kind (batch size, with or without gradients) compiles, later ones reuse that;
         copies and pickles of the filter compile again. Noise is drawn outside: a seed gives what it gives eagerly, up
@@ -380,7 +380,7 @@ class Filter(Checked, TensorDictSequential):
         if not entries.keys() >= structure.must:
             diagnosis().check_inputs(structure, type(self).__name__, entries, tensordict)
         # A mark may be that of a slice of data, which goes on from the belief before it.
-        known = entries.get(KNOWN)
+        known = entries.get(HAS_PREVIOUS)
         reset = starts_of(tensordict, self.init_key, step=True) if known is None else ~known.reshape(*size, 1)
         drawn: Entries = {}
         if self.keeps_noise:
@@ -396,7 +396,7 @@ class Filter(Checked, TensorDictSequential):
             # What went before does not count where an episode begins.
             entries.update({key: where_rows(reset, written[key], entries[key]) for key in structure.carry})
         following = {("next", *previous_key(key)): written[key] for key in structure.carry}
-        following["next", *KNOWN] = torch.ones(*size, 1, dtype=torch.bool, device=written[structure.carry[0]].device)
+        following["next", *HAS_PREVIOUS] = written[structure.carry[0]].new_ones(*size, 1, dtype=torch.bool)
         following.update({("drawn", *key[1:]): value for key, value in drawn.items()})
         record = Record("policy", tensordict, size, entries, {**written, **following})
         return self.write(tensordict, self.finished(record, given))
@@ -438,7 +438,7 @@ class Filter(Checked, TensorDictSequential):
         return self.write(tensordict, self.finished(Record("step", tensordict, size, entries, written)))
 
     def predict(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
-        """A step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does.
+        """Runs a step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does.
 
         Raises:
             KeyError: if an analysis does not say which entries are its readings.
@@ -604,7 +604,7 @@ class Filter(Checked, TensorDictSequential):
         return self.finished(Record("sequence", tensordict, size, entries, outputs), given), rows
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:
-        """``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
+        """Returns ``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
         size = tensordict.batch_size
         marks = starts_of(tensordict, self.init_key)
         first = torch.zeros(size, dtype=torch.bool, device=device_of(tensordict))
@@ -612,11 +612,11 @@ class Filter(Checked, TensorDictSequential):
         first = first if marks is None else first | marks.reshape(size)
         if any(tensordict.get(self.outer(previous_key(key)), None) is None for key in self.structure.carry):
             return ~first
-        known = tensordict.get(self.outer(KNOWN), None)  # a policy's data: what has a belief before it is a step
+        known = tensordict.get(self.outer(HAS_PREVIOUS), None)  # a policy's data: what has a belief before it is a step
         return torch.ones_like(first) if known is None else known.reshape(size)
 
     def like(self) -> Tensor | None:
-        """A tensor of the filter's precision and device; ``None`` where it has no parameters or constants."""
+        """Returns a tensor of the filter's precision and device; ``None`` where it has no parameters or constants."""
         return next((p for p in chain(self.parameters(), self.buffers()) if p.is_floating_point()), None)
 
     def entries_of(self, tensordict: TensorDictBase, *, one_step: bool = False) -> Entries:

@@ -37,7 +37,7 @@ class GaussianUpdate(NamedTuple):
 
 
 def kalman_predict(mean: Tensor, cov: Tensor, transition: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Forecast a Gaussian through a linear transition: F m and F P Fᵀ + Q (Särkkä 2013, eq. 4.20).
+    """Forecasts a Gaussian through a linear transition: F m and F P Fᵀ + Q (Särkkä 2013, eq. 4.20).
 
     Args:
         mean: m, ``[*B, S]``, in the state's units.
@@ -82,7 +82,7 @@ def kalman_update(
     *,
     observed: Tensor | None = None,
 ) -> GaussianUpdate:
-    """Condition a Gaussian on a linear observation (Särkkä 2013, eq. 4.21).
+    """Conditions a Gaussian on a linear observation (Särkkä 2013, eq. 4.21).
 
     The covariance in Joseph's form, (I − KH) P (I − KH)ᵀ + K R Kᵀ, which round-off leaves positive. For an
     extended Kalman filter pass H = the Jacobian of h at the mean and ``observation - h(mean) + H @ mean``.
@@ -184,7 +184,7 @@ def check_update(mean: Tensor, cov: Tensor, observation: Tensor, matrix: Tensor,
 
 
 def gaussian_log_prob(value: Tensor, mean: Tensor, cov: Tensor) -> Tensor:
-    """Log-density of a Gaussian, log N(value; mean, cov), NaN where ``cov`` is not positive definite.
+    """Returns the log-density of a Gaussian, log N(value; mean, cov), NaN where ``cov`` is not positive definite.
 
     Unlike ``torch.distributions.MultivariateNormal`` it never waits for the device.
 
@@ -225,7 +225,7 @@ def sandwich(matrix: Tensor, cov: Tensor) -> Tensor:
 
 
 def solve_for_gain(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The gain Cᵀ M⁻¹ with the residual's covariance M, and the two numbers of its likelihood.
+    """Returns the gain Cᵀ M⁻¹ with the residual's covariance M, and the two numbers of its likelihood.
 
     Args:
         matrix: M, ``[*B, O, O]``.

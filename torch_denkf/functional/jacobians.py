@@ -74,7 +74,7 @@ def _identity(x: Tensor) -> Tensor:
 
 
 def _flat(network: nn.Module) -> Iterator[nn.Module]:
-    """The layers of sequences, and of those in them, but for the identity."""
+    """Yields the layers of sequences, and of those in them, but for the identity."""
     if type(network) is nn.Sequential and not _hooked(network):
         for layer in network:
             yield from _flat(layer)

@@ -170,7 +170,9 @@ class BeliefAhead(Checked, TensorDictModuleBase):
         return tensordict
 
     def _wanted(self, tensordict: TensorDictBase) -> Tensor | None:
-        """How far to look, in steps and parts of one, ``[*B, 1]``; ``None`` where it is the same everywhere."""
+        """Returns the prediction horizon in steps and parts of one, ``[*B, 1]``; ``None`` where it is the same
+        everywhere.
+        """
         if self.ahead_key is None:
             if self.dt_key is None:
                 return None

@@ -29,7 +29,7 @@ def message_rows(
     origin: Mapping[str, Any] | None = None,
     dtype: torch.dtype | None = None,
 ) -> TensorDict:
-    """Rows ``[T]`` of a log in which sensors of different rates write when they like.
+    """Returns rows ``[T]`` of a log in which sensors of different rates write when they like.
 
     Each time at which a sensor has read is a row, and ``"dt"`` ``[T, 1]`` holds the seconds since the row before: the
     motion must read it. The first row is the start of the filter; no message stands there. A sensor that says two
@@ -131,29 +131,29 @@ def message_rows(
 
 @dataclass(frozen=True)
 class _Stream:
-    """What a sensor said, in the order of its times ``[m]``: values ``[m, O]``, and noise of each, if it says so."""
+    """Messages of a sensor by time ``[m]``: values ``[m, O]``, and noise of each, if it reports one."""
 
     times: np.ndarray
     values: np.ndarray
     noise: np.ndarray | None
 
     def kept(self, which: np.ndarray) -> _Stream:
-        """The messages at some places."""
+        """Returns the messages at some places."""
         return _Stream(self.times[which], self.values[which], None if self.noise is None else self.noise[which])
 
     def since(self, first: float) -> _Stream:
-        """The messages from a time on."""
+        """Returns the messages from a time on."""
         return self.kept(self.times >= first)
 
     def once(self, name: str) -> _Stream:
-        """The last message of each time, without those that are not finite."""
+        """Returns the last message of each time, without those that are not finite."""
         finite = self.kept(np.isfinite(self.values).all(1))
         if not len(finite.times):
             raise ValueError(f"{name!r} drives the motion and has no message that is finite.")
         return finite.kept(np.append(np.diff(finite.times) > 0, True))
 
     def events(self) -> np.ndarray:
-        """Of each message its time, and how many of the same sensor and time stand before it, ``[m, 2]``."""
+        """Returns, for each message, its time and the number of earlier ones of its sensor and time, ``[m, 2]``."""
         before = np.arange(len(self.times)) - np.searchsorted(self.times, self.times)
         return np.stack([self.times, before.astype(float)], 1)
 
@@ -170,12 +170,12 @@ class _Stream:
         return found
 
     def means(self, times: np.ndarray) -> np.ndarray:
-        """Means between each of the ``times`` and the one before, on straight lines between the messages ``[T, O]``."""
+        """Returns means from each of the ``times`` before to the next, interpolating messages linearly ``[T, O]``."""
         now = np.stack([np.interp(times, self.times, column) for column in self.values.T], 1)
         knots = np.unique(np.concatenate([times, self.times]))
         on = np.stack([np.interp(knots, self.times, column) for column in self.values.T], 1)
         area = np.append(np.diff(knots)[:, None] * (on[1:] + on[:-1]) / 2, np.zeros_like(on[:1]), 0)
-        # Each row sums its own pieces: one reading that is absurd must not spoil the rows that follow.
+        # Each row sums its own pieces: one outlier must not spoil the rows that follow.
         total, step = np.add.reduceat(area, np.searchsorted(knots, times), 0)[:-1], np.diff(times)[:, None]
         now[1:] = np.where(step > 0, total / np.where(step > 0, step, 1.0), now[1:])
         return now
@@ -223,7 +223,7 @@ def _look_at_silence(name: str, times: np.ndarray, others: np.ndarray) -> None:
 
 
 def _by_sensor(messages: Iterable[Sequence[Any]], unit: str) -> dict[str, _Stream]:
-    """The messages of each sensor, in the order of their stamps, s.
+    """Returns the messages of each sensor, in the order of their stamps, s.
 
     Raises:
         ValueError: see :func:`message_rows`.
@@ -236,7 +236,7 @@ def _by_sensor(messages: Iterable[Sequence[Any]], unit: str) -> dict[str, _Strea
             )
         name, source = message[1], f"Message {number}, of {message[1]!r},"
         if any(np.ma.is_masked(part) for part in message):
-            raise ValueError(f"{source} has masked elements: leave it out, or give what is there a sensor of its own.")
+            raise ValueError(f"{source} has masked elements: leave it out, or give the others a sensor of their own.")
         stamp = float(_floats(f"{source} has a stamp", message[0], 0)) * SECONDS[unit]
         value = np.atleast_1d(_floats(f"{source} has a value", message[2]))
         if not np.isfinite(stamp) or value.ndim != 1:

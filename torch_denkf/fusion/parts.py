@@ -47,7 +47,7 @@ class Renamed(Wrapper, Sensor):
         self.marks = {names.get(made, made): names.get(key, key) for made, key in marks_of(module).items()}
 
     def on_entries(self, entries, call):
-        """What the module writes."""
+        """Returns the entries that the module writes."""
         inside = {key: value for key, value in entries.items() if key not in self.names}
         inside.update({key: entries[name] for key, name in self.names.items() if name in entries})
         written = self.run_inside(inside, call)
@@ -55,7 +55,7 @@ class Renamed(Wrapper, Sensor):
 
 
 class OfOwnErrors(Wrapper):
-    """An observation model of one sensor, of a state that holds the lasting errors of several behind its system.
+    """An observation model of one sensor, of a state that has the biases of several behind its system.
 
     Args:
         observation: of the system, and of the sensor's own errors behind it, where it has some.
@@ -68,12 +68,12 @@ class OfOwnErrors(Wrapper):
         self.own, self.total = list(own), total
 
     def on_entries(self, entries, call):
-        """The predicted observations."""
+        """Returns the predicted observations."""
         key, state = self._seen(entries)
         return self.run_inside({**entries, key: state}, call)
 
     def linearised(self, entries, call):
-        """That of the model, and zeros by the errors of others."""
+        """Returns the Jacobian of the model, and zeros by the errors of others."""
         key, state = self._seen(entries)
         found = linearise(self.module, {**entries, key: state}, call)
         if found is None:
@@ -84,7 +84,7 @@ class OfOwnErrors(Wrapper):
         return written, whole.index_add(-1, _places(self.own, begin, whole), matrix[..., begin:]), sides
 
     def _seen(self, entries: Entries) -> tuple[NestedKey, Tensor]:
-        """The key and the value of what the sensor sees of the state."""
+        """Returns the key and the value of what the sensor sees of the state."""
         key = unravel_key(self.in_keys[0])
         system, errors = self.required(entries, key).tensor_split([-self.total], -1)
         return key, torch.cat([system, errors[..., self.own]], -1)
@@ -108,12 +108,12 @@ class LinearMembers(SubModel):
         super().__init__(transition, keys, [("forecast", "ensemble")])
 
     def compute(self, ensemble, *action):
-        """The forecast."""
+        """Returns the forecast."""
         moved = ensemble @ self.module.matrix.mT
         return moved if not action else moved + (action[0].to(moved.dtype) @ self.module.control.mT).unsqueeze(-2)
 
     def jacobian(self, ensemble, *action):
-        """F."""
+        """Returns the forecast and F."""
         return self.compute(ensemble, *action), self.module.matrix
 
     def process_noise(self) -> TensorDictModuleBase:
@@ -190,7 +190,7 @@ class StateObservation(Wrapper, Update):
         self.reading_keys = list(map(unravel_key, reading_keys))
 
     def on_entries(self, entries, call):
-        """The predicted observations, and the mask."""
+        """Returns the predicted observations, and the mask."""
         states, written = self.required(entries, self.ensemble_key), {}
         if self.state_dim is not None:
             if self.past_key is None:
@@ -202,20 +202,20 @@ class StateObservation(Wrapper, Update):
         return {self.predicted_key: self.run_inside({**entries, self._in_key: states}, call)[self._out_key], **written}
 
     def linearised(self, entries, call):
-        """That of the model, where it sees the present state alone."""
+        """Returns the Jacobian of the model, if it sees the present state alone."""
         if self.state_dim is not None:
             return None
         found = linearise(self.module, {**entries, self._in_key: self.required(entries, self.ensemble_key)}, call)
         return None if found is None else ({self.predicted_key: found[0][self._out_key]}, *found[1:])
 
     def seen(self, entries: Entries, call: Call) -> tuple[Tensor, Tensor | None]:
-        """The predicted observations ``[*B, E, O]``, and the mask of what is observed, if there is one."""
+        """Returns the predicted observations ``[*B, E, O]``, and the mask of what is observed, if there is one."""
         written = run_module(self, entries, call)
         mask = entries.get(self.observed_key) if self.state_dim is None else written[unravel_key(self.out_keys[1])]
         return written[self.predicted_key], mask
 
     def _of_its_time(self, whole: Tensor, entries) -> tuple[Tensor, Tensor]:
-        """The states ``[*B, E, S]`` that the reading belongs to, of ``[*B, E, L + 1, S]``, and the mask."""
+        """Returns the states ``[*B, E, S]`` that the reading belongs to, of ``[*B, E, L + 1, S]``, and the mask."""
         observed, age = entries.get(self.observed_key), entries.get(self.age_key)
         check_mask(str(self.observed_key), observed)
         if age is None:  # a call that learns shapes brings no age
@@ -260,16 +260,16 @@ class JoinedObservation(SubModel):
         self.spaces = list(spaces)
 
     def parts(self):
-        """The models."""
+        """Returns the models."""
         return dict(self.module.items())
 
     def on_entries(self, entries, call):
-        """The predicted observations, and the mask."""
+        """Returns the predicted observations, and the mask."""
         pairs = [model.seen(entries, call.part(name)) for name, model in self.module.items()]
         return self._joined([predicted for predicted, _ in pairs], [mask for _, mask in pairs])
 
     def linearised(self, entries, call):
-        """Their Jacobians below each other, where all are of plain numbers."""
+        """Returns their Jacobians below each other, where all are of plain numbers."""
         given = [linearise(model, entries, call) for model in self.module.values()]
         found = [each for each in given if each is not None and is_flat(*each[2] or ())]
         if len(found) < len(given):
@@ -328,7 +328,7 @@ class JoinedReading(Sensor):
         self.spaces = list(spaces)
 
     def compute(self, *values, batch_size):
-        """The readings and their noise."""
+        """Returns the readings and their noise."""
         count, size = len(self.spaces), len(batch_size)
         readings = [
             value if value.ndim == size + 1 else value.mean(-2) if space is None else space.mean(value)

@@ -32,7 +32,7 @@ from torch_denkf.imperfect.mixed import (
 from torch_denkf.imperfect.mixture import log_mixture, responsibility
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.modules.likelihood import GaussianLikelihood
-from torch_denkf.modules.spaces import told
+from torch_denkf.modules.spaces import narrowed_mask
 from torch_denkf.modules.tensors import as_floating, register_constant
 from torch_denkf.running import check_module, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, Update
@@ -67,7 +67,7 @@ class Contaminated(MixedUpdate):
     the mean of both runs' by q; under the model its expectation is the number of observed components.
 
     Share, width and noise are each numbers, the key of an entry, or a module that writes one entry. A module is run in
-    the update: beside frames and forecast it may read what the analysis writes with R, such as ``("info",
+    the update: next to frames and forecast it may read what the analysis writes with R, such as ``("info",
     "innovation")`` and ``("info", "nis")``.
 
     Args:
@@ -163,14 +163,14 @@ class Contaminated(MixedUpdate):
         return [*dims, *(dims[-1] if name == "noise" else 1 for name in self.said_by_entries.values())]
 
     def on_entries(self, entries, call):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         if self.claimed is not None:
             mean = self.required(entries, self.module.in_keys[0])
             entries = {**entries, _CLAIMED: self.claimed.expand(*mean.shape[:-1], *self.claimed.shape)}
         entries = with_draws(self.module, self.with_mask(entries, call), call)
         if self.kind == "members":
             entries = self.module.aligned(entries)
-        mask = None if self.observed_key is None else told(self.reading_space, entries.get(self.observed_key))
+        mask = None if self.observed_key is None else narrowed_mask(self.reading_space, entries.get(self.observed_key))
         seen = None if mask is None else mask.any(-1, keepdim=True)
         out = self._of_sound(entries, call, seen)
         known, like = {**entries, **out}, out[self.info_prefix, "nis"]
@@ -236,7 +236,7 @@ class Contaminated(MixedUpdate):
         return noise * (factor.unsqueeze(-1) if noise.ndim > like.ndim else factor)
 
     def _with(self, entries: Entries, noise: Tensor) -> Entries:
-        """The entries with another noise of the reading, and with the particles' likelihood under it."""
+        """Returns the entries with another noise of the reading, and with the particles' likelihood under it."""
         entries = {**entries, self.noise_key: noise}
         if self.kind == "particles":
             entries.update(self.likelihood.on_entries(entries, Call(noise.shape[:-1])))
@@ -298,5 +298,5 @@ class _Quantity(nn.Module):
 
 
 def _exp_twice(log_std: Tensor) -> Tensor:
-    """The variance of a logarithm of a standard deviation."""
+    """Returns the variance of a logarithm of a standard deviation."""
     return (2 * log_std).exp()

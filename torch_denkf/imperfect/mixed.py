@@ -49,7 +49,7 @@ class MixedUpdate(Around):
         return {key: torch.where(_like(first, value), out[key], value) for key, value in mixed.items()}
 
     def _mixed_moments(self, entries: Entries, never: Tensor, share: Tensor, out: Entries, other: Entries) -> Entries:
-        """Mean, covariance and variances; on a space in the tangents at the forecast's mean."""
+        """Returns mean, covariance and variances; on a space in the tangents at the forecast's mean."""
         space, start, keys = self.space, entries[self.module.in_keys[0]], self.module.out_keys[:3]
         if space is None:
             mean, cov = mix_moments(share, out[keys[0]], out[keys[1]], other[keys[0]], other[keys[1]])
@@ -72,7 +72,7 @@ class MixedUpdate(Around):
         return {**mixed, keys[2]: mixed[keys[1]].diagonal(dim1=-2, dim2=-1)}
 
     def _mixed_members(self, entries: Entries, never: Tensor, share: Tensor, out: Entries, other: Entries) -> Entries:
-        """Ensemble, mean and variances; a past, and a covariance, where the analysis writes them."""
+        """Returns ensemble, mean and variances; a past, and a covariance, where the analysis writes them."""
         analysis, space, batch = self.module, self.space, len(share.shape) - 1
         pairs = [(analysis.in_keys[0], analysis.out_keys[0])]
         pairs += [(key, key) for key in analysis.in_keys if key in analysis.out_keys]  # the past is corrected in place
@@ -154,7 +154,7 @@ def wider_past(analysis: Update, entries: Entries, factor: Tensor) -> Entries:
 
 
 def spread_about_mean(members: Tensor, factor: Tensor, space: Space | None = None) -> Tensor:
-    """Members ``[*B, E, N]``, their distances from the mean times ``factor`` ``[*B, 1]``; bit-equal for 1."""
+    """Returns members ``[*B, E, N]``, their distances from the mean times ``factor`` ``[*B, 1]``; bit-equal for 1."""
     factor = factor.unsqueeze(-2)
     if space is not None:
         center = space.mean(members).unsqueeze(-2)
@@ -195,12 +195,12 @@ def with_noise_from(key: NestedKey, analysis: KalmanAnalysis) -> KalmanAnalysis:
 
 
 def _like(mask: Tensor, value: Tensor) -> Tensor:
-    """A mask ``[*B, 1]`` with as many dimensions as a value ``[*B, ...]``."""
+    """Returns a mask ``[*B, 1]`` with as many dimensions as a value ``[*B, ...]``."""
     return mask.reshape(*mask.shape[:-1], *(1,) * (value.ndim - mask.ndim + 1))
 
 
 def _center(space: Space, members: Tensor, batch: int) -> Tensor:
-    """A point ``[*B, 1, P]`` near members ``[*B, E, P]``, or one for each time of a past ``[*B, E, L, P]``."""
+    """Returns a point ``[*B, 1, P]`` near members ``[*B, E, P]``, or one for each time of a past ``[*B, E, L, P]``."""
     if members.ndim == batch + 2:
         return space.near(members).unsqueeze(-2)
     return space.near(members.movedim(-3, -2)).unsqueeze(-3)

@@ -1,6 +1,6 @@
 r"""A sensor that says whether it sees, and updates that heed it.
 
-A camera that looks at a pillar still reads something. :class:`Visibility` is a head beside a sensor: it writes the
+A camera that looks at a pillar still reads something. :class:`Visibility` is a head next to a sensor: it writes the
 probability p that this reading is about the state at all. :class:`Visible` goes around an analysis: the density of a
 reading is
 
@@ -28,7 +28,7 @@ from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional.weighted import weighted_innovation
 from torch_denkf.imperfect.mixed import MixedUpdate, kind_of_update
 from torch_denkf.imperfect.mixture import log_mixture, responsibility
-from torch_denkf.modules.spaces import told
+from torch_denkf.modules.spaces import narrowed_mask
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import mean_of_members
 from torch_denkf.submodel import Call, Entries, Sensor, Update
@@ -87,7 +87,7 @@ class Visibility(Sensor):
         self.floor = floor
 
     def compute(self, encoding, observed=None, *, batch_size):
-        """The probability."""
+        """Returns the probability."""
         encoding = mean_of_members(encoding, batch_size)
         if observed is not None:
             encoding = torch.where(observed.any(-1, keepdim=True), encoding, 0)
@@ -158,10 +158,10 @@ class Visible(MixedUpdate):
         self.kind, self.broad, self.visible_key = kind, broad, unravel_key(visible_key)
 
     def on_entries(self, entries, call):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         if self.observed_key is not None:
             entries = self.with_mask(entries, call)
-        mask = None if self.observed_key is None else told(self.reading_space, entries.get(self.observed_key))
+        mask = None if self.observed_key is None else narrowed_mask(self.reading_space, entries.get(self.observed_key))
         visible = entries.get(self.visible_key)
         if visible is None:  # where a step is taken without the reading, nothing says whether it sees
             like = self.required(entries, self.in_keys[0])

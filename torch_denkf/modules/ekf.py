@@ -120,7 +120,7 @@ def _linearise(
     key: NestedKey,
     sides: tuple[Space | None, Space | None] | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Value, Jacobian and mask of the model inside a step, which knows its Jacobian or is differentiated.
+    """Returns value, Jacobian and mask of the model inside a step, which knows its Jacobian or is differentiated.
 
     Args:
         step: around the model.
@@ -167,7 +167,7 @@ def _differentiated(
     mean: Tensor,
     size: int,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Value and Jacobian at ``mean`` ``[*B, S]`` of a model of ensembles, in one call of it.
+    """Returns value and Jacobian at ``mean`` ``[*B, S]`` of a model of ensembles, in one call of it.
 
     The model runs on N copies of the batch, and one backward pass goes from the n-th output of the n-th copy. This
     takes a quarter of the time of torch.func's forward mode, whose Python formulas dominate in small systems, and

@@ -52,7 +52,7 @@ class LearnedObservation(MemberNetwork):
         return self.compute(state, noise=None)
 
     def compute(self, ensemble, *, noise):
-        """The predicted observations."""
+        """Returns the predicted observations."""
         return self._run(self.features(ensemble), noise)
 
     def features(self, state: torch.Tensor) -> torch.Tensor:
@@ -61,7 +61,7 @@ class LearnedObservation(MemberNetwork):
         return state if self.scale is None else state / self.scale
 
     def jacobian(self, state):
-        """The network's, by states in their own units."""
+        """Returns the network's Jacobian, by states in their own units."""
         found = jacobian_of_network(self.module, self.features(state), state.shape[-1])
         return found if found is None or self.scale is None else (found[0], found[1] / self.scale)
 
@@ -98,11 +98,11 @@ class Select(SubModel):
         return state.gather(-1, self.dims.expand(*state.shape[:-1], -1))
 
     def compute(self, ensemble):
-        """The predicted observations of all members."""
+        """Returns the predicted observations of all members."""
         return self.observe(ensemble)
 
     def jacobian(self, state):
-        """Rows of the identity."""
+        """Returns rows of the identity."""
         places = torch.arange(state.shape[-1], device=state.device)
         return self.observe(state), (self.dims.unsqueeze(-1) == places).to(state.dtype)
 
@@ -137,9 +137,9 @@ class LinearObservation(SubModel):
         return product_of_known(self.matrix, state)
 
     def compute(self, ensemble):
-        """The predicted observations."""
+        """Returns the predicted observations."""
         return ensemble @ self.matrix.mT
 
     def jacobian(self, state):
-        """H."""
+        """Returns H."""
         return self.compute(state), self.matrix

@@ -81,7 +81,7 @@ class FlipoutLinear(nn.Module):
 
     @property
     def perturbation_size(self) -> int:
-        """Number of standard-normal values in one perturbation of the weights."""
+        """Returns the number of standard-normal values in one perturbation of the weights."""
         return self.weight.numel() + self.bias.numel()
 
     def forward(self, x: torch.Tensor, signs=None, perturbation=None, *, sample: bool = True) -> torch.Tensor:
@@ -103,7 +103,7 @@ class FlipoutLinear(nn.Module):
         return mean + change * sign_out
 
     def kl(self) -> torch.Tensor:
-        """KL divergence of the weights' posterior from the prior, in nats, a scalar."""
+        """Returns the KL divergence of the weights' posterior from the prior, in nats, a scalar."""
         total = self.weight.new_zeros(())
         for mean, rho in ((self.weight, self.weight_rho), (self.bias, self.bias_rho)):
             std = F.softplus(rho) / self.prior_std
@@ -193,7 +193,7 @@ class StochasticMLP(nn.Module):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """The tensors that one call needs, see :class:`torch_denkf.modules.SubModel`."""
+        """Names the tensors that one call needs, see :class:`torch_denkf.modules.SubModel`."""
         if not self.noise_size or not self.sample:
             return ()
         return ("",) if self.layer == "dropout" else ("signs", "perturbation")
@@ -291,7 +291,7 @@ class StochasticMLP(nn.Module):
         ]
 
     def kl(self) -> torch.Tensor:
-        """KL divergence of the weights from their prior, in nats; zero where the layers have none."""
+        """Returns the KL divergence of the weights from their prior, in nats; zero where the layers have none."""
         zero = next(self.layers.parameters()).new_zeros(())
         return sum((layer.kl() for layer in self.layers if isinstance(layer, FlipoutLinear)), zero)
 

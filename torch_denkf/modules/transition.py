@@ -31,7 +31,7 @@ class MemberNetwork(SubModel):
         return self.module.draw_noise(batch_size, members, time=time, device=device, dtype=dtype, generator=generator)
 
     def noise_sizes(self, state, *_):
-        """E, from the ensemble."""
+        """Returns E, from the ensemble."""
         return {"members": state.shape[-2]}
 
     def _run(self, features: torch.Tensor, noise) -> torch.Tensor:
@@ -96,7 +96,7 @@ class LearnedTransition(MemberNetwork, Transition):
         register_location_and_scale(self, action_loc, action_scale, "action_")
 
     def compute(self, state, action=None, dt=None, *, noise):
-        """The forecast ensemble."""
+        """Returns the forecast ensemble."""
         return self._moved(state, self._run(self.features(state, action), noise), action, dt)
 
     def features(self, state: torch.Tensor, action: Any) -> torch.Tensor:
@@ -111,7 +111,7 @@ class LearnedTransition(MemberNetwork, Transition):
         return torch.cat([features, action.expand(*state.shape[:-1], action.shape[-1])], -1)
 
     def jacobian(self, state, action=None, dt=None):
-        """That of the network, in the state's units, times the length of the step; and the identity if residual."""
+        """Returns the network's Jacobian in the state's units times the step's length, plus identity if residual."""
         found = jacobian_of_network(self.module, self.features(state, action), state.shape[-1])
         if found is None:
             return None

@@ -1,4 +1,4 @@
-"""How far a reading is believed, from its own and the last innovations."""
+"""Gating of a reading by its own and the last innovations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Response = Literal["reject", "student", "huber"]
 
 
 def disbelief(evidence: Tensor, limit: Tensor, response: Response, *, freedom: float = 4.0) -> Tensor:
-    r"""Factor on a reading's variances: 1 up to the limit, and from there on the larger, the less it is believed.
+    r"""Returns the factor on a reading's variances: 1 up to the limit, and growing with the evidence from there on.
 
     ============== ===================================== =============================================================
     response       beyond the limit l                    so that an outlier's pull
@@ -46,7 +46,7 @@ def disbelief(evidence: Tensor, limit: Tensor, response: Response, *, freedom: f
 
 
 def adapt(log_factor: Tensor, nis: Tensor, freedom: Tensor, rate: float, *, largest: float = 9.0) -> Tensor:
-    r"""One step of stochastic approximation: a factor on a variance grows while innovations are too large.
+    r"""Runs one step of stochastic approximation: a factor on a variance grows while innovations are too large.
 
     :math:`\log \alpha \leftarrow \log \alpha + \eta (\mathrm{nis} / O - 1)` rests where the normalised innovation
     squared has its expected mean O (Robbins & Monro 1951), which it has with the true variance.

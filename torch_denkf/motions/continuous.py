@@ -53,7 +53,7 @@ class ContinuousMotion(Transition):
         register_constant(self, "drift", drift, trainable=trainable)
 
     def compute(self, ensemble, dt):
-        """The forecast ensemble."""
+        """Returns the forecast ensemble."""
         motion, _ = discretise(self.drift, torch.zeros_like(self.drift), dt.to(self.drift.dtype))
         return ensemble @ motion.mT
 
@@ -93,7 +93,7 @@ class ContinuousNoise(SubModel):
         register_constant(self, "density", density)
 
     def compute(self, dt):
-        """The covariance."""
+        """Returns the covariance."""
         drift = self.module.drift
         return discretise(drift, self.density, dt.to(drift.dtype))[1]
 
@@ -123,7 +123,7 @@ class NoisePerSecond(Wrapper):
         self.dt_key = dt_key
 
     def on_entries(self, entries, call):
-        """The variances or the covariance of the step."""
+        """Returns the variances or the covariance of the step."""
         written, key = self.run_inside(entries, call), self.out_keys[0]
         noise, dt = written[key], self.required(entries, self.dt_key)
         return {**written, key: noise * (dt if noise.ndim == dt.ndim else dt.unsqueeze(-1)).to(noise.dtype)}

@@ -106,21 +106,21 @@ class InertialMotion(Motion):
         self.accelerometer_walk = densities("accelerometer_walk", accelerometer_walk, 3)
 
     def move(self, state, *readings, dt):
-        """The state moved by the readings without their biases."""
+        """Returns the state moved by the readings without their biases."""
         gyro, accelerometer = readings if len(readings) == 2 else readings[0].split(3, -1)
         pose, gyro_bias, accelerometer_bias = self.space.points(state)
         moved = move_inertially(pose, gyro - gyro_bias, accelerometer - accelerometer_bias, dt, self.gravity)
         return torch.cat([moved, gyro_bias, accelerometer_bias], -1)
 
     def gradient(self, state, *readings, dt):
-        """That of the pose by itself and by the biases, which stay."""
+        """Returns the Jacobian of the pose by itself and by the biases, which stay."""
         gyro, accelerometer = readings if len(readings) == 2 else readings[0].split(3, -1)
         _, gyro_bias, accelerometer_bias = self.space.points(state)
         rate, force = torch.broadcast_tensors(gyro - gyro_bias, accelerometer - accelerometer_bias)
         return corner(_inertial_jacobian(rate, force, dt), torch.eye(6).to(state))
 
     def noise_of_step(self, dt):
-        """Of orientation, velocity, position, the gyro's bias and the accelerometer's."""
+        """Returns the noise of orientation, velocity, position, the gyro's bias and the accelerometer's."""
         force = self.accelerometer_noise
         moved = walked(self.gyro_noise, dt) + walked(force, dt) + integrated(force, dt)
         return moved + walked(self.gyro_walk, dt) + walked(self.accelerometer_walk, dt)
@@ -169,12 +169,12 @@ class AttitudeMotion(Motion):
         self.gyro_walk = densities("gyro_walk", gyro_walk, 3)
 
     def move(self, state, gyro, *, dt):
-        """The orientation turned by the reading without its bias."""
+        """Returns the orientation turned by the reading without its bias."""
         orientation, bias = self.space.points(state)
         return torch.cat([SO3().plus(orientation, (gyro - bias) * dt), bias], -1)
 
     def move_and_gradient(self, state, gyro, *, dt):
-        """By the orientation itself, and by the bias, which stays."""
+        """Returns the Jacobian by the orientation itself, and by the bias, which stays."""
         orientation, bias = self.space.points(state)
         turn, by_rate = SO3().exp_and_jacobian((gyro - bias) * dt)
         moved = torch.cat([SO3().compose(orientation, turn), bias], -1)
@@ -183,12 +183,12 @@ class AttitudeMotion(Motion):
         return moved, corner(torch.cat([by_turn, by_rate], -1), torch.eye(3, dtype=state.dtype, device=state.device))
 
     def noise_of_step(self, dt):
-        """Of orientation and bias."""
+        """Returns the noise of orientation and bias."""
         return walked(self.gyro_noise, dt) + walked(self.gyro_walk, dt)
 
 
 def move_inertially(pose: Tensor, rate: Tensor, force: Tensor, dt: float | Tensor, gravity: float = 9.81) -> Tensor:
-    r"""The pose of a body after a step in which its rate of turn and its specific force are constant in its own axes.
+    r"""Returns the pose after a step of constant angular velocity and specific force in the body's axes.
 
     With rate :math:`\omega`, specific force :math:`f` and gravity :math:`g`, both axes and world as in
     :mod:`torch_denkf.functional.manifolds`:
@@ -244,7 +244,7 @@ _sixth = Function(
 
 
 def _inertial_jacobian(rate: Tensor, force: Tensor, dt: float | Tensor) -> Tensor:
-    """The Jacobian of :func:`move_inertially`, ``[*, 9, 15]``: of the pose's tangent by itself, and by biases.
+    """Returns the Jacobian of :func:`move_inertially`, ``[*, 9, 15]``: of the pose's tangent by itself, and by biases.
 
     Velocity and position are seen from the body's axes, before the step and behind it. What the force adds to the
     velocity is what a twist of turn and force moves a body by; to the position it adds the integral of that.

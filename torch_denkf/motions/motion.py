@@ -1,4 +1,4 @@
-"""What all known motions share."""
+"""Base of all known motions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Motion(Transition):
         self.tangents_of, self._timed = (space, space), bool(keys_of_dt(dt))
 
     def move(self, *values: Any, **_: Any) -> Tensor:
-        """The states ``[*, P]`` one step later.
+        """Returns the states ``[*, P]`` one step later.
 
         Args:
             *values: the states ``[*, P]``, then the actions ``[*, A]``.
@@ -56,15 +56,15 @@ class Motion(Transition):
         raise NotImplementedError
 
     def gradient(self, *values: Any, **_: Any) -> Tensor:
-        """The Jacobian ``[*, D, D]`` of :meth:`move`, between tangents, from the same values; it may be left out."""
+        """Returns the Jacobian ``[*, D, D]`` of :meth:`move`, between tangents, from the same values; optional."""
         raise NotImplementedError
 
     def move_and_gradient(self, *values: Any, **dt: Any) -> tuple[Tensor, Tensor]:
-        """Both, which may share what they need."""
+        """Returns both, which may share what they need."""
         return self.move(*values, **dt), self.gradient(*values, **dt)
 
     def noise_of_step(self, dt: Any) -> list:
-        """The standard deviations ``[D]`` that a step of ``dt`` seconds adds, in the space's tangents.
+        """Returns the standard deviations ``[D]`` that a step of ``dt`` seconds adds, in the space's tangents.
 
         They are numbers, or tensors of the shape of ``dt``, if that is a tensor.
         """
@@ -72,7 +72,7 @@ class Motion(Transition):
 
     @property
     def process_noise(self) -> list[float] | SubModel:
-        """What a step adds, in the space's tangents: the noise to give to a filter.
+        """Returns the process noise of a step, in the space's tangents: the noise to give to a filter.
 
         Standard deviations ``[D]``; where the motion reads the length of each step, a module that writes the variances
         of that step.
@@ -88,17 +88,17 @@ class Motion(Transition):
         return self.noise_of_step(self.dt) if isinstance(self.dt, (int, float)) else NoiseOfStep(self)
 
     def compute(self, ensemble, *others):
-        """The forecast ensemble."""
+        """Returns the forecast ensemble."""
         actions, dt = self._drivers(ensemble, *others)
         return self.move(ensemble, *actions, dt=dt)
 
     def jacobian(self, ensemble, *others):
-        """The forecast ensemble, and the Jacobian between tangents."""
+        """Returns the forecast ensemble, and the Jacobian between tangents."""
         actions, dt = self._drivers(ensemble, *others)
         return self.move_and_gradient(ensemble, *actions, dt=dt)
 
     def _drivers(self, ensemble: Tensor, *others: Tensor) -> tuple[list[Tensor], Any]:
-        """The actions and the length of the step, beside an ensemble."""
+        """Returns the actions and the length of the step, next to an ensemble."""
         actions: list[Any]
         dt: Any
         *actions, dt = others if self._timed else (*others, self.dt)
@@ -125,13 +125,13 @@ class NoiseOfStep(SubModel):
         super().__init__(motion, [("belief", "mean"), *keys_of_dt(motion.dt)], [out_key])
 
     def compute(self, mean, dt):
-        """The variances of the step."""
+        """Returns the variances of the step."""
         dt = dt.to(mean.dtype).squeeze(-1)
         return torch.stack([torch.zeros_like(dt) + each for each in self.module.noise_of_step(dt)], -1).square()
 
 
 def carried(space: Space, twist: Tensor, dt: Any) -> tuple[Tensor, Tensor]:
-    r"""The Jacobians of :math:`x \exp(d)` by x, and by the rate r of which :math:`d = r \Delta t`: ``[*, D, D]`` each.
+    r"""Returns the Jacobians of :math:`x \exp(d)` by x, and by the rate r with :math:`d = r \Delta t`: ``[*, D, D]``.
 
     Args:
         space: of x.
@@ -144,13 +144,13 @@ def carried(space: Space, twist: Tensor, dt: Any) -> tuple[Tensor, Tensor]:
 
 
 def corner(above: Tensor, below: Tensor) -> Tensor:
-    """Rows ``[*, N, D]``, and below them those of numbers that a motion does not mix, ``[*, D - N, D - N]``."""
+    """Returns rows ``[*, N, D]``, and below them those of numbers that a motion does not mix, ``[*, D - N, D - N]``."""
     padded = nn.functional.pad(below, (above.shape[-2], 0))
     return torch.cat([above, padded.expand(*above.shape[:-2], *padded.shape[-2:])], -2)
 
 
 def densities(name: str, value: float | Sequence[float] | Tensor, size: int) -> list[float]:
-    """Noise densities, one for each of ``size`` numbers, of one for all or of one for each.
+    """Returns noise densities, one for each of ``size`` numbers, of one for all or of one for each.
 
     Raises:
         TypeError: if they are no numbers.
@@ -162,12 +162,12 @@ def densities(name: str, value: float | Sequence[float] | Tensor, size: int) -> 
 
 
 def walked(density: Sequence[float], dt: Any) -> list:
-    """The standard deviations of a random walk after ``dt`` seconds."""
+    """Returns the standard deviations of a random walk after ``dt`` seconds."""
     return [each * dt**0.5 for each in density]
 
 
 def integrated(density: Sequence[float], dt: Any) -> list:
-    """The standard deviations of a random walk's integral after ``dt`` seconds.
+    """Returns the standard deviations of a random walk's integral after ``dt`` seconds.
 
     They are correlated with those of the walk by .87. In a filter, where the next step moves by what this one has
     drawn, all but the last step's correlation is there.

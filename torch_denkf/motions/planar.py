@@ -65,7 +65,7 @@ class PlanarMotion(Motion):
         self.damping, self.usual_speed = float(damping), float(usual_speed)
 
     def move(self, state, *, dt):
-        """The pose on its arc; speed and turn rate on their way back."""
+        """Returns the pose on its arc; speed and turn rate on their way back."""
         pose, rest = self.space.points(state)
         speed, turn, errors = rest.split([1, 1, 2], -1)
         arc = torch.cat([turn * dt, speed * dt, torch.zeros_like(turn)], -1)
@@ -74,7 +74,7 @@ class PlanarMotion(Motion):
         return torch.cat([SE2().plus(pose, arc), speed, kept * turn, errors], -1)
 
     def gradient(self, state, *, dt):
-        """That of the pose by itself, by the speed ahead and by the turn rate; and the damping of these."""
+        """Returns the Jacobian of the pose by itself, speed ahead and turn rate; and the damping of these."""
         speed, turn = state[..., 3:4], state[..., 4:5]
         arc = torch.cat([turn * dt, speed * dt, torch.zeros_like(turn)], -1)
         by_pose, by_rate = carried(SE2(), arc, dt)
@@ -86,6 +86,6 @@ class PlanarMotion(Motion):
         return torch.exp(-self.damping * dt) if isinstance(dt, torch.Tensor) else math.exp(-self.damping * dt)
 
     def noise_of_step(self, dt):
-        """Of turn, ahead and sideways; of speed, turn rate, bias and scale."""
+        """Returns the noise of turn, ahead and sideways; of speed, turn rate, bias and scale."""
         ahead, turn = integrated(self.noises[:2], dt)
         return [turn, ahead, 0.0, *walked(self.noises, dt)]

@@ -1,4 +1,4 @@
-"""What sensors read of a pose: gravity, the magnetic field, the pose itself, landmarks."""
+"""Measurement models of a pose: gravity, the magnetic field, the pose itself, landmarks."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ class _Reading(SubModel):
         self.reading_space, self.tangents_of = space, (self.space, space)
 
     def observe(self, point: Tensor) -> Tensor:
-        """What is read of the part's points ``[*, P]``, ``[*, Q]``."""
+        """Returns the observation ``[*, Q]`` of the part's points ``[*, P]``."""
         raise NotImplementedError
 
     def gradient(self, point: Tensor, reading: Tensor) -> Tensor:
-        """The Jacobian of :meth:`observe` from the part's tangents to those of the reading; it may be left out."""
+        """Returns the Jacobian of :meth:`observe` from the part's tangents to those of the reading; optional."""
         raise NotImplementedError
 
     def compute(self, ensemble, *given):
@@ -94,11 +94,11 @@ class PoseOf(_Reading):
         super().__init__(space, part, None, in_key, out_key)
 
     def observe(self, point):
-        """The same point."""
+        """Returns the point itself."""
         return point
 
     def gradient(self, point, reading):
-        """The identity."""
+        """Returns the identity."""
         return torch.eye(self.read_space.tangent_dim, dtype=point.dtype, device=point.device)
 
 
@@ -139,17 +139,17 @@ class Magnetic(_Reading):
         _register_vectors(self, "field", field, [3])
 
     def observe(self, point):
-        """The direction in the body's axes."""
+        """Returns the direction in the body's axes."""
         return rotate(_inverse(point), self.field)
 
     def gradient(self, point, reading):
-        """A turn of the body turns the direction back."""
+        """Returns the Jacobian: a turn of the body turns the direction back."""
         others = self.read_space.tangent_dim - 3
         return nn.functional.pad(skew(reading), (0, others)) if others else skew(reading)
 
 
 class Gravity(Magnetic):
-    """What an accelerometer reads while the velocity is constant: specific force, upwards, in the body's axes.
+    """Observes specific force, upwards, in the body's axes: an accelerometer at constant velocity.
 
     Args:
         space: of the states.
@@ -183,7 +183,7 @@ class Gravity(Magnetic):
 
 
 class PositionInBody(_Reading):
-    r"""Where landmarks lie as seen from the body, :math:`R^\top (l - p)`: what a stereo camera or a lidar reads.
+    r"""Observes landmarks in the body's axes, :math:`R^\top (l - p)`: as a stereo camera or a lidar does.
 
     Args:
         space: of the states.
@@ -254,7 +254,7 @@ class PositionInBody(_Reading):
         return self.seen(point, self.landmark.reshape(-1, self.size)).flatten(-2)
 
     def gradient(self, point, reading):
-        """A turn of the body turns landmarks back; they come nearer as it moves towards them."""
+        """Returns the Jacobian: a turn of the body turns landmarks back; they come nearer as it moves towards them."""
         return self._by_pose(reading)
 
     def _by_pose(self, seen: Tensor) -> Tensor:
@@ -328,7 +328,7 @@ class RangeBearing(PositionInBody):
 
 
 def _inverse(pose: Tensor) -> Tensor:
-    """The world's orientation seen from the body, of a pose whose first four numbers are a quaternion."""
+    """Returns the world's orientation seen from the body, of a pose whose first four numbers are a quaternion."""
     return SO3().inverse(pose[..., :4])
 
 

@@ -48,7 +48,7 @@ class RTSSmoother(Smoother):
         prefix = prefix_of(filter, "moments", self)
         self.place = filter.structure.transition[0]
         forecast = filter.structure.forecast_of[prefix, "mean"][0]
-        CrossTransition(filter.transition_module)  # refuses what gives no cross-covariance
+        CrossTransition(filter.transition_module)  # raises without a cross-covariance
         keys = [(prefix, "mean"), (prefix, "cov"), *((forecast, name) for name in ("mean", "cov", "cross", "open"))]
         super().__init__(filter, lag, keys, ("mean", "cov", "var"))
 

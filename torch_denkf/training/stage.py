@@ -94,13 +94,13 @@ class Stage:
             object.__setattr__(self, "parameters", parameters)
 
     def length(self, update: int) -> int | None:
-        """The sequence length of an update, counted from zero; ``None`` without ``lengths``."""
+        """Returns the sequence length of an update, counted from zero; ``None`` without ``lengths``."""
         if self.lengths is None:
             return None
         return self.lengths[max(start for start in self.lengths if start <= update)]
 
     def groups(self, model: nn.Module) -> list[dict]:
-        """The trained parameters as an optimiser's groups.
+        """Returns the trained parameters as an optimiser's groups.
 
         Raises:
             ValueError: if there are none, or ``model`` lacks some: no checkpoint would hold them.
@@ -125,7 +125,7 @@ class Stage:
         return groups
 
     def optimiser(self, groups: list[dict]) -> tuple[torch.optim.Optimizer, LRScheduler]:
-        """AdamW for :meth:`groups`, and its schedule."""
+        """Returns AdamW for :meth:`groups`, and its schedule."""
         optimiser = torch.optim.AdamW(groups, lr=self.lr, weight_decay=self.weight_decay)
         if callable(self.schedule):
             return optimiser, self.schedule(optimiser, self.updates)
@@ -137,7 +137,7 @@ class Stage:
         return optimiser, LambdaLR(optimiser, lambda update: 1.0)
 
     def settings(self, model: nn.Module) -> dict:
-        """What a checkpoint must agree with to be resumed; plain values."""
+        """Returns the settings that a checkpoint must share to be resumed; plain values."""
         names = {id(parameter): name for name, parameter in model.named_parameters()}
         schedule = self.schedule if isinstance(self.schedule, str) else getattr(self.schedule, "__qualname__", "custom")
         return {

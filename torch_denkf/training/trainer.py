@@ -16,9 +16,9 @@ from torchrl.record.loggers.common import Logger
 from torch_denkf._checks import check_count
 from torch_denkf.compilation.lock import locked
 from torch_denkf.deployment.progress import progress_bar
+from torch_denkf.training.backups import back_up
 from torch_denkf.training.checkpoint import check_settings, check_state, read_checkpoint, write_checkpoint
 from torch_denkf.training.distributed import Processes
-from torch_denkf.training.earlier import set_aside
 from torch_denkf.training.hooks import HookPoints
 from torch_denkf.training.logs import RunLogs
 from torch_denkf.training.stage import Stage, only_trainable, why_no_gain
@@ -147,14 +147,14 @@ class FilterTrainer(HookPoints):
 
     @property
     def last_checkpoint(self) -> Path:
-        """The file from which a training is resumed."""
+        """Returns the file from which a training is resumed."""
         return self.out / "last.pt"
 
     def fit(self, *, resume: bool = True) -> dict[str, dict[str, Any]]:
         """Trains to the end; where a checkpoint is, from there.
 
         Args:
-            resume: ``False`` removes an earlier run's checkpoints and logs from ``out`` and starts anew.
+            resume: ``False`` removes an earlier run's checkpoints and logs from ``out`` and restarts.
 
         Returns:
             for each stage: ``value`` of the monitored error (``None`` without validation) at its best ``update``, all
@@ -313,16 +313,16 @@ class FilterTrainer(HookPoints):
             self._logs.open(state["logs"])
             if state["stage"] == len(self.stages):
                 _LOG.warning(
-                    "The training in %s is finished: its result is read and nothing is trained. Start anew with "
+                    "The training in %s is finished: its result is read and nothing is trained. Start again with "
                     "fit(resume=False), or give another out.",
                     self.out,
                 )
             return state
-        if self.last_checkpoint.exists():  # the caller wants to start anew
+        if self.last_checkpoint.exists():  # the caller wants to start again
             for file in (self.last_checkpoint, *self.out.glob("best_*.pt")):
                 file.unlink(missing_ok=True)
         else:
-            set_aside(self.out, [*self.out.glob("best_*.pt"), *self._logs.files()])
+            back_up(self.out, [*self.out.glob("best_*.pt"), *self._logs.files()])
         self._logs.open({})
         state = {
             "stage": 0,

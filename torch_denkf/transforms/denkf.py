@@ -19,7 +19,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record, check_belief
 from torch_denkf.filters.scan import where_rows
 from torch_denkf.submodel import Entries
-from torch_denkf.transforms.primer import refuse_resets_of_groups
+from torch_denkf.transforms.primer import check_no_group_resets
 
 __all__ = ["DEnKFTransform"]
 
@@ -46,8 +46,8 @@ class DEnKFTransform(Checked, Transform):
     the frame already, and count each reading twice. In one process a warning says so; across processes, or where the
     belief is copied on its way, it is not noticed. Behind this transform, torchrl's ``FrameSkipTransform`` makes
     one step of the belief a skip, with the last frame; put it in front, where it skips for the environment alone. With
-    groups of agents, the belief is the environment's, and starts anew where the environment's own ``done`` says so; an
-    environment without one is refused.
+    groups of agents, the belief is the environment's, and is reset where the environment's own ``done`` says so; an
+    environment without one raises an error.
 
     Args:
         filter: any :class:`~torch_denkf.filters.Filter`, also one inside a :class:`~torch_denkf.smoothers.FixedLag` or
@@ -221,11 +221,11 @@ class DEnKFTransform(Checked, Transform):
         masks = [mask for mask in (tensordict.get(key, None) for key in keys) if mask is not None]
         if not masks:
             return None
-        # The belief is the environment's: it starts anew where any group or agent does.
+        # The belief is the environment's: it is reset where any group or agent does.
         return torch.stack([mask.reshape(*tensordict.batch_size, -1).any(-1) for mask in masks]).any(0)
 
     def _trial(self, row: TensorDictBase) -> dict[NestedKey, torch.Tensor]:
-        """All that a step from ``row`` without actions writes."""
+        """Returns all that a step from ``row`` without actions writes."""
         if self._controls:
             actions = self.parent.full_action_spec.zero()
             self._copy(actions, row, self._controls, "the environment's action spec")
@@ -278,7 +278,7 @@ class DEnKFTransform(Checked, Transform):
                 if a transform behind this one writes over the belief that the filter goes on with.
         """
         keys = [key for key in self._keep if key not in self._dropped_keys]
-        refuse_resets_of_groups(self.parent.reset_keys, self.out_keys)
+        check_no_group_resets(self.parent.reset_keys, self.out_keys)
         diagnosis().check_behind(self, [self._names[key] for key in self.filter.structure.carry])
         taken = [name for name in self.out_keys if name in observation_spec.keys(True, True)]
         if taken:
@@ -326,7 +326,7 @@ class DEnKFTransform(Checked, Transform):
         """Filters a sequence ``[*B, T]``, e.g. a sample of a replay buffer; see :class:`Filter`.
 
         torchrl's buffers apply their transforms before ``SliceSampler`` marks the slices: a buffer of flat slices is
-        refused. Filter what it returns, or store whole windows ``[T]`` as its items.
+        an error. Filter what it returns, or store whole windows ``[T]`` as its items.
 
         Raises:
             ValueError: if a flat batch seems to hold several sequences that are not marked.

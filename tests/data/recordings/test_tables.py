@@ -72,7 +72,7 @@ def test_many_columns_take_no_longer_than_their_number(tmp_path):
 
 @pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
 def test_other_encodings_are_refused_with_the_file(tmp_path, encoding):
-    with pytest.raises(ValueError, match=r"run.csv is no text in UTF-8 .*store it anew"):
+    with pytest.raises(ValueError, match=r"run.csv is no text in UTF-8 .*store it again"):
         read(tmp_path, GOOD.replace("y", "größe"), encoding=encoding)
 
 

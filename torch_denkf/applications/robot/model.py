@@ -40,7 +40,7 @@ class RobotModel:
     unheeded: tuple[str, ...] = field(default=())
 
     def started(self, mean: Tensor, cov: Tensor) -> RobotModel:
-        """The same model, that starts from another belief: ``[15]`` and ``[15, 15]``."""
+        """Returns this model with another initial belief: ``[15]`` and ``[15, 15]``."""
         initial = MomentPrior(mean, cov, space=STATE_SPACE)
         return RobotModel(self.filter.with_modules(initial=initial), self.config, self.reads, self.unheeded)
 

@@ -20,7 +20,7 @@ __all__ = ["Readings", "Table", "Unit", "check_times", "given_times"]
 
 
 class Readings(NamedTuple):
-    """What a table holds.
+    """Content of a table.
 
     Attributes:
         times: when they were taken, s, ascending, ``[n]``.
@@ -123,7 +123,7 @@ class Table:
             )
 
     def read(self) -> Readings:
-        """The whole table.
+        """Returns the whole table.
 
         Raises:
             FileNotFoundError: without the file.
@@ -176,7 +176,7 @@ class Table:
 
 
 def check_stream(sample: str, ways: Sequence[str], tolerance: float | None, unit: str | None) -> None:
-    """Refuses options that no stream has.
+    """Raises for options that no stream has.
 
     Raises:
         ValueError: if there is one.
@@ -190,7 +190,7 @@ def check_stream(sample: str, ways: Sequence[str], tolerance: float | None, unit
 
 
 def check_times(times: np.ndarray, place: Callable[[int], str], column: str) -> None:
-    """Refuses times that stand still or go back.
+    """Raises for times that stand still or go back.
 
     Args:
         times: s, ``[n]``.

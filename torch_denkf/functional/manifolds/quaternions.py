@@ -11,7 +11,7 @@ __all__ = ["quaternion_of", "quaternion_product", "rotate", "rotation_matrix", "
 
 
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
-    """The rotation ``second``, then ``first``: both quaternions ``[*, 4]``, w first."""
+    """Multiplies quaternions ``[*, 4]``, w first: the rotation ``second``, then ``first``."""
     a, b = first[..., :1], first[..., 1:]
     c, d = second[..., :1], second[..., 1:]
     w = a * c - (b * d).sum(-1, keepdim=True)
@@ -19,7 +19,7 @@ def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
 
 
 def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
-    """A vector ``[*, 3]`` in the body's axes, turned into the world's by a quaternion ``[*, 4]``."""
+    """Rotates a vector ``[*, 3]`` from the body's axes to the world's by a quaternion ``[*, 4]``."""
     w, axis = quaternion[..., :1], quaternion[..., 1:]
     twice = 2 * _cross(axis, vector)
     return torch.addcmul(vector, w, twice) + _cross(axis, twice)
@@ -32,13 +32,13 @@ def _cross(first: Tensor, second: Tensor) -> Tensor:
 
 
 def rotation_matrix(quaternion: Tensor) -> Tensor:
-    """The matrix ``[*, 3, 3]`` of a quaternion ``[*, 4]``: its columns are the body's axes in the world's."""
+    """Returns the matrix ``[*, 3, 3]`` of a quaternion ``[*, 4]``: its columns are the body's axes in the world's."""
     axes = torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)
     return rotate(quaternion.unsqueeze(-2), axes).mT
 
 
 def quaternion_of(matrix: Tensor) -> Tensor:
-    """A quaternion ``[*, 4]`` of a rotation matrix ``[*, 3, 3]``, by the largest of its four numbers."""
+    """Returns a quaternion ``[*, 4]`` of a rotation matrix ``[*, 3, 3]``, by the largest of its four numbers."""
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
     candidates = [
         torch.stack([1 + a + e + i, h - f, c - g, d - b], -1),
@@ -53,13 +53,13 @@ def quaternion_of(matrix: Tensor) -> Tensor:
 
 
 def skew(vector: Tensor) -> Tensor:
-    """The matrix ``[*, 3, 3]`` whose product with another vector is the cross product with it."""
+    """Returns the matrix ``[*, 3, 3]`` whose product with another vector is the cross product with it."""
     axes = torch.eye(3, dtype=vector.dtype, device=vector.device)
     return _cross(vector.unsqueeze(-2), axes).mT
 
 
 def products(point: Tensor) -> Tensor:
-    """The products of a point's quaternion with i, j and k, ``[*, 4, 3]``."""
+    """Returns the products of a point's quaternion with i, j and k, ``[*, 4, 3]``."""
     w, x, y, z = point[..., :4].unbind(-1)
     rows = [[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
