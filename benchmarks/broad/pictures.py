@@ -9,7 +9,7 @@ from torch import Tensor
 
 from benchmarks.broad.task import Trial
 from benchmarks.common.plots import plt, save
-from torch_denkf.applications.imu import Orientations
+from torch_denkf.applications.imu.log import Orientations
 from torch_denkf.functional.manifolds import SO3, quaternion_product
 
 __all__ = ["draw"]
@@ -17,13 +17,13 @@ __all__ = ["draw"]
 _HALF = 1.645  # of a 90 % interval, in standard deviations
 
 
-def draw(trial: Trial, found: Orientations, other: Tensor, path: Path, *, every: int = 20) -> None:
+def draw(trial: Trial, found: Orientations, other: Tensor | None, path: Path, *, every: int = 20) -> None:
     """Draws one trial.
 
     Args:
         trial: with the truth.
         found: by the filter.
-        other: orientations by VQF, ``[T, 4]``.
+        other: orientations by VQF, ``[T, 4]``; ``None`` for none.
         path: PNG.
         every: so many rows make a point.
     """
@@ -32,6 +32,8 @@ def draw(trial: Trial, found: Orientations, other: Tensor, path: Path, *, every:
     seconds = torch.arange(len(trial.orientation))[rows] / trial.rate
     figure, axes = plt.subplots(2, 1, figsize=(9, 5), sharex=True, layout="constrained")
     for name, quaternion, colour in (("VQF", other, "C1"), ("filter", found.quaternion, "C0")):
+        if quaternion is None:
+            continue
         w, _, _, z = quaternion_product(quaternion[rows].double(), SO3().inverse(truth)).unbind(-1)
         axes[0].plot(seconds, (2 * (z / w).atan()).rad2deg(), colour, lw=1, label=name)
         tilt = 2 * (w.square() + z.square()).sqrt().clamp_max(1).acos()

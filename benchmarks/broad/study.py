@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -15,13 +16,15 @@ from benchmarks.broad.pictures import draw
 from benchmarks.broad.task import Trial, read_trials, scores, simulated_trial
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import Columns, head, line, pick, write_page
-from torch_denkf.applications.imu import ImuFilter, ImuSettings, Orientations, imu_rows
-from torch_denkf.applications.imu.log import at_readings
+from torch_denkf.applications.imu.filter import ImuFilter, ImuSettings
+from torch_denkf.applications.imu.log import Orientations, at_readings, imu_rows
 from torch_denkf.deployment.files import write_text
 from torch_denkf.functional.manifolds import SO3
 from torch_denkf.smoothers import RTSSmoother
 
+HAS_VQF = find_spec("vqf") is not None
 NUMBERS = Path(__file__).parent / "numbers.json"
+HELD = ("heading", "inclination")
 SCORES = ("total", "heading", "inclination", "heading_held", "inclination_held", "heading_std", "seconds")
 COLUMNS = Columns(
     names=("trial", "kind", "method", "numbers", *SCORES),
@@ -75,7 +78,7 @@ class Runner:
 def settings_for(kind: str, numbers: dict[str, dict]) -> tuple[str, ImuSettings]:
     """Returns the numbers that were learned without a kind of motion; those of all for a kind that was not there."""
     name = kind if kind in numbers else "all"
-    return name, ImuSettings(**{**numbers[name], "poles": tuple(numbers[name]["poles"])})
+    return name, ImuSettings(**numbers[name])
 
 
 def rows_of(trial: Trial, numbers: dict[str, dict], runner: Runner, smoother: bool) -> Iterator[tuple[dict, Tensor]]:
@@ -98,23 +101,18 @@ def rows_of(trial: Trial, numbers: dict[str, dict], runner: Runner, smoother: bo
     if smoother:
         found = runner(settings, trial, smooth=True)
         yield scored(SMOOTH, found.quaternion, found.std, **own)
-    nine, six_axes, seconds = vqf(trial)
-    yield scored(VQF, nine, seconds=seconds)
-    yield scored(LATE, SO3().plus(nine, trial.gyro * settings.latency), **own)
-    yield scored(VQF_SIX, six_axes)
+    if HAS_VQF:
+        nine, six_axes, seconds = vqf(trial)
+        yield scored(VQF, nine, seconds=seconds)
+        yield scored(LATE, SO3().plus(nine, trial.gyro * settings.latency), **own)
+        yield scored(VQF_SIX, six_axes)
     yield scored(GYRO, by_gyro(trial, settings))
 
 
 def vqf(trial: Trial) -> tuple[Tensor, Tensor, float]:
-    """Orientations of VQF with its default settings, 9 and 6 axes, and its seconds.
+    """Orientations of VQF with its default settings, 9 and 6 axes, and its seconds."""
+    from vqf import VQF as Filter
 
-    Raises:
-        ImportError: without the package.
-    """
-    try:
-        from vqf import VQF as Filter  # noqa: N811
-    except ImportError as error:
-        raise ImportError('VQF is the peer of this study: pip install "torch_denkf[bench]"') from error
     began = time.process_time()
     sensors = (trial.gyro, trial.acceleration, trial.magnetometer)
     out = Filter(1 / trial.rate).updateBatch(*(value.numpy().copy() for value in sensors))
@@ -146,7 +144,7 @@ def page(rows: Sequence[dict], smoke: bool = False) -> str:
     for method in methods:
         own = pick(rows, method=method)
         cells = [f"{mean(own, name):.2f}" for name in ("total", "heading", "inclination")]
-        held = [f"{100 * mean(own, f'{name}_held'):.0f} %" if f"{name}_held" in own[0] else "" for name in cells_held]
+        held = [f"{100 * mean(own, f'{name}_held'):.0f} %" if f"{name}_held" in own[0] else "" for name in HELD]
         seconds = f"{mean(own, 'seconds'):.1f}" if "seconds" in own[0] else ""
         text.append(line(method, *cells, f"{max(row['total'] for row in own):.2f}", *held, seconds))
     text += ["", "Total error of each trial, degrees, and the coverage of the filter's intervals, %.", ""]
@@ -154,7 +152,7 @@ def page(rows: Sequence[dict], smoke: bool = False) -> str:
     for name in names:
         cells = [f"{pick(rows, trial=name, method=method)[0]['total']:.2f}" for method in methods]
         own = pick(rows, trial=name, method=OWN)[0]
-        text.append(line(name, *cells, *(f"{100 * own[f'{each}_held']:.0f}" for each in cells_held)))
+        text.append(line(name, *cells, *(f"{100 * own[f'{each}_held']:.0f}" for each in HELD)))
     text += ["", "Inclination of each trial, degrees.", "", *head("trial", *methods)]
     for name in names:
         cells = [f"{pick(rows, trial=name, method=method)[0]['inclination']:.2f}" for method in methods]
@@ -164,17 +162,16 @@ def page(rows: Sequence[dict], smoke: bool = False) -> str:
     return "\n".join(text)
 
 
-cells_held = ("heading", "inclination")
-
-
 def mean(rows: Sequence[dict], name: str) -> float:
     """Of a column."""
     return sum(row[name] for row in rows) / len(rows)
 
 
-def main(arguments: Sequence[str] | None = None, peer: Callable = vqf) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the study."""
     study = parse(Study, arguments)
+    if not HAS_VQF:
+        print('VQF, the peer, is left out: pip install "torch_denkf[bench]"')
     numbers = json.loads(NUMBERS.read_text())["numbers"]
     trials = [simulated_trial()] if study.smoke else read_trials(study.data)
     runner = Runner(study.compile and not study.smoke)
@@ -193,5 +190,5 @@ def main(arguments: Sequence[str] | None = None, peer: Callable = vqf) -> None:
         assert worst is not None
         _, settings = settings_for(worst[1].kind, numbers)
         found = runner(settings, worst[1])
-        draw(worst[1], found, vqf(worst[1])[0], study.out / "broad.png")
+        draw(worst[1], found, vqf(worst[1])[0] if HAS_VQF else None, study.out / "broad.png")
     write_page(page(rows, study.smoke), None if study.out is None else study.out / "broad.md")

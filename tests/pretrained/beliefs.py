@@ -10,16 +10,8 @@ import torch_denkf
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
 
 _LEGS = {"imu": 6, "joints": 16, "joint_rates": 16, "contact": 4}
-_IMU = {
-    "gyro": 3,
-    "accelerometer": 3,
-    "magnetometer": 3,
-    "unrest": 1,
-    "disturbance": 1,
-    "dt": 1,
-    "moves": 9,
-    "start": 31,
-}
+_IMU = dict.fromkeys(("gyro", "accelerometer", "magnetometer"), 3) | dict.fromkeys(("unrest", "disturbance", "dt"), 1)
+_IMU |= {"moves": 9, "start": 31}
 _READINGS = {
     "car-odometry": {"flow": FLOW_SHAPE, "road": ROAD_SHAPE, "start": (5,)},
     "imu": {key: (size,) for key, size in _IMU.items()},

@@ -7,8 +7,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.applications.imu import ImuSettings, imu, imu_rows, orientations
-from torch_denkf.applications.imu.filter import SPACE, moves
+from torch_denkf.applications.imu import imu, imu_rows, orientations
+from torch_denkf.applications.imu.filter import SPACE, ImuSettings, moves
 from torch_denkf.functional.manifolds import SO3, rotate
 from torch_denkf.smoothers import RTSSmoother
 
@@ -120,7 +120,7 @@ def reference(rows, s):
             cov = reset @ (keep @ cov @ keep.T + variance * gain @ gain.T) @ reset.T
             turn, x = rotation(change[:3]) @ turn, x + change[3:]
 
-        up = x[18:21] + [0, 0, s.gravity]
+        up = x[18:21] + np.array([0, 0, s.gravity])
         h = np.zeros((3, 30))
         h[:, :3], h[:, 21:24] = turn.T @ skew(up), turn.T
         update(row["accelerometer"], turn.T @ up, h, s.accelerometer**2)
@@ -243,10 +243,8 @@ def test_within_a_block_the_gyro_turns_exactly():
 
 def test_a_log_that_is_not_one():
     _, log = body_log(100)
-    with pytest.raises(ValueError, match=r"m/s\^2.*median of its size is 1\b"):
-        imu_rows(
-            SETTINGS, log["gyro"], log["acceleration"] / log["acceleration"].norm(dim=-1, keepdim=True), rate=100.0
-        )
+    with pytest.raises(ValueError, match=r"m/s\^2.*median of its size is 1\."):
+        imu_rows(SETTINGS, log["gyro"], log["acceleration"] / 9.82, rate=100.0)
     with pytest.raises(ValueError, match="at least 4 readings"):
         imu_rows(SETTINGS, log["gyro"][:3], log["acceleration"][:3], rate=100.0)
     with pytest.raises(ValueError, match="not finite"):

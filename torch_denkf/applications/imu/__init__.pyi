@@ -1,4 +1,4 @@
-from .filter import ImuFilter, ImuSettings, imu
-from .log import Orientations, imu_rows, orientations
+from .filter import imu
+from .log import imu_rows, orientations
 
-__all__ = ["ImuFilter", "ImuSettings", "Orientations", "imu", "imu_rows", "orientations"]
+__all__ = ["imu", "imu_rows", "orientations"]

@@ -41,7 +41,8 @@ class Orient(Command):
         import numpy as np
         import torch
 
-        from torch_denkf.applications.imu import ImuFilter, orientations
+        from torch_denkf.applications.imu.filter import ImuFilter
+        from torch_denkf.applications.imu.log import orientations
         from torch_denkf.applications.imu.pictures import orientation_picture
         from torch_denkf.deployment.files import replacing
         from torch_denkf.pretrained import from_pretrained

@@ -92,6 +92,7 @@ class ImuSettings:
     tilt_floor: float = 0.15
 
     def __post_init__(self):
+        object.__setattr__(self, "poles", tuple(self.poles))  # of a file they are a list
         for each in fields(self):
             for value in self.poles if each.name == "poles" else [getattr(self, each.name)]:
                 check_number(each.name, value, **({} if each.name in ("lag", "latency") else {"above": 0}))
@@ -263,6 +264,4 @@ def imu(**settings) -> ImuFilter:
         >>> found.quaternion[-1], found.std.shape
         (tensor([1., 0., 0., 0.]), torch.Size([500, 3]))
     """
-    return ImuFilter(
-        ImuSettings(**{**settings, **({"poles": tuple(settings["poles"])} if "poles" in settings else {})})
-    )
+    return ImuFilter(ImuSettings(**settings))
