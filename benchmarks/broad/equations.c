@@ -1,11 +1,12 @@
 /* The equations of torch_denkf.applications.imu in plain C, for learning its numbers: a trial takes ten milliseconds.
  * Errors of the orientation stand in the body's axes, which gives the same filter as errors in the world's.
  * State of errors: rotation 0, bias of the gyro 3, its matrix of errors 6, position 15, velocity 18, acceleration 21,
- * bias of the magnetometer 24, field northwards 27 and upwards 28, lag of the magnetometer 29. */
+ * bias of the magnetometer 24, field northwards 27 and upwards 28, lag of the magnetometer 29,
+ * stray field 30. */
 #include <math.h>
 #include <string.h>
-#define N 30
-enum { BIAS = 3, GYRO = 6, POSITION = 15, VELOCITY = 18, PUSH = 21, HARD = 24, NORTH = 27, UP = 28, LAG = 29 };
+#define N 33
+enum { BIAS = 3, GYRO = 6, POSITION = 15, VELOCITY = 18, PUSH = 21, HARD = 24, NORTH = 27, UP = 28, LAG = 29, STRAY = 30 };
 
 static void product(const double *a, const double *b, double *o) {
     double w = a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3];
@@ -87,14 +88,16 @@ static void update(double P[N][N], double H[3][N], const double *r, const double
     for (int i = 3; i < N; i++) x[i] += change[i];
 }
 
-/* p: gyro, gyro_rate, gyro_walk, damping, motion, motion_unrest, accelerometer, magnetometer, magnetometer_unrest,
- * magnetometer_rate, magnetic_walk, field_walk, rest, gravity; start: 30 standard deviations, those of the rotation in
- * the world's axes; state: 31 numbers. Writes orientations [T, 4] and covariances of turns in the body's axes. */
+/* p: gyro, gyro_rate, gyro_walk, damping, motion, motion_unrest, accelerometer, magnetometer, magnetometer_rate,
+ * magnetic_walk, field_walk, rest, gravity, stray, stray_unrest, stray_time; start: 33 standard deviations, those of the
+ * rotation in the world's axes; state: 34 numbers. Writes orientations [T, 4], covariances of turns in the body's axes,
+ * and states [T, 33], whose first three numbers are none. */
 void filter(int count, double dt, const double *gyro, const double *force, const double *field, const double *unrest,
             const double *disturbance, const unsigned char *rest, int nine, const double *moves, const double *p,
-            const double *start, const double *state, double *orientation, double *cov, double *last) {
+            const double *start, const double *state, double *orientation, double *cov, double *states) {
     double P[N][N], q[4], x[N], R[3][3], J[3][3], turn[4], now[4];
-    memset(P, 0, sizeof P), memcpy(q, state, sizeof q), memcpy(x + 3, state + 4, 27 * sizeof(double));
+    memset(P, 0, sizeof P), memcpy(q, state, sizeof q), memcpy(x + 3, state + 4, 30 * sizeof(double));
+    double fades = exp(-dt / p[15]);
     matrix(q, R);
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
@@ -128,6 +131,7 @@ void filter(int count, double dt, const double *gyro, const double *force, const
                         double s[3] = {AT(POSITION + i), AT(VELOCITY + i), AT(PUSH + i)};
                         for (int l = 0; l < 3; l++)
                             AT(POSITION + 3 * l + i) = moves[3 * l] * s[0] + moves[3 * l + 1] * s[1] + moves[3 * l + 2] * s[2];
+                        AT(STRAY + i) *= fades;
                     }
                 }
             for (int i = 0; i < 3; i++) {
@@ -137,16 +141,19 @@ void filter(int count, double dt, const double *gyro, const double *force, const
                 P[i][i] += (p[0] * p[0] + p[1] * p[1] * speed) * dt;
                 P[BIAS + i][BIAS + i] += p[2] * p[2] * dt;
                 P[PUSH + i][PUSH + i] += p[3] * (p[4] * p[4] + p[5] * p[5] * unrest[t] * unrest[t]) * dt;
-                P[HARD + i][HARD + i] += p[10] * p[10] * dt;
+                P[HARD + i][HARD + i] += p[9] * p[9] * dt;
+                x[STRAY + i] *= fades;
+                double stray = p[13] * p[13] + p[14] * p[14] * disturbance[t] * disturbance[t];
+                P[STRAY + i][STRAY + i] += stray * (1 - fades * fades);
             }
-            P[NORTH][NORTH] += p[11] * p[11] * dt, P[UP][UP] += p[11] * p[11] * dt;
+            P[NORTH][NORTH] += p[10] * p[10] * dt, P[UP][UP] += p[10] * p[10] * dt;
         }
         for (int k = 0; k < 3; k++) {
             if ((k == 1 && !nine) || (k == 2 && !rest[t])) continue;
-            double H[3][N], r[3], noise[3], u[3], v[3] = {0, x[NORTH], x[UP]};
+            double H[3][N], r[3], noise[3], u[3], v[3] = {x[STRAY], x[NORTH] + x[STRAY + 1], x[UP] + x[STRAY + 2]};
             memset(H, 0, sizeof H), matrix(q, R);
             if (k == 0)
-                for (int i = 0; i < 3; i++) v[i] = x[PUSH + i] + (i == 2 ? p[13] : 0);
+                for (int i = 0; i < 3; i++) v[i] = x[PUSH + i] + (i == 2 ? p[12] : 0);
             for (int i = 0; i < 3; i++) u[i] = R[0][i] * v[0] + R[1][i] * v[1] + R[2][i] * v[2];
             double U[3][3] = {{0, -u[2], u[1]}, {u[2], 0, -u[0]}, {-u[1], u[0], 0}};
             if (k == 0)
@@ -157,24 +164,26 @@ void filter(int count, double dt, const double *gyro, const double *force, const
             if (k == 1) {
                 double lag = x[LAG], c[3], n[3], z[3], W[3][3] = {{0, -w[2], w[1]}, {w[2], 0, -w[0]}, {-w[1], w[0], 0}};
                 cross(w, u, c);
-                double north[3] = {R[1][0], R[1][1], R[1][2]}, up[3] = {R[2][0], R[2][1], R[2][2]};
-                cross(w, north, n), cross(w, up, z);
+                double e[3];
+                cross(w, R[0], e), cross(w, R[1], n), cross(w, R[2], z);
                 for (int a = 0; a < 3; a++) {
                     for (int i = 0; i < 3; i++) {
                         H[a][i] = U[a][i];
                         for (int l = 0; l < 3; l++) H[a][i] += lag * W[a][l] * U[l][i];
                     }
-                    H[a][HARD + a] = 1, H[a][NORTH] = north[a] + lag * n[a], H[a][UP] = up[a] + lag * z[a], H[a][LAG] = c[a];
+                    H[a][HARD + a] = 1, H[a][LAG] = c[a], H[a][STRAY] = R[0][a] + lag * e[a];
+                    H[a][NORTH] = H[a][STRAY + 1] = R[1][a] + lag * n[a];
+                    H[a][UP] = H[a][STRAY + 2] = R[2][a] + lag * z[a];
                     r[a] = field[3 * t + a] - u[a] - lag * c[a] - x[HARD + a];
-                    noise[a] = p[7] * p[7] + p[8] * p[8] * disturbance[t] * disturbance[t] + p[9] * p[9] * speed;
+                    noise[a] = p[7] * p[7] + p[8] * p[8] * speed;
                 }
             }
             if (k == 2)
-                for (int a = 0; a < 3; a++) H[a][BIAS + a] = 1, r[a] = w[a] - x[BIAS + a], noise[a] = p[12] * p[12];
+                for (int a = 0; a < 3; a++) H[a][BIAS + a] = 1, r[a] = w[a] - x[BIAS + a], noise[a] = p[11] * p[11];
             update(P, H, r, noise, q, x);
         }
         memcpy(orientation + 4 * t, q, sizeof q);
         for (int i = 0; i < 9; i++) cov[9 * t + i] = P[i / 3][i % 3];
+        memcpy(states + N * t + 3, x + 3, sizeof x - 3 * sizeof(double));
     }
-    memcpy(last, x, sizeof x);
 }

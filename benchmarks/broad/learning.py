@@ -25,20 +25,22 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy import ndarray
+from torch import Tensor
 
 from benchmarks.broad.task import Trial, read_trials, simulated_trial
 from benchmarks.common.arguments import command, parse
 from torch_denkf.applications.imu.filter import ImuFilter, ImuSettings, moves
 from torch_denkf.applications.imu.log import block_size, imu_rows
 from torch_denkf.deployment.files import write_text
-from torch_denkf.functional.manifolds import SO3
+from torch_denkf.functional.manifolds import SO3, rotation_matrix
 
-__all__ = ["Equations", "Rows", "learn", "minimised"]
+__all__ = ["Equations", "Rows", "beliefs", "learn", "minimised"]
 
 #: What the strategy changes; poles are three more. All others stay.
 FREE = (
     *("gyro", "gyro_rate", "gyro_walk", "motion", "motion_unrest", "accelerometer", "gyro_scale", "gyro_skew"),
-    *("magnetic_bias", "magnetic_walk", "magnetometer", "magnetometer_unrest", "magnetometer_rate", "field_walk"),
+    *("magnetic_bias", "magnetic_walk", "magnetometer", "magnetometer_rate", "field_walk"),
+    *("stray", "stray_unrest", "stray_time"),
     *("lag_std", "heading", "heading_scale", "heading_floor", "tilt_scale", "tilt_floor"),
 )
 START = ImuSettings()
@@ -65,10 +67,12 @@ class Rows:
         trial: with the truth.
         settings: of which the lag and the block count.
         every: so many blocks are scored.
+        six: whether the magnetometer is left out.
     """
 
-    def __init__(self, trial: Trial, settings: ImuSettings, every: int = 3):
-        rows = imu_rows(settings, trial.gyro, trial.acceleration, trial.magnetometer, rate=trial.rate)
+    def __init__(self, trial: Trial, settings: ImuSettings, every: int = 3, *, six: bool = False):
+        field = None if six else trial.magnetometer
+        rows = imu_rows(settings, trial.gyro, trial.acceleration, field, rate=trial.rate)
         names = ("gyro", "accelerometer", "magnetometer", "unrest", "disturbance")
         self.values = [np.ascontiguousarray(rows[name].numpy()) for name in names]
         self.rest = np.ascontiguousarray(rows["rest_observed"].numpy(), np.uint8)
@@ -92,18 +96,26 @@ class Equations:
             self.library = ctypes.CDLL(str(file))
 
     def __call__(self, rows: Rows, s: ImuSettings, *, nine: bool = True) -> tuple[ndarray, ndarray, ndarray]:
-        """Orientations ``[N, 4]``, covariances ``[N, 9]`` about the body's axes, and the last state ``[30]``."""
+        """Orientations ``[N, 4]``, covariances ``[N, 9]`` about the body's axes, and states ``[N, 33]``."""
         motion = ImuFilter(s)
         numbers = [s.gyro, s.gyro_rate, s.gyro_walk, 2 * sum(s.poles), s.motion, s.motion_unrest, s.accelerometer]
-        numbers += [s.magnetometer, s.magnetometer_unrest, s.magnetometer_rate, s.magnetic_walk, s.field_walk]
-        numbers += [s.rest, s.gravity]
+        numbers += [s.magnetometer, s.magnetometer_rate, s.magnetic_walk, s.field_walk, s.rest, s.gravity]
+        numbers += [s.stray, s.stray_unrest, s.stray_time]
         start = motion.initial.std.double().numpy()
         step = moves(s.poles, rows.dt).numpy().copy()
-        found = np.empty((rows.count, 4)), np.empty((rows.count, 9)), np.empty(30)
+        found = np.empty((rows.count, 4)), np.empty((rows.count, 9)), np.zeros((rows.count, 33))
         own = [*rows.values, rows.rest]
         given = [step, np.array(numbers), np.ascontiguousarray(start), rows.state, *found]
         self.library.filter(rows.count, ctypes.c_double(rows.dt), *map(_pointer, own), int(nine), *map(_pointer, given))
         return found
+
+
+def beliefs(run: Equations, trial: Trial, settings: ImuSettings, *, six: bool = False) -> tuple[Tensor, Tensor]:
+    """Returns means ``[N, 34]`` and covariances of the orientation ``[N, 3, 3]``, as the library's filter writes them."""
+    found = run(Rows(trial, settings, six=six), settings, nine=not six)
+    quaternion, cov, states = map(torch.as_tensor, found)
+    axes = rotation_matrix(quaternion)
+    return torch.cat([quaternion, states[:, 3:]], -1), axes @ cov.unflatten(-1, (3, 3)) @ axes.mT
 
 
 def _pointer(array: ndarray) -> ctypes.c_void_p:
@@ -204,7 +216,7 @@ def learn(
     """Learns the numbers from some trials."""
     plain = [Rows(trial, replace(START, lag=0.0)) for trial in trials]
     weights = [np.square(each.values[0]).sum() for each in plain]
-    lags = [run(each, replace(START, lag_std=0.01))[2][29] for each in plain]
+    lags = [run(each, replace(START, lag_std=0.01))[2][-1, 29] for each in plain]
     lag = float(np.average(lags, weights=weights))
     rows = [Rows(trial, replace(START, lag=lag)) for trial in trials]
     s = replace(start, lag=lag, latency=latency(run, rows, START))

@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from benchmarks.broad.learning import Equations, beliefs
 from benchmarks.broad.pictures import draw
 from benchmarks.broad.task import Trial, read_trials, scores, simulated_trial
 from benchmarks.common.arguments import made_by, parse
@@ -46,6 +47,7 @@ class Study:
     data: Path = Path("../shared/data/broad")  # folder with .npz files of BROAD
     out: Path | None = None  # folder for broad.csv, broad.json, broad.md and broad.png
     smoother: bool = True  # run the smoother, too
+    equations: bool = False  # the filter by equations.c, a second a trial; a test compares it with the library's
     compile: bool = True  # the filter's steps: a minute, and a twentieth of the time
     smoke: bool = False  # ten simulated seconds: does it run?
 
@@ -55,9 +57,11 @@ class Runner:
 
     Args:
         compiled: whether it is compiled at all.
+        equations: whether the equations in C run in its place; the smoother is the library's.
     """
 
-    def __init__(self, compiled: bool):
+    def __init__(self, compiled: bool, equations: bool = False):
+        self.equations = Equations() if equations else None
         self.model = ImuFilter(ImuSettings()).double()
         if compiled:
             self.model.compile(chunk=1)
@@ -66,6 +70,9 @@ class Runner:
     @torch.no_grad()
     def __call__(self, settings: ImuSettings, trial: Trial, *, six: bool = False, smooth: bool = False) -> Orientations:
         """The orientations of a trial."""
+        if self.equations is not None and not smooth:
+            mean, cov = beliefs(self.equations, trial, settings, six=six)
+            return at_readings(settings, mean, cov, trial.gyro, trial.rate)
         self.model.load_state_dict(ImuFilter(settings).double().state_dict())
         field = None if six else trial.magnetometer
         rows = imu_rows(settings, trial.gyro, trial.acceleration, field, rate=trial.rate)
@@ -174,7 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print('VQF, the peer, is left out: pip install "torch_denkf[bench]"')
     numbers = json.loads(NUMBERS.read_text())["numbers"]
     trials = [simulated_trial()] if study.smoke else read_trials(study.data)
-    runner = Runner(study.compile and not study.smoke)
+    runner = Runner(study.compile and not study.smoke, study.equations)
     rows: list[dict] = []
     worst: tuple[float, Trial, Tensor] | None = None
     for trial in trials:

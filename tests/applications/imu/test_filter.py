@@ -12,7 +12,6 @@ from torch_denkf.applications.imu.filter import SPACE, ImuSettings, moves
 from torch_denkf.functional.manifolds import SO3, rotate
 from torch_denkf.smoothers import RTSSmoother
 
-SIZES = (3, 3, 9, 3, 3, 3, 3, 2, 1)
 SETTINGS = ImuSettings(
     gyro=0.003,
     gyro_scale=0.02,
@@ -87,7 +86,7 @@ def reference(rows, s):
     """An error-state Kalman filter; the rotation's error stands in the world's axes."""
     start = np.array([s.tilt] * 2 + [s.heading] + [s.gyro_bias] * 3)
     errors = [s.gyro_scale if i == j else s.gyro_skew for i in range(3) for j in range(3)]
-    rest = [s.motion_start] * 9 + [s.magnetic_bias] * 3 + [s.field] * 2 + [s.lag_std]
+    rest = [s.motion_start] * 9 + [s.magnetic_bias] * 3 + [s.field] * 2 + [s.lag_std] + [s.stray] * 3
     cov = np.diag(np.concatenate([start, errors, rest]) ** 2)
     turn, x = matrix(rows["start"][0, :4].numpy()), rows["start"][0, 4:].numpy().copy()
     found = []
@@ -96,43 +95,47 @@ def reference(rows, s):
         gyro, dt = row["gyro"], row["dt"].item()
         if t:
             angles = (gyro - x[:3] - x[3:12].reshape(3, 3) @ gyro) * dt
-            f = np.eye(30)
+            f = np.eye(33)
             spread = turn @ left_jacobian(angles) * dt  # of the gyro's errors, to a turn in the world's axes
             f[:3, 3:6] = -spread
             f[:3, 6:15] = -spread @ np.kron(np.eye(3), gyro)
             step = np.kron(row["moves"].reshape(3, 3), np.eye(3))
             f[15:24, 15:24] = step
+            fades = np.exp(-dt / s.stray_time)
+            f[30:, 30:] *= fades
+            x[27:] *= fades
             turn, x[12:21] = turn @ rotation(angles), step @ x[12:21]
-            q = np.zeros(30)
+            q = np.zeros(33)
             q[:3] = s.gyro**2 + s.gyro_rate**2 * (gyro @ gyro)
             q[3:6] = s.gyro_walk**2
             q[21:24] = 2 * sum(s.poles) * (s.motion**2 + s.motion_unrest**2 * row["unrest"] ** 2)
             q[24:27], q[27:29] = s.magnetic_walk**2, s.field_walk**2
+            stray = s.stray**2 + s.stray_unrest**2 * row["disturbance"].item() ** 2
+            q[30:] = stray * (1 - fades**2) / dt
             cov = f @ cov @ f.T + np.diag(q * dt)
 
         def update(read, predicted, h, variance):
             nonlocal turn, x, cov
             gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + variance * np.eye(3))
             change = gain @ (read - predicted)
-            reset = np.eye(30)
+            reset = np.eye(33)
             reset[:3, :3] = left_jacobian(change[:3])
-            keep = np.eye(30) - gain @ h
+            keep = np.eye(33) - gain @ h
             cov = reset @ (keep @ cov @ keep.T + variance * gain @ gain.T) @ reset.T
             turn, x = rotation(change[:3]) @ turn, x + change[3:]
 
         up = x[18:21] + np.array([0, 0, s.gravity])
-        h = np.zeros((3, 30))
+        h = np.zeros((3, 33))
         h[:, :3], h[:, 21:24] = turn.T @ skew(up), turn.T
         update(row["accelerometer"], turn.T @ up, h, s.accelerometer**2)
         if row["magnetometer_observed"]:
-            field, h, lag = np.array([0, *x[24:26]]), np.zeros((3, 30)), np.eye(3) + x[26] * skew(gyro)
+            field, h, lag = np.array([0, *x[24:26]]) + x[27:], np.zeros((3, 33)), np.eye(3) + x[26] * skew(gyro)
             h[:, :3], h[:, 24:27], h[:, 27:29] = lag @ turn.T @ skew(field), np.eye(3), (lag @ turn.T)[:, 1:]
-            h[:, 29] = skew(gyro) @ turn.T @ field
-            noise = s.magnetometer**2 + s.magnetometer_unrest**2 * row["disturbance"] ** 2
-            noise = noise + s.magnetometer_rate**2 * (gyro @ gyro)
+            h[:, 29], h[:, 30:] = skew(gyro) @ turn.T @ field, lag @ turn.T
+            noise = s.magnetometer**2 + s.magnetometer_rate**2 * (gyro @ gyro)
             update(row["magnetometer"], lag @ turn.T @ field + x[21:24], h, noise)
         if row["rest_observed"]:
-            h = np.zeros((3, 30))
+            h = np.zeros((3, 33))
             h[:, 3:6] = np.eye(3)
             update(gyro, x[:3], h, s.rest**2)
         found.append((turn, x.copy(), cov))
@@ -181,18 +184,18 @@ def drawn_rows(settings, runs=60, steps=100, seed=0):
     states, accelerometer, magnetometer = [], [], []
     for t in range(steps):
         if t == 0:
-            state = SPACE.plus(rows["start"][:, 0], std * torch.randn(runs, 30, dtype=torch.float64))
+            state = SPACE.plus(rows["start"][:, 0], std * torch.randn(runs, 33, dtype=torch.float64))
         else:
             now = rows[:, t].clone()
             now["belief", "ensemble"], now["belief", "mean"] = state.unsqueeze(1), state
             state, variance = transition(now)["forecast", "ensemble"].squeeze(1), noise(now)["forecast", "noise"]
-            state = SPACE.plus(state, variance.sqrt() * torch.randn(runs, 30, dtype=torch.float64))
+            state = SPACE.plus(state, variance.sqrt() * torch.randn(runs, 33, dtype=torch.float64))
         now = TensorDict({"forecast": {"ensemble": state.unsqueeze(1)}, **rows[:, t]}, [runs])
         for name, to in (("accelerometer", accelerometer), ("magnetometer", magnetometer)):
             value = model[name].module.module(now.clone()).get(("forecast", "observation")).squeeze(1)
             variance = settings.accelerometer**2
             if name == "magnetometer":
-                variance = model["magnetometer_noise"].module.compute(rows["gyro"][:, t], rows["disturbance"][:, t])
+                variance = model["magnetometer_noise"].module.compute(rows["gyro"][:, t])
             to.append(value + torch.as_tensor(variance).sqrt() * torch.randn(runs, 3, dtype=torch.float64))
         states.append(state)
     rows["accelerometer"], rows["magnetometer"] = torch.stack(accelerometer, 1), torch.stack(magnetometer, 1)
@@ -245,7 +248,7 @@ def test_a_log_that_is_not_one():
     _, log = body_log(100)
     with pytest.raises(ValueError, match=r"m/s\^2.*median of its size is 1\."):
         imu_rows(SETTINGS, log["gyro"], log["acceleration"] / 9.82, rate=100.0)
-    with pytest.raises(ValueError, match="at least 4 readings"):
+    with pytest.raises(ValueError, match="at least 5 readings"):
         imu_rows(SETTINGS, log["gyro"][:3], log["acceleration"][:3], rate=100.0)
     with pytest.raises(ValueError, match="not finite"):
         imu_rows(SETTINGS, log["gyro"] / 0, log["acceleration"], rate=100.0)

@@ -18,8 +18,9 @@ from torch_denkf.submodel import Sensor, SubModel
 __all__ = ["SPACE", "ImuFilter", "ImuMotion", "ImuNoise", "ImuSettings", "MagnetometerNoise", "imu", "moves"]
 
 #: Orientation (errors in the world's axes); the gyro's bias and its matrix of errors; position, velocity and
-#: acceleration in the world's axes; the magnetometer's bias; the field northwards and upwards; the magnetometer's lag.
-SPACE = Product(Opposite(SO3()), *map(Euclidean, (3, 9, 3, 3, 3, 3, 2, 1)))
+#: acceleration in the world's axes; the magnetometer's bias; the field northwards and upwards; the magnetometer's lag;
+#: the stray field in the world's axes.
+SPACE = Product(Opposite(SO3()), *map(Euclidean, (3, 9, 3, 3, 3, 3, 2, 1, 3)))
 BIAS = 4  # its place in a point
 
 
@@ -40,12 +41,14 @@ class ImuSettings:
         motion_start: standard deviation of position, velocity and acceleration at the start.
         accelerometer: standard deviation of the mean over a block, in m/s^2.
         magnetometer: of the mean over a block, in uT.
-        magnetometer_unrest: what is added to it per uT of ``"disturbance"``.
         magnetometer_rate: what is added to it per rad/s of rotation.
         magnetic_bias: standard deviation of the magnetometer's bias at the start, in uT.
         magnetic_walk: of that bias, in uT/sqrt(s).
         field: standard deviation of the first reading of the magnetic field, in uT.
         field_walk: of the field, in uT/sqrt(s).
+        stray: standard deviation of the stray field, which comes and goes, about each axis, in uT.
+        stray_unrest: what is added to it per uT of ``"disturbance"``.
+        stray_time: in which it fades to 1/e, in s.
         lag: how much later the magnetometer reads than the gyro, in s.
         lag_std: standard deviation of that number.
         tilt: standard deviation of the inclination at the start, in rad.
@@ -72,19 +75,21 @@ class ImuSettings:
     motion_start: float = 0.1
     accelerometer: float = 0.05
     magnetometer: float = 4.0
-    magnetometer_unrest: float = 3.0
     magnetometer_rate: float = 0.3
     magnetic_bias: float = 0.3
     magnetic_walk: float = 0.01
     field: float = 3.0
     field_walk: float = 0.02
+    stray: float = 0.5
+    stray_unrest: float = 0.5
+    stray_time: float = 1.0
     lag: float = 0.0
     lag_std: float = 0.003
     tilt: float = 0.05
     heading: float = 0.1
     rest: float = 0.002
     gravity: float = 9.82
-    block: float = 0.035
+    block: float = 0.05
     latency: float = 0.0
     heading_scale: float = 1.0
     heading_floor: float = 0.5
@@ -105,20 +110,26 @@ class ImuMotion(Motion):
 
     The gyro reads :math:`\omega + b + M \tilde\omega`. The position is the output of a linear process of third order
     with white noise at its input, so that neither velocity nor position run away: what the accelerometer reads for long
-    is gravity. ``"moves"`` ``[*B, 9]`` is that process' transition matrix, see :func:`moves`.
+    is gravity. ``"moves"`` ``[*B, 9]`` is that process' transition matrix, see :func:`moves`. The stray field fades.
+
+    Args:
+        stray_time: in which it fades to 1/e, in s.
     """
 
-    def __init__(self):
+    stray_time: Tensor
+
+    def __init__(self, stray_time: float):
         super().__init__(SPACE, "dt", {"gyro": 3, "moves": 9}, ("belief", "ensemble"), ("forecast", "ensemble"))
+        self.register_buffer("stray_time", torch.tensor(stray_time))
 
     def move(self, state, gyro, moves, *, dt):
         """The state one step later."""
-        orientation, bias, errors, position, velocity, acceleration, *others = SPACE.points(state)
+        orientation, bias, errors, position, velocity, acceleration, *others, stray = SPACE.points(state)
         rate = gyro - bias - (errors.unflatten(-1, (3, 3)) * gyro.unsqueeze(-2)).sum(-1)
         turned = SO3().plus(orientation, rate * dt)
         matrix, before = moves.unflatten(-1, (3, 3)), torch.stack([position, velocity, acceleration], -2)
         moved = (matrix.unsqueeze(-1) * before.unsqueeze(-3)).sum(-2)
-        return torch.cat([turned, bias, errors, moved.flatten(-2), *others], -1)
+        return torch.cat([turned, bias, errors, moved.flatten(-2), *others, stray * (-dt / self.stray_time).exp()], -1)
 
 
 def moves(poles: Sequence[float], dt: float) -> Tensor:
@@ -138,26 +149,29 @@ def moves(poles: Sequence[float], dt: float) -> Tensor:
 
 
 class ImuNoise(SubModel):
-    """Variances ``[*B, 30]`` that a step adds, learnable: of the gyro, the motion's acceleration and slow errors.
+    """Variances ``[*B, 33]`` that a step adds, learnable: of the gyro, the motion's acceleration and slow errors.
 
     Args:
         settings: the numbers before training.
     """
 
     def __init__(self, settings: ImuSettings):
-        keys = [("belief", "mean"), "gyro", "unrest", "dt"]
+        keys = [("belief", "mean"), "gyro", "unrest", "disturbance", "dt"]
         super().__init__(nn.Identity(), keys, [("forecast", "noise")])
         s = settings
         shares = [s.gyro, s.gyro_rate, s.gyro_walk, s.motion, s.motion_unrest, s.magnetic_walk, s.field_walk]
+        shares += [s.stray, s.stray_unrest]
         self.log_std = nn.Parameter(torch.tensor(shares).log())
         self.register_buffer("damping", torch.tensor(2 * sum(s.poles)))
+        self.register_buffer("stray_time", torch.tensor(s.stray_time))
 
-    def compute(self, mean, gyro, unrest, dt):
+    def compute(self, mean, gyro, unrest, disturbance, dt):
         """The variances of the step."""
-        rate = gyro.square().sum(-1, keepdim=True)
-        gyro_noise, by_rate, walk, motion, by_unrest, bias, field = (2 * self.log_std).exp().unbind(-1)
-        turn, push = gyro_noise + by_rate * rate, self.damping * (motion + by_unrest * unrest.square())
-        sizes = ((turn, 3), (walk, 3), (0, 15), (push, 3), (bias, 3), (field, 2), (0, 1))
+        rate, variance = gyro.square().sum(-1, keepdim=True), (2 * self.log_std).exp()
+        white, by_rate, walk, motion, by_unrest, bias, field, stray, by_disturbance = variance.unbind(-1)
+        turn, push = white + by_rate * rate, self.damping * (motion + by_unrest * unrest.square())
+        new = (stray + by_disturbance * disturbance.square()) * -torch.expm1(-2 * dt / self.stray_time) / dt
+        sizes = ((turn, 3), (walk, 3), (0, 15), (push, 3), (bias, 3), (field, 2), (0, 1), (new, 3))
         columns = [(one + torch.zeros_like(dt)).expand(*dt.shape[:-1], count) for one, count in sizes]
         return (torch.cat(columns, -1) * dt).to(mean.dtype)
 
@@ -184,12 +198,13 @@ class _Magnetometer(SubModel):
     def compute(self, state, gyro):
         """The field in the axes of the body as they were, and the bias."""
         parts = SPACE.points(state)
-        field = rotate(SO3().inverse(parts[0]), torch.cat([torch.zeros_like(parts[8]), parts[7]], -1))
+        field = torch.nn.functional.pad(parts[7], (1, 0)) + parts[9]
+        field = rotate(SO3().inverse(parts[0]), field)
         return field + parts[8] * torch.linalg.cross(gyro.unsqueeze(-2).expand_as(field), field) + parts[6]
 
 
 class MagnetometerNoise(Sensor):
-    """Variances ``[*B, 3]`` of the magnetometer, larger where the field changes and while the body turns fast.
+    """Variances ``[*B, 3]`` of the magnetometer, larger while the body turns fast, learnable.
 
     Args:
         settings: the numbers before training.
@@ -198,15 +213,13 @@ class MagnetometerNoise(Sensor):
     observation_dim = 3
 
     def __init__(self, settings: ImuSettings):
-        super().__init__(nn.Identity(), ["gyro", "disturbance"], [("sensor", "noise")])
-        shares = [settings.magnetometer, settings.magnetometer_unrest, settings.magnetometer_rate]
-        self.log_std = nn.Parameter(torch.tensor(shares).log())
+        super().__init__(nn.Identity(), ["gyro"], [("sensor", "noise")])
+        self.log_std = nn.Parameter(torch.tensor([settings.magnetometer, settings.magnetometer_rate]).log())
 
-    def compute(self, gyro, disturbance):
+    def compute(self, gyro):
         """The variances."""
-        white, unrest, rate = (2 * self.log_std).exp().unbind(-1)
-        noise = white + unrest * disturbance.square() + rate * gyro.square().sum(-1, keepdim=True)
-        return noise.expand_as(gyro)
+        white, rate = (2 * self.log_std).exp().unbind(-1)
+        return (white + rate * gyro.square().sum(-1, keepdim=True)).expand_as(gyro)
 
 
 class ImuFilter(FusedFilter):
@@ -230,7 +243,7 @@ class ImuFilter(FusedFilter):
         s = settings
         start = [s.tilt] * 2 + [s.heading] + [s.gyro_bias] * 3
         start += [s.gyro_scale if row == column else s.gyro_skew for row in range(3) for column in range(3)]
-        start += [s.motion_start] * 9 + [s.magnetic_bias] * 3 + [s.field] * 2 + [s.lag_std]
+        start += [s.motion_start] * 9 + [s.magnetic_bias] * 3 + [s.field] * 2 + [s.lag_std] + [s.stray] * 3
         read = {"in_key": "accelerometer", "trainable": True}
         sensors = {
             "accelerometer": FusedSensor(_Accelerometer(s.gravity), ConstantNoise([s.accelerometer] * 3, **read)),
@@ -238,7 +251,7 @@ class ImuFilter(FusedFilter):
             "rest": FusedSensor(Select(range(BIAS, BIAS + 3)), [s.rest] * 3, observation_key="gyro"),
         }
         super().__init__(
-            ImuMotion(),
+            ImuMotion(s.stray_time),
             sensors,
             initial=GaussianAround(start, state_key="start", space=SPACE),
             process_noise=ImuNoise(s),

@@ -26,8 +26,8 @@ class Orientations(NamedTuple):
         quaternion: ``[T, 4]``, w first, from the sensor's axes to the world's.
         std: standard deviations of rotations about the world's x, y and z, ``[T, 3]`` in rad: inclination about two
             axes, and heading.
-        mean: the filter's beliefs, a point of its space for each block, ``[N, 31]``.
-        cov: their covariances ``[N, 30, 30]``.
+        mean: the filter's beliefs, a point of its space for each block, ``[N, 34]``.
+        cov: their covariances ``[N, 33, 33]``.
     """
 
     quaternion: Tensor
