@@ -91,10 +91,11 @@ static void update(double P[N][N], double H[3][N], const double *r, const double
 /* p: gyro, gyro_rate, gyro_walk, damping, motion, motion_unrest, accelerometer, magnetometer, magnetometer_rate,
  * magnetic_walk, field_walk, rest, gravity, stray, stray_unrest, stray_time; start: 33 standard deviations, those of the
  * rotation in the world's axes; state: 34 numbers. Writes orientations [T, 4], covariances of turns in the body's axes,
- * and states [T, 33], whose first three numbers are none. */
+ * and states [T, 33], whose first three numbers are none. For a smoother kept, if any, [T, 3 * 33 * 33 + 37] gets the
+ * transition of errors into a step, the forecast's covariance, the posterior's, and the forecast's orientation and state. */
 void filter(int count, double dt, const double *gyro, const double *force, const double *field, const double *unrest,
             const double *disturbance, const unsigned char *rest, int nine, const double *moves, const double *p,
-            const double *start, const double *state, double *orientation, double *cov, double *states) {
+            const double *start, const double *state, double *orientation, double *cov, double *states, double *kept) {
     double P[N][N], q[4], x[N], R[3][3], J[3][3], turn[4], now[4];
     memset(P, 0, sizeof P), memcpy(q, state, sizeof q), memcpy(x + 3, state + 4, 30 * sizeof(double));
     double fades = exp(-dt / p[15]);
@@ -146,7 +147,23 @@ void filter(int count, double dt, const double *gyro, const double *force, const
                 double stray = p[13] * p[13] + p[14] * p[14] * disturbance[t] * disturbance[t];
                 P[STRAY + i][STRAY + i] += stray * (1 - fades * fades);
             }
+            if (kept) {
+                double *F = kept + (long)t * (3 * N * N + N + 4);
+                for (int i = 0; i < N * N; i++) F[i] = i / N == i % N;
+                for (int i = 0; i < 3; i++)
+                    for (int l = 0; l < 3; l++) {
+                        F[i * N + l] = D[l][i], F[i * N + BIAS + l] = -J[i][l] * dt;
+                        for (int m = 0; m < 3; m++) F[i * N + GYRO + 3 * l + m] = -J[i][l] * dt * w[m];
+                        for (int m = 0; m < 3; m++) F[(POSITION + 3 * l + i) * N + POSITION + 3 * m + i] = moves[3 * l + m];
+                        F[(STRAY + i) * N + STRAY + i] = fades;
+                    }
+            }
             P[NORTH][NORTH] += p[10] * p[10] * dt, P[UP][UP] += p[10] * p[10] * dt;
+        }
+        double *store = kept ? kept + (long)t * (3 * N * N + N + 4) + N * N : 0;
+        if (store) {
+            memcpy(store, P, sizeof P), memcpy(store + 2 * N * N, q, sizeof q);
+            memcpy(store + 2 * N * N + 4, x, sizeof x);
         }
         for (int k = 0; k < 3; k++) {
             if ((k == 1 && !nine) || (k == 2 && !rest[t])) continue;
@@ -182,6 +199,7 @@ void filter(int count, double dt, const double *gyro, const double *force, const
                 for (int a = 0; a < 3; a++) H[a][BIAS + a] = 1, r[a] = w[a] - x[BIAS + a], noise[a] = p[11] * p[11];
             update(P, H, r, noise, q, x);
         }
+        if (store) memcpy(store + N * N, P, sizeof P);
         memcpy(orientation + 4 * t, q, sizeof q);
         for (int i = 0; i < 9; i++) cov[9 * t + i] = P[i / 3][i % 3];
         memcpy(states + N * t + 3, x + 3, sizeof x - 3 * sizeof(double));

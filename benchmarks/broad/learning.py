@@ -95,8 +95,17 @@ class Equations:
             subprocess.run(["cc", source, *options[:-1], "-o", file, options[-1]], check=True)
             self.library = ctypes.CDLL(str(file))
 
-    def __call__(self, rows: Rows, s: ImuSettings, *, nine: bool = True) -> tuple[ndarray, ndarray, ndarray]:
-        """Orientations ``[N, 4]``, covariances ``[N, 9]`` about the body's axes, and states ``[N, 33]``."""
+    def __call__(
+        self, rows: Rows, s: ImuSettings, *, nine: bool = True, kept: ndarray | None = None
+    ) -> tuple[ndarray, ndarray, ndarray]:
+        """Orientations ``[N, 4]``, covariances ``[N, 9]`` about the body's axes, and states ``[N, 33]``.
+
+        Args:
+            rows: of the trial.
+            s: the numbers.
+            nine: whether the magnetometer is read.
+            kept: gets what a smoother needs, ``[N, 3 * 33 * 33 + 37]``.
+        """
         motion = ImuFilter(s)
         numbers = [s.gyro, s.gyro_rate, s.gyro_walk, 2 * sum(s.poles), s.motion, s.motion_unrest, s.accelerometer]
         numbers += [s.magnetometer, s.magnetometer_rate, s.magnetic_walk, s.field_walk, s.rest, s.gravity]
@@ -106,16 +115,46 @@ class Equations:
         found = np.empty((rows.count, 4)), np.empty((rows.count, 9)), np.zeros((rows.count, 33))
         own = [*rows.values, rows.rest]
         given = [step, np.array(numbers), np.ascontiguousarray(start), rows.state, *found]
-        self.library.filter(rows.count, ctypes.c_double(rows.dt), *map(_pointer, own), int(nine), *map(_pointer, given))
+        last = None if kept is None else _pointer(kept)
+        arrays = (*map(_pointer, own), int(nine), *map(_pointer, given), last)
+        self.library.filter(rows.count, ctypes.c_double(rows.dt), *arrays)
         return found
 
 
-def beliefs(run: Equations, trial: Trial, settings: ImuSettings, *, six: bool = False) -> tuple[Tensor, Tensor]:
-    """Returns means ``[N, 34]`` and covariances of the orientation ``[N, 3, 3]``, as the library's filter writes them."""
-    found = run(Rows(trial, settings, six=six), settings, nine=not six)
-    quaternion, cov, states = map(torch.as_tensor, found)
-    axes = rotation_matrix(quaternion)
-    return torch.cat([quaternion, states[:, 3:]], -1), axes @ cov.unflatten(-1, (3, 3)) @ axes.mT
+def beliefs(
+    run: Equations, trial: Trial, settings: ImuSettings, *, six: bool = False, smooth: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Returns means ``[N, 34]`` and covariances of the orientation ``[N, 3, 3]``, as filter and smoother write them."""
+    rows = Rows(trial, settings, six=six)
+    kept = np.zeros((rows.count, 3 * 33 * 33 + 37)) if smooth else None
+    quaternion, cov, states = map(torch.as_tensor, run(rows, settings, nine=not six, kept=kept))
+    mean, cov = torch.cat([quaternion, states[:, 3:]], -1), cov.unflatten(-1, (3, 3))
+    if kept is not None:
+        mean, cov = _smoothed(mean, torch.as_tensor(kept))
+    axes = rotation_matrix(mean[:, :4])
+    return mean, axes @ cov @ axes.mT
+
+
+def _smoothed(mean: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns smoothed means and covariances of rotations about the body's axes (Rauch, Tung & Striebel)."""
+    moves, ahead, after = kept[:, : 3 * 33 * 33].unflatten(-1, (3, 33, 33)).unbind(1)
+    forecast = torch.cat([kept[:, -37:-33], kept[:, -30:]], -1)
+    space, found, cov = SO3(), [mean[-1]], after[-1]
+    turns = [cov[:3, :3]]
+    for t in range(len(mean) - 2, -1, -1):
+        gain = torch.linalg.solve(ahead[t + 1], moves[t + 1] @ after[t]).mT
+        turn = space.log(space.compose(space.inverse(forecast[t + 1, :4]), found[-1][:4]))
+        step = gain @ torch.cat([turn, found[-1][4:] - forecast[t + 1, 4:]])
+        back = gain.clone()
+        back[:, :3] = torch.linalg.solve(space.right_jacobian(turn), gain[:, :3], left=False)
+        cov = after[t] - gain @ ahead[t + 1] @ gain.mT + back @ cov @ back.mT
+        jacobian = torch.eye(33, dtype=cov.dtype)
+        jacobian[:3, :3] = space.right_jacobian(step[:3])
+        cov = jacobian @ cov @ jacobian.mT
+        cov = (cov + cov.mT) / 2
+        found.append(torch.cat([space.plus(mean[t, :4], step[:3]), mean[t, 4:] + step[3:]]))
+        turns.append(cov[:3, :3])
+    return torch.stack(found[::-1]), torch.stack(turns[::-1])
 
 
 def _pointer(array: ndarray) -> ctypes.c_void_p:

@@ -57,7 +57,7 @@ class Runner:
 
     Args:
         compiled: whether it is compiled at all.
-        equations: whether the equations in C run in its place; the smoother is the library's.
+        equations: whether the equations in C run in its place.
     """
 
     def __init__(self, compiled: bool, equations: bool = False):
@@ -70,8 +70,8 @@ class Runner:
     @torch.no_grad()
     def __call__(self, settings: ImuSettings, trial: Trial, *, six: bool = False, smooth: bool = False) -> Orientations:
         """The orientations of a trial."""
-        if self.equations is not None and not smooth:
-            mean, cov = beliefs(self.equations, trial, settings, six=six)
+        if self.equations is not None:
+            mean, cov = beliefs(self.equations, trial, settings, six=six, smooth=smooth)
             return at_readings(settings, mean, cov, trial.gyro, trial.rate)
         self.model.load_state_dict(ImuFilter(settings).double().state_dict())
         field = None if six else trial.magnetometer

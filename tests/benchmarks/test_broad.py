@@ -54,15 +54,15 @@ def test_no_trials(tmp_path):
 
 @torch.no_grad()
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
-@pytest.mark.parametrize("nine", [True, False])
-def test_the_equations_in_c_are_the_filter(nine):
+@pytest.mark.parametrize(("nine", "smooth"), [(True, False), (True, True), (False, False)])
+def test_the_equations_in_c_are_filter_and_smoother(nine, smooth):
     trial, settings = simulated_trial(seconds=8.0), replace(ImuSettings(), lag=0.01, lag_std=0.01, magnetometer=0.5)
-    found = Runner(False)(settings, trial, six=not nine)
+    found = Runner(False)(settings, trial, six=not nine, smooth=smooth)
     assert imu_rows(settings, trial.gyro, trial.acceleration, rate=trial.rate)["rest_observed"].sum() > 3
-    mean, cov = beliefs(Equations(), trial, settings, six=not nine)
+    mean, cov = beliefs(Equations(), trial, settings, six=not nine, smooth=smooth)
     own = found.mean[:, :4]
     assert ((own * mean[:, :4]).sum(-1).abs() - 1).abs().max() < 1e-12
-    torch.testing.assert_close(found.mean[:, 4:], mean[:, 4:], atol=1e-6, rtol=0)
+    torch.testing.assert_close(found.mean[:, 4:], mean[:, 4:], atol=1e-5 if smooth else 1e-6, rtol=0)  # m, uT
     torch.testing.assert_close(found.cov[:, :3, :3], cov, atol=1e-6 * cov.max().item(), rtol=0)
 
 
