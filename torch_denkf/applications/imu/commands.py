@@ -55,7 +55,7 @@ class Orient(Command):
             raise ValueError(f"{self.model} is a {type(model).__name__}; pass imu, or a folder of an ImuFilter")
         torch.set_num_threads(1)
         values = {name: torch.as_tensor(value) for name, value in log.items()}
-        found = orientations(model.double(), **values, rate=rate, smooth=self.smooth)  # type: ignore[arg-type]
+        found = orientations(model.double(), **values, rate=rate, smooth=self.smooth)
         degrees = found.std.rad2deg()
         seconds = torch.arange(len(degrees), dtype=degrees.dtype).unsqueeze(-1) / rate
         with alone_in(self.out):

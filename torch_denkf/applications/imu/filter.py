@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
@@ -100,7 +101,7 @@ class ImuSettings:
         object.__setattr__(self, "poles", tuple(self.poles))  # of a file they are a list
         for each in fields(self):
             for value in self.poles if each.name == "poles" else [getattr(self, each.name)]:
-                check_number(each.name, value, **({} if each.name in ("lag", "latency") else {"above": 0}))
+                check_number(each.name, value, above=-math.inf if each.name in ("lag", "latency") else 0)
         if len(self.poles) != 3:
             raise ValueError(f"poles are three rates; got {len(self.poles)}.")
 
@@ -244,9 +245,9 @@ class ImuFilter(FusedFilter):
         start = [s.tilt] * 2 + [s.heading] + [s.gyro_bias] * 3
         start += [s.gyro_scale if row == column else s.gyro_skew for row in range(3) for column in range(3)]
         start += [s.motion_start] * 9 + [s.magnetic_bias] * 3 + [s.field] * 2 + [s.lag_std] + [s.stray] * 3
-        read = {"in_key": "accelerometer", "trainable": True}
+        force_noise = ConstantNoise([s.accelerometer] * 3, trainable=True, in_key="accelerometer")
         sensors = {
-            "accelerometer": FusedSensor(_Accelerometer(s.gravity), ConstantNoise([s.accelerometer] * 3, **read)),
+            "accelerometer": FusedSensor(_Accelerometer(s.gravity), force_noise),
             "magnetometer": FusedSensor(_Magnetometer(), MagnetometerNoise(s)),
             "rest": FusedSensor(Select(range(BIAS, BIAS + 3)), [s.rest] * 3, observation_key="gyro"),
         }
