@@ -129,10 +129,12 @@ def vqf(trial: Trial) -> tuple[Tensor, Tensor, float]:
 def by_gyro(trial: Trial, settings: ImuSettings) -> Tensor:
     """Orientations by the gyro alone, from what the first readings of all sensors say."""
     start = imu_rows(settings, trial.gyro[:100], trial.acceleration[:100], trial.magnetometer[:100], rate=trial.rate)
-    found = [start["start"][0, :4]]
-    for step in SO3().exp(trial.gyro[1:] / trial.rate):
-        found.append(SO3().compose(found[-1], step))
-    return torch.stack(found)
+    found = torch.cat([start["start"][:1, :4], SO3().exp(trial.gyro[1:] / trial.rate)])
+    reach = 1
+    while reach < len(found):  # products of all before, twice as many each time
+        found = torch.cat([found[:reach], SO3().compose(found[:-reach], found[reach:])])
+        reach *= 2
+    return found
 
 
 def page(rows: Sequence[dict], smoke: bool = False) -> str:
@@ -151,13 +153,17 @@ def page(rows: Sequence[dict], smoke: bool = False) -> str:
     for method in methods:
         own = pick(rows, method=method)
         cells = [f"{mean(own, name):.2f}" for name in ("total", "heading", "inclination")]
+        worst = f"{max(row['total'] for row in own):.2f}"
         held = [f"{100 * mean(own, f'{name}_held'):.0f} %" if f"{name}_held" in own[0] else "" for name in HELD]
         seconds = f"{mean(own, 'seconds'):.1f}" if "seconds" in own[0] else ""
-        text.append(line(method, *cells, f"{max(row['total'] for row in own):.2f}", *held, seconds))
+        if "6 axes" in method:  # north is unknown
+            cells[:2], worst, held[:1] = ["", ""], "", [""]
+        text.append(line(method, *cells, worst, *held, seconds))
+    north = [method for method in methods if "6 axes" not in method]
     text += ["", "Total error of each trial, degrees, and the coverage of the filter's intervals, %.", ""]
-    text += head("trial", *methods, "heading held", "inclination held")
+    text += head("trial", *north, "heading held", "inclination held")
     for name in names:
-        cells = [f"{pick(rows, trial=name, method=method)[0]['total']:.2f}" for method in methods]
+        cells = [f"{pick(rows, trial=name, method=method)[0]['total']:.2f}" for method in north]
         own = pick(rows, trial=name, method=OWN)[0]
         text.append(line(name, *cells, *(f"{100 * own[f'{each}_held']:.0f}" for each in HELD)))
     text += ["", "Inclination of each trial, degrees.", "", *head("trial", *methods)]
