@@ -62,3 +62,11 @@ def test_table_of_the_transform_names_its_own_methods():
 def test_the_list_of_public_names_is_up_to_date():
     pages = runpy.run_path(str(ROOT / "docs" / "_ext" / "reference_pages.py"))
     assert (ROOT / "docs" / "reference" / "names.md").read_text() == pages["names"]()
+
+
+def test_pages_are_short_and_animations_small():
+    written = [path for path in PAGES if "docs" in path.parts and path.name != "names.md"]  # names.md is generated
+    assert sum(len(path.read_text().split()) for path in written) <= 28_000
+    assert list(ROOT.glob("docs/*.png")) == list(ROOT.glob("docs/*.gif")) == []
+    animations = [*ROOT.glob("docs/pictures/*.gif"), *ROOT.glob("benchmarks/*/results/*.gif")]
+    assert [name(path) for path in animations if path.stat().st_size > 500_000] == []

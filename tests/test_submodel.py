@@ -90,9 +90,9 @@ def names_of_keys(name):
     """Every parameter that names an entry, and what it names by default."""
     kind, _, options, _ = CASES[name]
     parameters = dict(inspect.signature(kind).parameters)
-    if "keys" in parameters:  # **keys go to the class that it is made of
+    if "options" in parameters:  # **options go to the class that it is made of
         parameters |= inspect.signature(kind.__base__).parameters
-    defaults = {key: value.default for key, value in parameters.items() if key != "keys"} | options
+    defaults = {key: value.default for key, value in parameters.items() if key != "options"} | options
     keys = {key: value for key, value in defaults.items() if key.endswith(("_key", "_keys", "_prefix"))}
     return {key: value for key, value in keys.items() if value is not None and value is not inspect.Parameter.empty}
 

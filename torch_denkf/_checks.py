@@ -8,6 +8,7 @@ values. Text is checked by readers, which add the file and the line.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
@@ -22,6 +23,7 @@ __all__ = [
     "check_ensemble",
     "check_mask",
     "check_number",
+    "check_observed",
     "check_one_dtype",
     "check_shape",
     "check_square",
@@ -55,8 +57,7 @@ def check_shape(name: str, tensor: Tensor, shape: Sequence[int], layout: str) ->
 def check_shapes(*checks: tuple[str, Tensor, Sequence[int], str]) -> None:
     """Makes several checks, each of which takes the arguments of :func:`check_shape`."""
     for name, tensor, shape, layout in checks:
-        if tensor.shape != tuple(shape):
-            check_shape(name, tensor, shape, layout)
+        check_shape(name, tensor, shape, layout)
 
 
 def check_ensemble(name: str, ensemble: Tensor, min_size: int = 1) -> None:
@@ -110,6 +111,16 @@ def check_one_dtype(**tensors: Tensor | None) -> None:
             )
 
 
+def check_observed(mask: Tensor, batch: Sequence[int], dim: int) -> None:
+    """Raise unless ``observed`` is boolean, ``[*B, 1]`` or ``[*B, O]``.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    check_mask("observed", mask)
+    check_shape("observed", mask, (*batch, 1 if mask.ndim and mask.shape[-1] == 1 else dim), "[*B, 1] or [*B, O]")
+
+
 def check_mask(name: str, mask: Tensor | None) -> None:
     """Raise unless a mask is boolean, or ``None``.
 
@@ -159,15 +170,7 @@ def check_number(
         return
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number, got {value!r} ({type(value).__name__})" + _end(cure))
-    number = float(value)
-    inside = (
-        math.isfinite(number)
-        and (above is None or number > above)
-        and (least is None or number >= least)
-        and (below is None or number < below)
-        and (most is None or number <= most)
-    )
-    if not inside:
+    if not (math.isfinite(value) and all(_kept(float(value), above, least, below, most))):
         raise ValueError(f"{name} must be {_range(above, least, below, most)}; got {value!r}" + _end(cure))
 
 
@@ -184,14 +187,11 @@ def check_count(name: str, value: Any, *, least: int = 1, most: int | None = Non
         ...
         ValueError: ensemble_size must be a whole number, at least 1; got -3
     """
+    due = f"{name} must be a whole number, at least {least}" + ("" if most is None else f" and at most {most}")
     if isinstance(value, bool) or not isinstance(value, Integral):
-        raise TypeError(
-            f"{name} must be a whole number, at least {least}; got {value!r} ({type(value).__name__})" + _end(cure)
-        )
-    if int(value) < least:
-        raise ValueError(f"{name} must be a whole number, at least {least}; got {value!r}" + _end(cure))
-    if most is not None and int(value) > most:
-        raise ValueError(f"{name} must be a whole number, at most {most}; got {value!r}" + _end(cure))
+        raise TypeError(f"{due}; got {value!r} ({type(value).__name__})" + _end(cure))
+    if int(value) < least or (most is not None and int(value) > most):
+        raise ValueError(f"{due}; got {value!r}" + _end(cure))
 
 
 def check_choice(name: str, value: Any, choices: Sequence[str | None]) -> None:
@@ -241,9 +241,8 @@ def check_values(
         return
     values = tensor.detach()
     good = ~values.isnan() if infinite else values.isfinite()
-    for limit, compare in ((above, torch.gt), (least, torch.ge), (below, torch.lt), (most, torch.le)):
-        if limit is not None:
-            good = good & compare(values, limit)
+    for kept in _kept(values, above, least, below, most):
+        good = good & kept
     if not bool(good.all()):
         at = (~good).nonzero()[0].tolist()
         value = values[tuple(at)].item()
@@ -348,6 +347,12 @@ def flag_value(flag: Tensor) -> bool | None:
 def _has_values(tensor: Tensor) -> bool:
     """Tells whether a constant's values can be read; another class of tensors may forbid it."""
     return type(tensor) in (Tensor, torch.nn.Parameter) and has_values(tensor)
+
+
+def _kept(value: Any, *limits: float | None) -> list[Any]:
+    """Tells which limits a number keeps, or each of a tensor's; they are those of :func:`check_number`, in order."""
+    compare = (operator.gt, operator.ge, operator.lt, operator.le)
+    return [kept(value, limit) for kept, limit in zip(compare, limits, strict=True) if limit is not None]
 
 
 def _range(above=None, least=None, below=None, most=None, infinite: bool = False) -> str:

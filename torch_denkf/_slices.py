@@ -6,7 +6,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-__all__ = ["as_rows", "device_of", "starts_of"]
+__all__ = ["as_rows", "device_of", "one_earlier", "starts_of"]
 
 #: What marks the last element of an episode.
 _ENDS = ("done", "truncated")
@@ -54,6 +54,12 @@ def as_rows(tensordict: TensorDictBase, new: Tensor | None) -> tuple[TensorDictB
         if size % length == 0 and marks[::length][1:].all():
             return tensordict.reshape(-1, length), new.reshape(-1, length, 1)
     return tensordict, new
+
+
+def one_earlier(value: Tensor, time: int) -> Tensor:
+    """Every element from one step before; the first stays where it is."""
+    count = value.shape[time]
+    return torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, count - 1)], time)
 
 
 def _either(first: Tensor | None, second: Tensor | None) -> Tensor | None:

@@ -21,7 +21,6 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.functional.kernels.small_system import on_gpu
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean, weighted_median, weighted_var
@@ -35,7 +34,7 @@ __all__ = [
     "is_samples",
     "is_summary",
     "kinds_of",
-    "moments_on",
+    "moments_of",
     "summary_keys",
 ]
 
@@ -44,11 +43,18 @@ _FARTHEST = 1000.0
 _SUMMARIES = ("mean", "var")
 
 
-def moments_on(space: Space, ensemble: Tensor, log_weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Returns the mean ``[*B, P]`` of members ``[*B, E, P]``, and the variances ``[*B, D]`` of their tangents there."""
-    mean = space.mean(ensemble, None if log_weights is None else log_weights.exp())
-    away = space.minus(ensemble, mean.unsqueeze(-2))
-    return mean, ensemble_var(away) if log_weights is None else weighted_var(away, log_weights)
+def moments_of(
+    ensemble: Tensor, log_weights: Tensor | None = None, space: Space | None = None
+) -> tuple[Tensor, Tensor]:
+    """Returns the mean of members ``[*B, E, S]``, and their variances; on a space those of their tangents there."""
+    if space is not None:
+        mean = space.mean(ensemble, None if log_weights is None else log_weights.exp())
+        away = space.minus(ensemble, mean.unsqueeze(-2))
+        return mean, ensemble_var(away) if log_weights is None else weighted_var(away, log_weights)
+    if log_weights is not None:
+        return weighted_mean(ensemble, log_weights), weighted_var(ensemble, log_weights)
+    mean = ensemble_mean(ensemble)
+    return mean, ensemble_var(ensemble, mean)
 
 
 class Belief:
@@ -110,14 +116,14 @@ class Belief:
         Returns:
             The entries that change.
         """
-        factor = self._factor(held, ceiling)
-        out = {"mean": self._within_reach(held["mean"], ceiling), "var": held["var"] * factor.square()}
+        out = {"mean": self._within_reach(held["mean"], ceiling), "var": held["var"].clamp(max=ceiling)}
         if "cov" in held:
+            factor = self._factor(held, ceiling)
             out["cov"] = held["cov"] * factor.unsqueeze(-1) * factor.unsqueeze(-2)
         return out
 
     def _factor(self, held: Mapping[str, Tensor], ceiling: float) -> Tensor:
-        return (held["var"] / ceiling).clamp(min=1).rsqrt()
+        return (held["var"].detach() / ceiling).clamp(min=1).rsqrt()  # a constant to the gradient
 
     def _within_reach(self, mean: Tensor, ceiling: float) -> Tensor:
         farthest = _FARTHEST * sqrt(ceiling)
@@ -158,21 +164,12 @@ class Ensemble(Belief):
 
     def limited(self, held, ceiling):
         """Moves the members with their mean and variances; where nothing is clamped, not even by rounding."""
-        if self.space is None and "cov" not in held and on_gpu(held["mean"]):
-            # In few launches: a factor of one leaves all digits. It is a constant to the gradient.
-            factor = (held["var"].detach() / ceiling).clamp_(min=1).rsqrt_().unsqueeze(-2)
-            now = self._within_reach(held["mean"], ceiling)
-            moved = torch.lerp(now.unsqueeze(-2), held["ensemble"] - (held["mean"] - now).unsqueeze(-2), factor)
-            return {"mean": now, "var": held["var"].clamp(max=ceiling), "ensemble": moved}
-        out, factor, mean = super().limited(held, ceiling), self._factor(held, ceiling), held["mean"].unsqueeze(-2)
-        ensemble, now = held["ensemble"], out["mean"].unsqueeze(-2)
-        if self.space is None:
-            same = (factor.unsqueeze(-2) == 1) & (now == mean)
-            moved = now + (ensemble - mean) * factor.unsqueeze(-2)
-        else:
-            same = (factor == 1).all(-1)[..., None, None]
-            moved = self.space.plus(mean, self.space.minus(ensemble, mean) * factor.unsqueeze(-2))
-        return {**out, "ensemble": torch.where(same, ensemble, moved)}
+        out, ensemble, mean = super().limited(held, ceiling), held["ensemble"], held["mean"].unsqueeze(-2)
+        factor, now = self._factor(held, ceiling).unsqueeze(-2), out["mean"].unsqueeze(-2)
+        if self.space is None:  # a factor of one leaves all digits
+            return {**out, "ensemble": torch.lerp(now, ensemble - (mean - now), factor)}
+        moved = self.space.plus(mean, self.space.minus(ensemble, mean) * factor)
+        return {**out, "ensemble": torch.where((factor == 1).all(-1, keepdim=True), ensemble, moved)}
 
 
 class Particles(Belief):
@@ -183,11 +180,7 @@ class Particles(Belief):
     def derived(self, name, *carried):
         """Computes the weighted mean and variances."""
         ensemble, log_weight = carried
-        if name not in _SUMMARIES:
-            return None
-        if self.space is not None:
-            return moments_on(self.space, ensemble, log_weight)[_SUMMARIES.index(name)]
-        return (weighted_mean if name == "mean" else weighted_var)(ensemble, log_weight)
+        return dict(zip(_SUMMARIES, moments_of(ensemble, log_weight, self.space), strict=True)).get(name)
 
     def finite(self, name, value):
         """Tells whether points and weights are finite; a weight may be zero."""
@@ -198,11 +191,10 @@ class Particles(Belief):
 
         The others are what is known, and an observation will tell. On a space particles stay.
         """
-        factor = self._factor(held, ceiling)
-        out = {"var": held["var"] * factor.square()}
+        out = {"var": held["var"].clamp(max=ceiling)}
         if self.space is not None:
             return out
-        points, weights, exceeded = held["ensemble"], held["log_weight"], factor < 1
+        points, weights, exceeded = held["ensemble"], held["log_weight"], held["var"] > ceiling
         centre = self._within_reach(weighted_median(points, weights), ceiling).unsqueeze(-2)
         near = points.clamp(centre - sqrt(ceiling), centre + sqrt(ceiling))
         points = torch.where(exceeded.unsqueeze(-2), near, points)

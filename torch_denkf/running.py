@@ -15,7 +15,6 @@ from torch_denkf.submodel import EXPLAINED, Call, Entries, Sensor, SubModel, rol
 
 __all__ = [
     "check_module",
-    "check_network",
     "in_sequences",
     "is_sequence",
     "marks_of",
@@ -42,16 +41,6 @@ def check_module(name: str, module: Any) -> None:
         raise TypeError(
             f"{name} must be a TensorDict module, such as those of torch_denkf.modules{hint}; got {module!r}"
         )
-
-
-def check_network(name: str, network: Any) -> None:
-    """Raises unless an argument can be called, as networks and functions can.
-
-    Raises:
-        TypeError: if it cannot; ``name`` is the argument's.
-    """
-    if not callable(network):
-        raise TypeError(f"{name} must be a network or a function of tensors; got {network!r}")
 
 
 def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> Entries:

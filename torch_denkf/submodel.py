@@ -112,7 +112,7 @@ class SubModel(Checked, TensorDictModule):
 
     def __init__(
         self,
-        network: nn.Module,
+        network: Callable[..., Any],
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey],
         *,

@@ -24,8 +24,8 @@ from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
 from torch_denkf.applications.car.odometry.streams import all_frames, lose_frames, shortest_spans
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_gaussian
+from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.metrics import interval_coverage, nees, spread_skill_ratio, state_errors
-from torch_denkf.metrics.consistency import gaussian_nll
 from torch_denkf.training import hold_last
 
 MASKS = 8  # draws of the missing frames, over which the errors are averaged
@@ -152,7 +152,7 @@ def calibration(belief: TensorDict) -> dict[str, float]:
         "coverage90_theta_dot": float(covered[1]),
         "crps_v_m_per_s": float(crps[0]),
         "crps_theta_dot_deg_per_s": float(crps[1].rad2deg()),
-        "nll": float(gaussian_nll(mean, covariance, truth).mean()),
+        "nll": float(-gaussian_log_prob(truth, mean, covariance).mean()),
         "nees": float(nees(mean, covariance, truth).mean),
         "spread_skill": float(spread_skill_ratio(mean, variance, truth, members).mean()),
     }

@@ -1,6 +1,6 @@
 """Runs every pair in a process of its own, one after the other, and writes the report.
 
-python -m benchmarks.speed                      # all pairs: results/speed.{md,json}, docs/speed.png
+python -m benchmarks.speed                      # all pairs: results/speed.{md,json}, docs/pictures/speed.png
 python -m benchmarks.speed --only against_textbook packaged_step
 """
 
@@ -113,7 +113,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=12.0, help="to spend on each comparison (default: 12)")
     parser.add_argument("--only", nargs="+", default=PAIRS, choices=PAIRS, help="run these pairs, keep other rows")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results", help="folder of the results")
-    parser.add_argument("--plot", type=Path, default=ROOT / "docs" / "speed.png")
+    parser.add_argument("--plot", type=Path, default=ROOT / "docs" / "pictures" / "speed.png")
     parser.add_argument(
         "--no-compile", action="store_true", help="leave out compiled sequences: minutes each to compile"
     )

@@ -1,6 +1,6 @@
 """The analysis for S = O = 10 to a million: time, memory and digits; 32 members, diagonal R, one thread.
 
-    python -m benchmarks.speed.scaling --out benchmarks/speed/results/scaling.md --plot docs/scaling.png
+    python -m benchmarks.speed.scaling --out benchmarks/speed/results/scaling.md --plot docs/pictures/scaling.png
 
 Time: processor time of a call, median of rounds that go through all sizes in turn. Memory: what torch's allocator
 holds at most during a call (torch.profiler, every allocation and release), plus the call's arguments; for the largest

@@ -18,8 +18,8 @@ from tests.filters.gaussian_for_tests import directional_check, known_process_no
 from tests.functional.checks import assert_compiled_is_eager
 from tests.smoothers.joint import COV, MEAN, drive
 from torch_denkf.baselines import IEnKS
+from torch_denkf.baselines.iterated_smoothing import iterated_smoothing
 from torch_denkf.functional import analyse
-from torch_denkf.functional.smoothing.iterated import iterated_smoothing
 from torch_denkf.modules import (
     ConstantNoise,
     GaussianPrior,

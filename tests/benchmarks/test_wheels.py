@@ -18,12 +18,9 @@ def test_sensors_read_at_their_rates(data):
 
 
 @pytest.mark.slow
-def test_few_members_are_as_honest_as_the_kalman_filter_where_chance_is_not_believed(data):
-    """20 s are 2,400 updates. The table of the study says the same of 60 s."""
-    kalman, plain = row(gaussian_filter(), data), row(ensemble_filter(64), data)
-    honest = row(ensemble_filter(64, localisation="significance"), data)
-    assert min(plain[name] for name in ("x", "y", "heading")) < 0.4
-    assert all(honest[name] > 0.7 for name in NAMES)
-    # Eight runs: 10 % of a root mean square error are within what other members give.
-    assert honest["error_x"] + honest["error_y"] < 1.25 * (kalman["error_x"] + kalman["error_y"])
-    assert plain["error_x"] + plain["error_y"] > 1.5 * (honest["error_x"] + honest["error_y"])
+def test_thirty_two_members_with_exact_draws_are_the_extended_kalman_filter(data):
+    """20 s are 2,400 updates. The table of the study says the same of 60 s; random draws give 20 times the error."""
+    kalman, ensemble = row(gaussian_filter(), data), row(ensemble_filter(32), data)
+    # Eight runs: the standard error of a share is a few hundredths, both filters read the same.
+    assert [ensemble[name] for name in NAMES] == pytest.approx([kalman[name] for name in NAMES], abs=0.08)
+    assert ensemble["error_x"] + ensemble["error_y"] < 1.1 * (kalman["error_x"] + kalman["error_y"])

@@ -16,6 +16,7 @@ from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.particle_for_tests import bootstrap
 from torch_denkf.applications.car import track
 from torch_denkf.applications.car.kitti.gaps import bridge_gaps
+from torch_denkf.applications.car.modules.member_gain import MemberGain
 from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
 from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.applications.car.odometry.training import train_car_filter
@@ -24,7 +25,6 @@ from torch_denkf.data import Episode, EpisodeReplay
 from torch_denkf.deployment.folder import WEIGHTS, described, load_folder, save_folder
 from torch_denkf.envs import ReplayEnv
 from torch_denkf.modules import LearnedTransition, NoisyTransition
-from torch_denkf.modules.noise import MemberGain
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, TransitionLoss
 from torch_denkf.pretrained import from_pretrained, save_pretrained
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother

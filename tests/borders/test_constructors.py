@@ -10,6 +10,7 @@ from torch import nn
 
 from tests.filters.gaussian_for_tests import linear_filter
 from torch_denkf.applications.car import FlowSensor, UnicycleMotion, UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car.modules.member_gain import MemberGain
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.baselines.lstm_cell import LSTMUpdate
 from torch_denkf.envs import LinearGaussianEnv
@@ -40,7 +41,6 @@ from torch_denkf.modules import (
     UKFTransition,
     VectorSensor,
 )
-from torch_denkf.modules.noise import MemberGain
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition
 from torch_denkf.modules.stochastic import FlipoutLinear
 

@@ -136,7 +136,7 @@ def rejecting(name, **options):
 
 
 def same(filter, got, expected):
-    keys = [*filter.belief_keys, *filter.log_likelihood_keys]
+    keys = [*filter.belief_keys, *filter.structure.likelihoods]
     for key in keys:
         assert got[key].isfinite().all(), key
         torch.testing.assert_close(got[key], expected[key], rtol=0, atol=0, msg=lambda text, key=key: f"{key}: {text}")

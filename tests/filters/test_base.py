@@ -50,7 +50,8 @@ def test_parts():
     part = filter[1:3]
     assert type(part) is TensorDictSequential
     assert list(part) == [filter["noise"], filter["transition"]]
-    assert [filter.frame_modules, [filter.transition_module], filter.update_modules] == [
+    structure = filter.structure
+    assert [[part for _, part in parts] for parts in (structure.frames, [structure.transition], structure.update)] == [
         [filter["sensor"], filter["noise"]],
         [filter["transition"]],
         [filter["observation"], filter["analysis"]],
@@ -74,7 +75,7 @@ def test_modules_are_sorted_by_their_keys_whatever_their_order(float64):
     # The sensor behind the transition: still a frame module.
     order = ("transition", "sensor", "observation", "noise", "analysis")
     other = Filter({name: filter[name] for name in order}, initial=filter.initial)
-    assert other.frame_modules == [filter["sensor"], filter["noise"]]
+    assert [part for _, part in other.structure.frames] == [filter["sensor"], filter["noise"]]
     assert_equal(other.sequence(frames.copy()), filter.sequence(frames.copy()), filter.out_keys)
 
 

@@ -233,7 +233,7 @@ def test_two_analyses_are_the_kalman_filter_of_both_readings(float64, scheme, wa
     # Five standard errors of 20,000 members, of the mean and of the variance.
     torch.testing.assert_close(out["belief", "mean"], exact["belief", "mean"], rtol=0, atol=0.06)
     torch.testing.assert_close(out["belief", "var"], exact["belief", "var"], rtol=0.07, atol=0.01)
-    likelihood = sum(out[key] for key in filter.log_likelihood_keys)
+    likelihood = sum(out[key] for key in filter.structure.likelihoods)
     torch.testing.assert_close(likelihood, exact["info", "log_likelihood"], rtol=0, atol=0.1)
     own = [out["info", name, "log_likelihood"] for name in ("a0", "a1")]
     torch.testing.assert_close(own[0] + own[1], out["info", "log_likelihood"])

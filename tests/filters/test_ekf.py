@@ -69,7 +69,7 @@ def test_keys_and_modules(name):
     filter = learned_filter(name)
     assert filter.carry_keys == [("belief", "mean"), ("belief", "cov")]
     assert filter.belief_keys == BELIEF
-    assert len(filter.frame_modules) == 2, "sensor and R run once on all frames"
+    assert len(filter.structure.frames) == 2, "sensor and R run once on all frames"
     assert filter.transition_module is filter["transition"]
 
 

@@ -87,7 +87,7 @@ def test_analyses_inside_sequences_count_all_or_are_refused(float64):
     frames.update({"y0": frames["observation"][..., :1], "y1": frames["observation"][..., 1:]})
     out, exact = filter.sequence(frames.copy()), both.sequence(frames.copy())
     close(out, exact, [MEAN, VAR])
-    likelihood = sum(out[key] for key in filter.log_likelihood_keys)
+    likelihood = sum(out[key] for key in filter.structure.likelihoods)
     torch.testing.assert_close(likelihood[:, 1:], exact["info", "log_likelihood"][:, 1:])
 
 

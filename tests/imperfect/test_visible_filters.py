@@ -15,9 +15,9 @@ from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.particle_for_tests import bootstrap
 from torch_denkf import EKF, UKF, DEnKF, DEnKFTransform, ParticleFilter
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.functional.mixture import mix_moments
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import Visibility, Visible
+from torch_denkf.imperfect.mixture import mix_moments
 from torch_denkf.modules import (
     DiagonalNoise,
     EKFAnalysis,

@@ -13,7 +13,7 @@ from torch_denkf.metrics import (
     spread_skill_ratio,
     state_errors,
 )
-from torch_denkf.metrics.calibration import rank_histogram, spread_error
+from torch_denkf.plots.histograms import rank_histogram, spread_error
 
 
 def problem():

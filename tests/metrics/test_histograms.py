@@ -11,7 +11,8 @@ from tests.functional.checks import assert_refused
 from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.metrics import pit, spread_skill_ratio
-from torch_denkf.metrics.calibration import ensemble_interval, histogram_band, rank_histogram, spread_error
+from torch_denkf.metrics.calibration import ensemble_interval
+from torch_denkf.plots.histograms import histogram_band, rank_histogram, spread_error
 
 
 def rng(seed=0):

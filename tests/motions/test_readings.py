@@ -140,7 +140,7 @@ def test_states_of_another_size_are_refused(make):
         (lambda: Gravity(SE2()), r"Gravity reads a part that is SO3\(\) or SE3\(\) or SE23\(\); part 0 of SE2\(\)"),
         (lambda: Gravity(7), "space of Gravity"),
         (lambda: Gravity(SO3(), gravity=-1.0), "gravity must be"),
-        (lambda: Gravity(INERTIAL, part=3), "part must be a whole number, at least 0; got 3|at most 2; got 3"),
+        (lambda: Gravity(INERTIAL, part=3), "part must be a whole number, at least 0 and at most 2; got 3"),
         (lambda: Magnetic(SO3(), [1.0, 2.0]), r"field is \[3\]; got \[2\]"),
         (lambda: PositionInBody(SO3(), [1.0, 2.0, 3.0]), "PositionInBody reads a part"),
         (lambda: PositionInBody(SE3(), [1.0, 2.0]), r"landmark is \[3\] or \[2, 3\]; got \[2\]"),

@@ -29,8 +29,11 @@ PROGRAMS = ("ppo", "sac", "ddpg")
 
 
 def code(name):
-    blocks = (match["code"] for match in BLOCK.finditer(PAGE.read_text()))
-    return dict(zip(PROGRAMS, blocks, strict=False))[name]  # what comes behind them is of simulators
+    setup, *blocks = (match["code"] for match in BLOCK.finditer(PAGE.read_text()))
+    parts = dict(zip(PROGRAMS, blocks, strict=False))  # what comes behind them is of simulators
+    before, _, after = parts["sac"].partition("head = ")
+    parts["ddpg"] = before + parts["ddpg"] + after[after.index("loss.make_value_estimator") :]
+    return setup + parts[name]
 
 
 @cache

@@ -9,8 +9,8 @@ from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import ensemble_run, kalman_runs
 from torch_denkf.metrics import pit
-from torch_denkf.metrics.calibration import histogram_band, rank_histogram
 from torch_denkf.plots import plot_calibration, plot_spread_error
+from torch_denkf.plots.histograms import histogram_band, rank_histogram
 
 
 def bars(axes):

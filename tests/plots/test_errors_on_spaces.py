@@ -9,8 +9,8 @@ from tests.functional.checks import assert_refused
 from tests.plots.test_bands_of_spaces import SPACE
 from torch_denkf.functional.manifolds import SO3, Euclidean
 from torch_denkf.metrics import pit
-from torch_denkf.metrics.calibration import rank_histogram, spread_error
 from torch_denkf.plots import plot_calibration, plot_spread_error
+from torch_denkf.plots.histograms import rank_histogram, spread_error
 
 RUNS, E = 400, 9
 

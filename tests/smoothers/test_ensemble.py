@@ -239,7 +239,7 @@ def test_compiled_functions_are_the_eager_ones():
 def test_what_cannot_be_smoothed_says_so():
     assert_refused(TypeError, "EnRTS takes a filter with an ensemble", EnRTS, linear_kalman())
     assert_refused(TypeError, "EnKS takes a filter with an ensemble", EnKS, linear_kalman())
-    with pytest.raises(TypeError, match="takes a filter with a mean and a covariance; DEnKF has none"):
+    with pytest.raises(TypeError, match="takes a filter with a mean and a covariance; DEnKF carries"):
         RTSSmoother(linear_denkf())
     assert_refused(ValueError, "at least 1", FixedLag, linear_denkf(), 0)
     assert_refused(ValueError, "lag must be a whole number, at least 0; got -1", EnRTS, linear_denkf(), -1)

@@ -12,33 +12,31 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number
+from torch_denkf.baselines.iterated_smoothing import iterated_smoothing
+from torch_denkf.beliefs import moments_of
 from torch_denkf.functional import analyse
 from torch_denkf.functional.draws import exact_draws
-from torch_denkf.functional.inflation import inflate, random_rotation
+from torch_denkf.functional.inflation import inflate
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.functional.smoothing.iterated import iterated_smoothing
 from torch_denkf.modules.around import AugmentedBelief
+from torch_denkf.modules.ensemble import Rotated
 from torch_denkf.modules.gaussian import further_keys
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.modules.spaces import mean_reading, told
 from torch_denkf.running import check_module, random_parts, run_module
-from torch_denkf.smoothers.past import moments_of
-from torch_denkf.submodel import Call, Entries, Initial, Update, flat_noise, role
+from torch_denkf.submodel import Call, Entries, Initial, flat_noise, role
 
 __all__ = ["IteratedAnalysis", "with_smoothed"]
 
 _SMOOTHED = ("ensemble", "mean", "var", "age")
 
 
-def with_smoothed(
-    initial: TensorDictModuleBase, *, belief_prefix: str = "belief", smoothed_prefix: str = "smoothed"
-) -> AugmentedBelief:
+def with_smoothed(initial: TensorDictModuleBase, *, belief_prefix: str = "belief") -> AugmentedBelief:
     """An initial belief that is also what is believed of the state before it.
 
     Args:
         initial: writes ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]`` under ``belief_prefix``.
         belief_prefix: see there.
-        smoothed_prefix: prefix of the same, and of ``age`` ``[*B, 1]``, 0 steps.
 
     Example:
         >>> from tensordict import TensorDict
@@ -47,7 +45,7 @@ def with_smoothed(
         >>> start(TensorDict({}))["smoothed", "age"]
         tensor([0])
     """
-    keys: list[NestedKey] = [(smoothed_prefix, name) for name in _SMOOTHED]
+    keys: list[NestedKey] = [("smoothed", name) for name in _SMOOTHED]
     follow = partial(_twice, belief_prefix, tuple(keys), role(initial, Initial).space)
     return AugmentedBelief(initial, [], _nothing, follow_keys=keys, follow=follow)
 
@@ -65,11 +63,11 @@ def _twice(prefix: str, keys: Sequence[NestedKey], space: Space | None, belief: 
     return [ensemble, *moments, torch.zeros_like(ensemble[..., 0, :1], dtype=torch.int64)]
 
 
-class IteratedAnalysis(Update):
+class IteratedAnalysis(Rotated):
     r"""Finds from where the reading says that the last step began, and makes the step anew from there.
 
     Gauss-Newton steps in the space of the members, each with a run of transition and observation; see
-    :func:`~torch_denkf.functional.smoothing.iterated.iterated_smoothing`. Where the motion has Gaussian noise, the
+    :func:`~torch_denkf.baselines.iterated_smoothing.iterated_smoothing`. Where the motion has Gaussian noise, the
     noise of each member is part of what is looked for (Sakov, Haussaire & Bocquet 2018).
 
     Args:
@@ -85,8 +83,8 @@ class IteratedAnalysis(Update):
         observation_key: learned observations ``[*B, E, O]``, whose mean is used, or one reading ``[*B, O]``.
         noise_variance_key: variances ``[*B, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
-        belief_prefix: prefix of what is written of the new time: ``ensemble``, ``mean``, ``var``.
-        smoothed_prefix: prefix of the same of the time before, and of ``age`` ``[*B, 1]``, 1 step.
+        belief_prefix: prefix of what is written of the new time: ``ensemble``, ``mean``, ``var``; of the time before
+            the same stand under ``"smoothed"``, with ``age`` ``[*B, 1]``, 1 step.
         info_prefix: prefix of ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``, of the forecast
             that has not seen the reading.
 
@@ -110,7 +108,6 @@ class IteratedAnalysis(Update):
         noise_variance_key: NestedKey = ("sensor", "noise"),
         observed_key: NestedKey = "observed",
         belief_prefix: str = "belief",
-        smoothed_prefix: str = "smoothed",
         info_prefix: str = "info",
     ):
         check_module("transition", transition)
@@ -121,7 +118,7 @@ class IteratedAnalysis(Update):
         self_made = [ensemble_key, *map(unravel_key, transition.out_keys)]
         further, optional = further_keys([transition, observation], [*self_made, observation_key, noise_variance_key])
         out_keys = [(belief_prefix, name) for name in ("ensemble", "mean", "var")]
-        out_keys += [(smoothed_prefix, name) for name in _SMOOTHED]
+        out_keys += [("smoothed", name) for name in _SMOOTHED]
         out_keys += [(info_prefix, name) for name in ("innovation", "nis", "log_likelihood")]
         super().__init__(
             nn.ModuleDict({"transition": transition, "observation": observation}),
@@ -133,21 +130,6 @@ class IteratedAnalysis(Update):
         self.space, self.reading_space = check_space("space", space), check_space("reading_space", reading_space)
         self.info_prefix, self.observed_key = info_prefix, unravel_key(observed_key)
         self.reading_keys = self.in_keys[1:3]
-
-    @property
-    def noise_names(self) -> tuple[str, ...]:
-        """Rotations, where wanted."""
-        return ("",) if self.rotate else ()
-
-    def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
-        """Draws rotations ``[*B, E, E]``."""
-        if not self.rotate or members is None:
-            return None
-        return random_rotation(members, tuple(batch_size), device=device, dtype=dtype, generator=generator)
-
-    def noise_sizes(self, ensemble, *_):
-        """E, from the ensemble."""
-        return {"members": ensemble.shape[-2]}
 
     def parts(self):
         """The transition, whose noise is looked for; the observation has none."""
@@ -216,10 +198,7 @@ class IteratedAnalysis(Update):
 
     def _after(self, smoothed, observed, rotation) -> torch.Tensor:
         """The smoothed members, inflated and rotated where anything was observed."""
-        changed = inflate(smoothed, self.inflation) if self.inflation != 1.0 else smoothed
-        if rotation is not None:
-            mean = changed.mean(-2, keepdim=True)
-            changed = mean + rotation @ (changed - mean)
+        changed = self.rotated(inflate(smoothed, self.inflation) if self.inflation != 1.0 else smoothed, rotation)
         return changed if observed is None else torch.where(observed.any(-1)[..., None, None], changed, smoothed)
 
 

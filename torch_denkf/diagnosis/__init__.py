@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from torch_denkf.diagnosis.behind import check_behind as check_behind
+from torch_denkf.diagnosis.brightness import look_at_brightness as look_at_brightness
 from torch_denkf.diagnosis.ceiling import CeilingReached
 from torch_denkf.diagnosis.check import check_analysis
 from torch_denkf.diagnosis.collapse import NarrowEnsemble

@@ -263,24 +263,9 @@ class Filter(Checked, TensorDictSequential):
         return [self.outer(key) for key in self.structure.belief]
 
     @property
-    def log_likelihood_keys(self) -> list[NestedKey]:
-        """The log-likelihoods that add up to that of all readings."""
-        return [self.outer(key) for key in self.structure.likelihoods]
-
-    @property
-    def frame_modules(self) -> list[TensorDictModuleBase]:
-        """The modules that read frames alone, and not the belief."""
-        return [module for _, module in self.structure.frames]
-
-    @property
     def transition_module(self) -> TensorDictModuleBase:
         """The module that forecasts the carry: the first that depends on the belief."""
         return self.structure.transition[1]
-
-    @property
-    def update_modules(self) -> list[TensorDictModuleBase]:
-        """The modules between the forecast and the belief."""
-        return [module for _, module in self.structure.update]
 
     def outer(self, key: NestedKey) -> NestedKey:
         """Returns the key of an entry outside of the filter: what the filter writes stands under the prefix."""

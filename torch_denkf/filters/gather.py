@@ -10,10 +10,11 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torch_denkf._registered import diagnosis
+from torch_denkf._slices import one_earlier
 from torch_denkf.filters.structure import KNOWN, RESUMES, Structure, previous_key
 from torch_denkf.submodel import Call, Entries
 
-__all__ = ["Rows", "gather_rows", "of_one_robot"]
+__all__ = ["Rows", "controls_of", "gather_rows", "of_one_robot"]
 
 
 class Rows(NamedTuple):
@@ -97,14 +98,22 @@ def gather_rows(
         known = entries.get(KNOWN, torch.ones_like(first))
         begins, inputs[RESUMES] = ~known, first & known
         inputs.update({previous_key(key): entries[previous_key(key)] for key in carry})
-    for key in structure.controls:  # stored one step earlier than they are read
-        if previous_key(key) in entries:
-            inputs[key] = entries[previous_key(key)]
-        elif key in inputs:
-            value = inputs[key]
-            inputs[key] = torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, size[-1] - 1)], time)
+    inputs.update(controls_of(structure, entries, time))
     before = {key: starts[key].select(time, 0) for key in carry}
     return Rows(size, inputs, begins, starts, stored, before)
+
+
+def controls_of(structure: Structure, entries: Entries, time: int) -> Entries:
+    """Returns what drives the step to each time, which is stored one step earlier than it is read.
+
+    Args:
+        structure: of the filter.
+        entries: of a sequence.
+        time: the dimension of time.
+    """
+    moved = {key: one_earlier(entries[key], time) for key in structure.controls if key in entries}
+    kept = {key: entries[previous_key(key)] for key in structure.controls if previous_key(key) in entries}
+    return moved | kept
 
 
 def _or_first(marks: Tensor | None, size: torch.Size, device: torch.device) -> Tensor:

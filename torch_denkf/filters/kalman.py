@@ -87,15 +87,10 @@ class KalmanFilter(Filter):
         size, readings = len(f), len(h) if h.ndim else 0
         check_shape("observation", h, (readings, size), "[O, S]")
         check_shape("mean", m, (size,), "[S]")
-        for name, value in {"transition": f, "observation": h, "mean": m}.items():
-            check_values(name, value)
-        check_covariance("cov", p, size)
+        check_values("transition", f)
+        check_values("observation", h)
         q = _covariance("process_noise", constants, size, "[S]")
         r = _covariance("noise", constants, readings, "[O]")
-        if control is not None:
-            b = as_floating(control, "control")
-            check_shape("control", b, (size, b.shape[-1] if b.ndim else 0), "[S, A]")
-            check_values("control", b)
         check_kind("sensor_error", sensor_error)
         if sensor_error is not None:
             f, h, q, m, p, control = sensor_error.augmented_matrices(f, h, q, m, p, control)

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from typing import NamedTuple, TypeGuard
 
 from tensordict import NestedKey, unravel_key
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.beliefs import Belief, complete, kinds_of, summary_keys
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.running import (
     in_sequences,
-    is_sequence,
-    named_modules_of,
     reads,
     reads_of,
     writes,
 )
 from torch_denkf.submodel import Entries, Initial, Update, in_role, role
 
-__all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "previous_key", "sequences_in"]
+__all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "previous_key"]
 
 #: A module and its place in the filter, which names its noise.
 Placed = tuple[str, TensorDictModuleBase]
@@ -40,14 +38,6 @@ def previous_key(key: NestedKey) -> tuple[str, ...]:
 def takes_reading(module: TensorDictModuleBase) -> TypeGuard[Update]:
     """Tells whether a module is an update with a reading and an observed mask."""
     return isinstance(module, Update) and bool(module.reading_keys) and module.observed_key is not None
-
-
-def sequences_in(sequence: TensorDictSequential) -> Iterator[TensorDictSequential]:
-    """A filter, and the plain sequences inside it."""
-    yield sequence
-    for _, module in named_modules_of(sequence):
-        if is_sequence(module):
-            yield from sequences_in(module)
 
 
 class Structure(NamedTuple):

@@ -17,10 +17,17 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape, check_shapes
+from torch_denkf._checks import (
+    check_choice,
+    check_ensemble,
+    check_observed,
+    check_one_dtype,
+    check_shape,
+    check_shapes,
+)
 from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
 from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
-from torch_denkf.functional.kernels.small_system import LARGEST, on_gpu, solve_written_out
+from torch_denkf.functional.kernels.small_system import WrittenOut, is_written_out, on_gpu
 from torch_denkf.functional.linalg import Solver, inverse_square_root_difference
 
 Scheme = Literal["sensor", "perturbed", "etkf", "sakov"]
@@ -185,19 +192,15 @@ def check_analysis_arguments(
     if not fits or not forecast.dtype == predicted.dtype == observation.dtype == noise.dtype:
         _check_entries(forecast, predicted, observation, noise)
     (size,), (dim,) = size, dim
-    if scheme not in get_args(Scheme):
-        raise ValueError(f"scheme must be one of {', '.join(get_args(Scheme))}, got {scheme!r}")
-    if space not in get_args(Space):
-        raise ValueError(f"space must be one of {', '.join(get_args(Space))}, got {space!r}")
+    check_choice("scheme", scheme, get_args(Scheme))
+    check_choice("space", space, get_args(Space))
     if scheme == "sensor" and observation.ndim != forecast.ndim:
         raise ValueError(
             f"scheme 'sensor' needs one observation a member, [*B, E, O], got {list(observation.shape)}; "
             "use 'perturbed', 'etkf' or 'sakov' for a single observation"
         )
     if observed is not None:
-        check_mask("observed", observed)
-        width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
-        check_shape("observed", observed, (*batch, width), "[*B, 1] or [*B, O]")
+        check_observed(observed, batch, dim)
     if perturbation is not None:
         if scheme != "perturbed":
             raise ValueError(f"perturbation is for scheme 'perturbed', not {scheme!r}; leave it out")
@@ -259,11 +262,8 @@ def _observation_space(
     transformed = None
     if square_root:
         transformed = anomalies + normalised @ (inverse_square_root_difference(gram) @ cross)
-    if torch.compiler.is_compiling() and gram.shape[-1] <= LARGEST:
-        increment, square, log_det = solve_written_out(gram, cross, acted_on, mean_shift)
-        return increment, transformed, square, log_det
-    solver = Solver(gram, ridge=1)  # with S, eq. 9
-    increment = acted_on @ solver.solve(cross)  # by the gain K, eq. 11
+    solver = (WrittenOut if is_written_out(gram) else Solver)(gram, ridge=1)  # with S, eq. 9
+    increment = solver.between(acted_on, cross)  # by the gain K, eq. 11
     return increment, transformed, solver.square(mean_shift.mT), solver.log_det()
 
 

@@ -5,13 +5,14 @@ linear algebra of the extended Kalman filter, whose matrices are Jacobians.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_denkf._checks import check_mask, check_one_dtype, check_shape, check_shapes
-from torch_denkf.functional.kernels.small_system import LARGEST, gain_written_out
+from torch_denkf._checks import check_observed, check_one_dtype, check_shape, check_shapes
+from torch_denkf.functional.kernels.small_system import WrittenOut, is_written_out
 from torch_denkf.functional.linalg import Solver, as_covariance
 
 
@@ -112,18 +113,11 @@ def kalman_update(
     batch, state_dim, dim = mean.shape[:-1], mean.shape[-1], observation.shape[-1]
     if noise.ndim == mean.ndim:
         noise = as_covariance(noise, mean)
-    identity = torch.eye(dim, dtype=mean.dtype, device=mean.device)
     count: int | Tensor = dim
     if observed is not None:
-        check_mask("observed", observed)
-        width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
-        check_shape("observed", observed, (*batch, width), "[*B, 1] or [*B, O]")
-        observed = observed.expand(observation.shape)
-        row, column = observed.unsqueeze(-1), observed.unsqueeze(-2)
+        observed, noise, count = hide(observed, noise.to(mean.dtype), (*batch, dim))
         observation = torch.where(observed, observation, 0)
-        observation_matrix = torch.where(row, observation_matrix, 0)
-        noise = torch.where(row & column, noise, identity)
-        count = observed.sum(-1, keepdim=True, dtype=mean.dtype)
+        observation_matrix = torch.where(observed.unsqueeze(-1), observation_matrix, 0)
 
     cross = observation_matrix @ cov  # HP
     innovation = observation - _apply(observation_matrix, mean)
@@ -132,6 +126,24 @@ def kalman_update(
     cov = keep @ cov @ keep.mT + gain @ noise @ gain.mT
     log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
     return GaussianUpdate(mean + _apply(gain, innovation), (cov + cov.mT) / 2, innovation, nis, log_likelihood)
+
+
+def hide(observed: Tensor, noise: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns a mask of each component, R ``[*B, O, O]`` with ones in the place of the others, and how many they are.
+
+    Args:
+        observed: ``[*B, 1]`` or ``[*B, O]``.
+        noise: R, ``[*B, O, O]``.
+        shape: ``[*B, O]``.
+
+    Raises:
+        ValueError: if the mask has another shape, or is not boolean.
+    """
+    check_observed(observed, shape[:-1], shape[-1])
+    observed = observed.expand(shape)
+    identity = torch.eye(shape[-1], dtype=noise.dtype, device=noise.device)
+    noise = torch.where(observed.unsqueeze(-1) & observed.unsqueeze(-2), noise, identity)
+    return observed, noise, observed.sum(-1, keepdim=True, dtype=noise.dtype)
 
 
 def _check_update(mean: Tensor, cov: Tensor, observation: Tensor, matrix: Tensor, noise: Tensor) -> None:
@@ -195,9 +207,7 @@ def solve_for_gain(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Ten
     Returns:
         Cᵀ M⁻¹, ``[*B, S, O]``; rᵀ M⁻¹ r and log det M, ``[*B, 1]`` each. NaN where M is not positive definite.
     """
-    if torch.compiler.is_compiling() and 0 < matrix.shape[-1] <= LARGEST:
-        return gain_written_out(matrix, cross, residual)
-    solver = Solver(matrix)
+    solver = (WrittenOut if is_written_out(matrix) else Solver)(matrix)
     return solver.solve(cross).mT, solver.square(residual.unsqueeze(-1)), solver.log_det()
 
 

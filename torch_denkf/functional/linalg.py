@@ -7,14 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from torch_denkf.functional.kernels.resolvents import sum_of_resolvents
-from torch_denkf.functional.kernels.small_system import (
-    LARGEST_FACTOR,
-    cholesky_solve_written_out,
-    cholesky_written_out,
-    forward_written_out,
-    inverse_of,
-    on_gpu,
-)
+from torch_denkf.functional.kernels.small_system import LARGEST_FACTOR, WrittenOut, inverse_of, is_written_out, on_gpu
 
 
 def cholesky(matrix: Tensor) -> Tensor:
@@ -37,8 +30,8 @@ def cholesky(matrix: Tensor) -> Tensor:
         >>> cholesky(torch.tensor([[[4.0]], [[-1.0]]])).flatten()
         tensor([2., nan])
     """
-    if torch.compiler.is_compiling() and 0 < matrix.shape[-1] <= LARGEST_FACTOR:
-        return cholesky_written_out(matrix)
+    if is_written_out(matrix, LARGEST_FACTOR):
+        return WrittenOut(matrix).factor()
     factor, info = torch.linalg.cholesky_ex(matrix)
     return torch.where((info == 0)[..., None, None], factor, torch.nan)
 
@@ -70,8 +63,8 @@ def whitened(rows: Tensor, cov: Tensor) -> Tensor:
     """Maps rows ``[*B, E, N]`` by the inverse Cholesky factor of their covariance; components without any become 0."""
     correlation, _, inverse = _correlation(cov)
     scaled = (rows * inverse.unsqueeze(-2)).mT
-    if torch.compiler.is_compiling() and cov.shape[-1] <= LARGEST_FACTOR:
-        return forward_written_out(correlation, scaled).mT
+    if is_written_out(correlation, LARGEST_FACTOR):
+        return WrittenOut(correlation).forward(scaled).mT
     return torch.linalg.solve_triangular(cholesky(correlation), scaled, upper=False).mT
 
 
@@ -112,9 +105,7 @@ def solve(matrix: Tensor, right: Tensor) -> Tensor:
         >>> solve(torch.tensor([[2.0, 1.0], [1.0, 1.0]]), torch.tensor([[1.0], [0.0]])).mT.round(decimals=4)
         tensor([[ 1., -1.]])
     """
-    if torch.compiler.is_compiling() and 0 < matrix.shape[-1] <= LARGEST_FACTOR:
-        return cholesky_solve_written_out(matrix, right)
-    return Solver(matrix).solve(right)
+    return (WrittenOut if is_written_out(matrix, LARGEST_FACTOR) else Solver)(matrix).solve(right)
 
 
 class Solver:
@@ -141,6 +132,10 @@ class Solver:
     def solve(self, right: Tensor) -> Tensor:
         """Returns M⁻¹ Y, ``[*B, N, K]``."""
         return self.inverse @ right if self.direct else torch.cholesky_solve(right, self.factor)
+
+    def between(self, left: Tensor, right: Tensor) -> Tensor:
+        """Returns D M⁻¹ Y, ``[*B, E, K]``, for D ``[*B, E, N]``."""
+        return left @ self.solve(right)
 
     def square(self, vector: Tensor) -> Tensor:
         """Returns rᵀ M⁻¹ r, ``[*B, 1]``, for r ``[*B, N, 1]``."""

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
+from torch_denkf.functional._whitened import whiten
 from torch_denkf.functional.analysis import check_significance, significant
 from torch_denkf.functional.linalg import inverse_square_root, solve
 
@@ -94,8 +95,6 @@ def neighbours(
         >>> neighbours(places, places, 0.5, period=torch.tensor([5.0])).index.sort().values.tolist()
         [[0, 1, 4], [0, 1, 2], [1, 2, 3], [2, 3, 4], [0, 3, 4]]
     """
-    if not radius > 0:
-        raise ValueError(f"radius must be positive, got {radius}")
     reach = 2 * math.sqrt(10 / 3) * radius
 
     def around(offset: Tensor, circle: Tensor | None) -> Tensor:
@@ -207,12 +206,8 @@ def letkf(
     check_shape("observation", observation, (*batch, count), "[*B, O]")
     check_shape("noise", noise, (*batch, count), "[*B, O]")
     check_shape("near.index", near.index, (dim, near.taper.shape[-1]), "[S, L]")
-    if observed is not None:
-        predicted = torch.where(observed.unsqueeze(-2), predicted, 0)
-        observation, noise = torch.where(observed, observation, 0), torch.where(observed, noise, 1)
-    predicted_mean = predicted.mean(-2, keepdim=True)
-    scale = (noise * (size - 1)).rsqrt().unsqueeze(-2)
-    normalised, shift = (predicted - predicted_mean) * scale, (observation.unsqueeze(-2) - predicted_mean) * scale
+    reading = whiten(predicted, observation.unsqueeze(-2), noise, observed)
+    normalised, shift = reading.normalised, reading.mean_shift
     mean = forecast.mean(-2, keepdim=True)
     anomalies = forecast - mean
     eye = torch.eye(size, dtype=forecast.dtype, device=forecast.device)

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
-from torch_denkf.functional.gaussian import GaussianUpdate, _check_moments, solve_for_gain
+from torch_denkf._checks import check_ensemble, check_one_dtype, check_shape
+from torch_denkf.functional.gaussian import GaussianUpdate, _check_moments, hide, solve_for_gain
 from torch_denkf.functional.linalg import as_covariance, semidefinite_root
 from torch_denkf.functional.manifolds import Space, check_space
 
@@ -120,7 +120,7 @@ def unscented_moments(
         tensor([1.])
     """
     mean, deviations = _deviations(points, weights, space)
-    return mean, _weighted_gram(deviations, weights.cov, deviations)
+    return mean, _weighted_gram(deviations, weights.cov)
 
 
 def unscented_anomalies(points: Tensor, images: Tensor, weights: UnscentedWeights) -> tuple[Tensor, Tensor, Tensor]:
@@ -187,7 +187,6 @@ def unscented_update(
         (tensor([1.0000]), tensor([[0.5000]]))
     """
     check_one_dtype(points=points, predicted=predicted, observation=observation, noise=noise)
-    check_mask("observed", observed)
     expected, deviations = _deviations(predicted, weights, space)
     check_ensemble("points", points)
     batch, dim = expected.shape[:-1], expected.shape[-1]
@@ -201,21 +200,16 @@ def unscented_update(
     innovation = observation - expected if space is None else space.minus(observation, expected)
     count: int | Tensor = dim
     if observed is not None:
-        width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
-        check_shape("observed", observed, (*batch, width), "[*B, 1] or [*B, O]")
-        observed = observed.expand(observation.shape)
-        identity = torch.eye(dim, dtype=points.dtype, device=points.device)
+        observed, noise, count = hide(observed, noise, (*batch, dim))
         innovation = torch.where(observed, innovation, 0)
         deviations = torch.where(observed.unsqueeze(-2), deviations, 0)
-        noise = torch.where(observed.unsqueeze(-1) & observed.unsqueeze(-2), noise, identity)
-        count = observed.sum(-1, keepdim=True, dtype=points.dtype)
     mean = points[..., 0, :]
     anomalies = points - mean.unsqueeze(-2)
     cross = deviations.mT @ (weights.cov.unsqueeze(-1) * anomalies)
-    predicted_cov = _weighted_gram(deviations, weights.cov, deviations) + noise
+    predicted_cov = _weighted_gram(deviations, weights.cov) + noise
     gain, nis, log_det = solve_for_gain(predicted_cov, cross, innovation)
     remaining = anomalies - deviations @ gain.mT
-    cov = _weighted_gram(remaining, weights.cov, remaining) + gain @ noise @ gain.mT
+    cov = _weighted_gram(remaining, weights.cov) + gain @ noise @ gain.mT
     mean = mean + (gain @ innovation.unsqueeze(-1)).squeeze(-1)
     log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
     return GaussianUpdate(mean, (cov + cov.mT) / 2, innovation, nis, log_likelihood)
@@ -245,6 +239,6 @@ def _deviations(points: Tensor, weights: UnscentedWeights, space: Space | None) 
     return center.squeeze(-2) + shift, deviations - shift.unsqueeze(-2)
 
 
-def _weighted_gram(left: Tensor, weights: Tensor, right: Tensor) -> Tensor:
-    gram = left.mT @ (weights.unsqueeze(-1) * right)
+def _weighted_gram(rows: Tensor, weights: Tensor) -> Tensor:
+    gram = rows.mT @ (weights.unsqueeze(-1) * rows)
     return (gram + gram.mT) / 2

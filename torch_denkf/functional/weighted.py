@@ -88,8 +88,8 @@ def weighted_median(particles: Tensor, log_weights: Tensor) -> Tensor:
 
 def weighted_innovation(
     predicted: Tensor, log_weights: Tensor, observation: Tensor, noise: Tensor, *, observed: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """The innovation of weighted particles, and its normalised square.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Computes the innovation of weighted particles, its normalised square, and the log-determinant of its covariance.
 
     The innovation is y − Σ wⁱ h(xⁱ). Its covariance is that of the predicted observations, with the factor of
     :func:`weighted_var`, plus R. For a linear Gaussian system and many particles both are the Kalman filter's.
@@ -102,26 +102,17 @@ def weighted_innovation(
         observed: boolean, ``[*B, 1]`` or ``[*B, O]``; where it is False, observation and noise may be NaN.
 
     Returns:
-        The innovation ``[*B, O]``, 0 where nothing was observed, and the NIS ``[*B, 1]`` over what was observed.
+        The innovation ``[*B, O]``, 0 where nothing was observed, and the NIS and the log-determinant, ``[*B, 1]``, over
+        what was observed.
 
     Raises:
         ValueError: if the shapes do not fit, or if there are fewer than two particles.
 
     Examples:
         >>> particles, weights = torch.tensor([[-1.0], [1.0]]), torch.tensor([0.5, 0.5]).log()
-        >>> innovation, nis = weighted_innovation(particles, weights, torch.tensor([4.0]), torch.tensor([2.0]))
+        >>> innovation, nis, _ = weighted_innovation(particles, weights, torch.tensor([4.0]), torch.tensor([2.0]))
         >>> print(f"{innovation.item():.1f} {nis.item():.1f}")
         4.0 4.0
-    """
-    return scored_innovation(predicted, log_weights, observation, noise, observed=observed)[:2]
-
-
-def scored_innovation(
-    predicted: Tensor, log_weights: Tensor, observation: Tensor, noise: Tensor, *, observed: Tensor | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """As :func:`weighted_innovation`, and behind it the log-determinant of the innovation's covariance, ``[*B, 1]``.
-
-    What was not observed adds nothing to it.
     """
     check_particles(predicted, log_weights, min_size=2)
     size, dim = predicted.shape[-2:]

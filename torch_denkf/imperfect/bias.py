@@ -243,7 +243,6 @@ class BiasedTransition(Wrapper, Transition):
     place = "transition"
 
     def __init__(self, transition: TensorDictModuleBase, bias: FadingBias):
-        check_module("transition", transition)
         super().__init__(transition)
         self.bias = bias
 
@@ -274,7 +273,6 @@ class BiasedNoise(Wrapper):
     place = "noise"
 
     def __init__(self, noise: TensorDictModuleBase, bias: FadingBias):
-        check_module("noise", noise)
         super().__init__(noise)
         self.bias = bias
 
@@ -316,7 +314,6 @@ class BiasedObservation(Wrapper):
     place = "observation"
 
     def __init__(self, observation: TensorDictModuleBase, bias: FadingBias, dims: Sequence[int] | None = None):
-        check_module("observation", observation)
         if dims is not None and len(dims) != len(bias):
             raise ValueError(f"dims names {len(dims)} components of the reading, and there are {len(bias)} biases")
         super().__init__(observation)

@@ -27,8 +27,8 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.beliefs import Ensemble, complete
 from torch_denkf.functional.manifolds import is_flat
-from torch_denkf.functional.mixture import log_mixture, mix_members, mix_moments, responsibility
-from torch_denkf.functional.weighted import scored_innovation
+from torch_denkf.functional.weighted import weighted_innovation
+from torch_denkf.imperfect.mixture import log_mixture, mix_members, mix_moments, responsibility
 from torch_denkf.modules.around import Around
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import mean_of_members
@@ -110,7 +110,7 @@ class Visible(Around):
     =====================  =============================================================================================
     mean and covariance    the mixture's, q (1 - q) d dᵀ of the way d between both means included
     ensemble               members with the mixture's mean and sample covariance, see
-                           :func:`~torch_denkf.functional.mixture.mix_members`; a past that is corrected, too
+                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a past that is corrected, too
     particles              the exact mixture: each particle's likelihood is one
     =====================  =============================================================================================
 
@@ -218,7 +218,7 @@ class Visible(Around):
             predicted, reading = self.module.reading_space.align(predicted, reading, mask)
         if reading.ndim == predicted.ndim:
             reading = reading.mean(-2)
-        innovation, nis, log_det = scored_innovation(predicted, prior, reading, variance, observed=mask)
+        innovation, nis, log_det = weighted_innovation(predicted, prior, reading, variance, observed=mask)
         count = torch.full_like(nis, innovation.shape[-1])
         if mask is not None:
             count = mask.expand(innovation.shape).sum(-1, keepdim=True, dtype=nis.dtype)

@@ -1,12 +1,10 @@
 """Does the spread of a belief say how wrong its mean is?
 
-Spread over skill, shares of intervals that hold the truth, and histograms that are flat for a calibrated belief. A
-truth that is NaN is not known, and does not count.
+Spread over skill, shares of intervals that hold the truth, and what is uniform for a calibrated belief. A truth that is
+NaN is not known, and does not count.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,28 +13,14 @@ from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.metrics.state import check_level, known_tangents, mean_of_known, state_difference
 
 __all__ = [
-    "SpreadError",
+    "around_mean",
+    "check_variance",
     "ensemble_interval",
     "ensemble_interval_coverage",
-    "histogram_band",
     "interval_coverage",
     "pit",
-    "rank_histogram",
-    "spread_error",
     "spread_skill_ratio",
 ]
-
-
-class SpreadError(NamedTuple):
-    """Holds the results of :func:`spread_error`.
-
-    Attributes:
-        spread: root mean square of the predicted standard deviation in each bin, ``[S, bins]``, ascending.
-        error: root mean square of the mean's error in the same bins, ``[S, bins]``.
-    """
-
-    spread: Tensor
-    error: Tensor
 
 
 def spread_skill_ratio(
@@ -75,15 +59,11 @@ def spread_skill_ratio(
         >>> spread_skill_ratio(members.mean(1), members.var(1), truth, 8).round(decimals=1)
         tensor([1.])
     """
-    space = check_space("space", space)
-    shape = mean.shape if space is None else (*mean.shape[:-1], space.tangent_dim)
-    if mean.shape != truth.shape or variance.shape != shape:
-        shapes = [list(part.shape) for part in (mean, variance, truth)]
-        kind = "one shape" if space is None else f"shapes of points of {space}, tangents and points"
-        raise ValueError(f"mean, variance and truth need {kind}; got {shapes}.")
+    difference = state_difference(mean, truth, space=space)
+    check_variance(variance, difference)
+    truth = known_tangents(truth, space)
     factor = 1.0 if ensemble_size is None else (ensemble_size + 1) / ensemble_size
-    square, truth = state_difference(mean, truth, space=space).square(), known_tangents(truth, space)
-    spread, error = (mean_of_known(values, truth) for values in (variance, square))
+    spread, error = (mean_of_known(values, truth) for values in (variance, difference.square()))
     return (factor * spread).sqrt() / error.sqrt()
 
 
@@ -119,7 +99,7 @@ def interval_coverage(
         tensor([0.7500])
     """
     error = state_difference(mean, truth, space=space)
-    _check_variance(variance, error)
+    check_variance(variance, error)
     check_level(level)
     quantile = torch.special.ndtri(torch.tensor(0.5 + level / 2, dtype=torch.float64)).item()
     return _share(quantile * variance.sqrt() - error.abs(), known_tangents(truth, space))
@@ -159,7 +139,7 @@ def ensemble_interval_coverage(
         >>> ensemble_interval_coverage(members, torch.tensor([[0.5], [18.5]]), level=0.9)  # from 0 to 18
         tensor([0.5000])
     """
-    members, offset = _around_mean(ensemble, truth, space)
+    members, offset = around_mean(ensemble, truth, space)
     lower, upper = ensemble_interval(members, level=level)
     return _share(torch.minimum(offset - lower, upper - offset), known_tangents(truth, space))
 
@@ -228,150 +208,12 @@ def pit(mean: Tensor, variance: Tensor, truth: Tensor, *, space: Space | None = 
         tensor([0.1000, 0.5000, 0.9000])
     """
     error = state_difference(truth, mean, space=space)
-    _check_variance(variance, error)
+    check_variance(variance, error)
     score = error / variance.sqrt()
     return torch.special.ndtr(torch.where((error == 0) & (variance == 0), 0.0, score))
 
 
-def rank_histogram(
-    ensemble: Tensor,
-    truth: Tensor,
-    *,
-    log_weight: Tensor | None = None,
-    space: Space | None = None,
-) -> Tensor:
-    """Counts how often the truth falls into each of the E+1 gaps between and beyond the sorted members.
-
-    The histogram is flat, up to chance, for a calibrated ensemble, Gaussian or not. It is high at both ends for an
-    overconfident one. A truth that equals some members counts in equal parts in all the gaps that they separate.
-
-    Args:
-        ensemble: ``[*B, E, S]``.
-        truth: ``[*B, S]``, in the same units.
-        log_weight: of particles, ``[*B, E]``. A particle of weight w counts as E w members of equal weight, and a truth
-            between two ranks in both. Without it, all members weigh the same.
-        space: whose points members and truth are; ``None`` for plain numbers. Tangents at the members' mean are ranked.
-
-    Returns:
-        Counts, ``[S, E+1]`` float64; each row sums to the number of states in ``*B``.
-
-    Raises:
-        ValueError: if the shapes do not fit, if a value is not finite, or for points of another space.
-
-    Reference:
-        Hamill 2001, "Interpretation of rank histograms for verifying ensemble forecasts", Mon. Weather Rev. 129.
-
-    Example:
-        >>> members = torch.tensor([[1.0], [2.0], [3.0]]).expand(4, 3, 1)
-        >>> rank_histogram(members, torch.tensor([[0.0], [2.5], [2.6], [2.0]]))
-        tensor([[1.0000, 0.5000, 2.5000, 0.0000]], dtype=torch.float64)
-    """
-    count = torch.ones_like(ensemble[..., :1], dtype=torch.float64)
-    if log_weight is not None:
-        if log_weight.shape != ensemble.shape[:-1]:
-            raise ValueError(f"log_weight must be [*B, E], {list(ensemble.shape[:-1])}; got {list(log_weight.shape)}")
-        count = log_weight.shape[-1] * log_weight.double().softmax(-1).unsqueeze(-1)
-    members, offset = _around_mean(ensemble, truth, space, count)
-    if not bool(members.isfinite().all() and offset.isfinite().all()):
-        raise ValueError("ensemble and truth must be finite; leave out the rows that are not")
-    offset, size = offset.unsqueeze(-2), members.shape[-2]
-    below = count.where(members < offset, 0.0).sum(-2).flatten(0, -2).T  # [S, N]
-    above = below + count.where(members == offset, 0.0).sum(-2).flatten(0, -2).T + 1
-    part = 1.0 / (above - below)
-    steps = torch.zeros(members.shape[-1], size + 3, dtype=torch.float64, device=members.device)
-    for edge, height in ((below, part), (above, -part)):  # each truth lies evenly on the ranks between its edges
-        whole = edge.floor().clamp(max=size + 1)
-        steps.scatter_add_(1, whole.long(), (1 - edge + whole) * height)
-        steps.scatter_add_(1, whole.long() + 1, (edge - whole) * height)
-    return steps.cumsum(1)[:, : size + 1]
-
-
-def histogram_band(samples: int, bins: int, *, level: float = 0.99) -> tuple[int, int]:
-    """Counts between which all bars of a flat histogram stay together with at least probability ``level``.
-
-    Each bar is binomial; by Bonferroni's bound each is granted a share (1 - level) / bins of being outside.
-
-    Args:
-        samples: independent samples in the histogram. Errors of successive steps are not independent: use every n-th.
-        bins: of the histogram.
-        level: probability of the band.
-
-    Returns:
-        The least and the largest count.
-
-    Raises:
-        ValueError: if ``level`` is not in (0, 1), or without samples or bins.
-
-    Example:
-        >>> histogram_band(1000, 10)
-        (70, 132)
-    """
-    check_level(level)
-    if samples < 1 or bins < 1:
-        raise ValueError(f"a histogram needs samples and bins; got {samples} samples and {bins} bins")
-    if bins == 1:
-        return samples, samples
-    counts = torch.arange(samples + 1, dtype=torch.float64)
-    ways = torch.lgamma(counts.max() + 1) - torch.lgamma(counts + 1) - torch.lgamma(samples - counts + 1)
-    share = torch.tensor(1 / bins, dtype=torch.float64)
-    mass = (ways + counts * share.log() + (samples - counts) * (1 - share).log()).exp()
-    tail = (1 - level) / bins / 2
-    low = int((mass.cumsum(0) <= tail).sum())
-    beyond = mass.flip(0).cumsum(0).flip(0) - mass  # P(count > k)
-    return low, int((beyond > tail).sum())
-
-
-def spread_error(
-    mean: Tensor,
-    variance: Tensor,
-    truth: Tensor,
-    *,
-    bins: int = 8,
-    ensemble_size: int | None = None,
-    space: Space | None = None,
-) -> SpreadError:
-    """Predicted spread and actual error, in bins of states with similar spread.
-
-    A filter that knows how wrong it is has spread = error in each bin.
-
-    Args:
-        mean: ``[*B, S]``.
-        variance: ``[*B, S]``; of an ensemble with divisor E-1.
-        truth: ``[*B, S]``, in the same units; what is NaN does not count.
-        bins: of equal size up to one state, by the rank of the spread.
-        ensemble_size: E, which scales the variance with (E+1)/E, see :func:`spread_skill_ratio`; ``None`` for a
-            distribution whose moments are exact.
-        space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. The variance is one of tangents.
-
-    Returns:
-        A :class:`SpreadError`, in the units of the state.
-
-    Raises:
-        ValueError: if the shapes differ, if a variance is negative, or if there are fewer states than bins.
-
-    Example:
-        >>> mean, truth = torch.zeros(4, 1), torch.tensor([[1.0], [-1.0], [3.0], [-3.0]])
-        >>> spread_error(mean, torch.tensor([[1.0], [1.0], [4.0], [4.0]]), truth, bins=2)
-        SpreadError(spread=tensor([[1., 2.]]), error=tensor([[1., 3.]]))
-    """
-    difference = state_difference(mean, truth, space=space)
-    _check_variance(variance, difference)
-    truth = known_tangents(truth, space)
-    known = ~truth.isnan().flatten(0, -2)
-    fewest = int(known.sum(0).min())
-    if not 1 <= bins <= fewest:
-        raise ValueError(f"{bins} bins need at least one state each; got {fewest} states whose truth is known")
-    factor = 1.0 if ensemble_size is None else (ensemble_size + 1) / ensemble_size
-    columns: tuple[list[Tensor], list[Tensor]] = ([], [])
-    for dim in range(truth.shape[-1]):
-        spread, square = (v.flatten(0, -2)[known[:, dim], dim] for v in (factor * variance, difference.square()))
-        order = spread.argsort()
-        for column, values in zip(columns, (spread, square), strict=True):
-            column.append(torch.stack([part.mean().sqrt() for part in values[order].tensor_split(bins)]))
-    return SpreadError(*map(torch.stack, columns))
-
-
-def _around_mean(
+def around_mean(
     ensemble: Tensor, truth: Tensor, space: Space | None, count: Tensor | float = 1.0
 ) -> tuple[Tensor, Tensor]:
     """Members and truth relative to the members' mean: ``[*B, E, S]`` and ``[*B, S]``.
@@ -392,7 +234,12 @@ def _around_mean(
     return ensemble - centre.unsqueeze(-2), truth - centre
 
 
-def _check_variance(variance: Tensor, error: Tensor) -> None:
+def check_variance(variance: Tensor, error: Tensor) -> None:
+    """Raises unless variances are those of an error: of its shape, and not negative.
+
+    Raises:
+        ValueError: if they are not.
+    """
     if variance.shape != error.shape:
         raise ValueError(
             f"variance must have the shape of the mean, {list(error.shape)}; got {list(variance.shape)}. If the states "

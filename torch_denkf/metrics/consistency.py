@@ -6,12 +6,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.distributions import MultivariateNormal, Normal
 
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.metrics.state import check_level, state_difference
 
-__all__ = ["NEES", "gaussian_nll", "nees"]
+__all__ = ["NEES", "nees"]
 
 
 class NEES(NamedTuple):
@@ -28,38 +27,6 @@ class NEES(NamedTuple):
     lower: float
     upper: float
     values: Tensor
-
-
-def gaussian_nll(mean: Tensor, covariance: Tensor, truth: Tensor, *, space: Space | None = None) -> Tensor:
-    """Negative log-likelihood of the truth under a Gaussian belief, in nats: lower is better.
-
-    Args:
-        mean: ``[*B, S]``.
-        covariance: ``[*B, S, S]``, or the variances ``[*B, S]``.
-        truth: ``[*B, S]``, in the same units.
-        space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. Errors of angles are wrapped,
-            which suits spreads well below π. The covariance, and the density, is
-            then one of tangents at the mean, S their number.
-
-    Returns:
-        With a covariance the joint one, ``[*B]``; with variances that of each dimension, ``[*B, S]``.
-
-    Raises:
-        ValueError: if the shapes do not fit, or if a covariance is not positive definite.
-
-    Examples:
-        >>> import torch
-        >>> gaussian_nll(torch.zeros(2), torch.tensor([1.0, 4.0]), torch.tensor([1.0, 0.0]))
-        tensor([1.4189, 1.6121])
-        >>> gaussian_nll(torch.zeros(2), torch.tensor([[1.0, 0.0], [0.0, 4.0]]), torch.tensor([1.0, 0.0]))
-        tensor(3.0310)
-    """
-    error = state_difference(truth, mean, space=space)
-    scale = _scale(error, covariance)
-    zero = torch.zeros_like(error)
-    if covariance.ndim == error.ndim:
-        return -Normal(zero, scale, validate_args=False).log_prob(error)
-    return -MultivariateNormal(zero, scale_tril=scale, validate_args=False).log_prob(error)
 
 
 def nees(

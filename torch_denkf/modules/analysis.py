@@ -10,10 +10,10 @@ import torch
 from torch_denkf._checks import check_choice, check_values
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.functional.draws import exact_draws, is_exact
-from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
+from torch_denkf.functional.inflation import inflate, relax_to_prior_spread
 from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.functional.moments import ensemble_cov
-from torch_denkf.modules.ensemble import EnsembleAnalysisKeys, EnsembleUpdate
+from torch_denkf.modules.ensemble import EnsembleOptions, EnsembleUpdate
 from torch_denkf.modules.spaces import mean_and_tangents
 from torch_denkf.modules.tensors import as_floating, check_dims
 
@@ -46,8 +46,10 @@ class EnsembleAnalysis(EnsembleUpdate):
         reading_space: in which the reading lives, such as ``Circle()`` for an angle; innovation and R are tangents.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
         draws: of ``"perturbed"``, ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.draws.exact_draws`.
-        **keys: see :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs
-            learned observations, not one reading.
+        **options: those above that every update of an ensemble has, see
+            :class:`~torch_denkf.modules.ensemble.EnsembleOptions`, and the keys,
+            :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs learned
+            observations, not one reading.
 
     Raises:
         ValueError: on an unknown scheme, an ``inflation`` that is not positive, a ``relaxation`` outside [0, 1], a
@@ -70,18 +72,12 @@ class EnsembleAnalysis(EnsembleUpdate):
         self,
         scheme: Literal["sensor", "perturbed", "etkf", "sakov"] = "sensor",
         *,
-        inflation: float = 1.0,
         inflated: Sequence[int] | None = None,
-        relaxation: float = 0.0,
-        rotate: bool = False,
         taper: tuple[torch.Tensor, torch.Tensor] | None = None,
-        localisation: Literal["significance"] | None = None,
-        threshold: float | torch.Tensor = 3.0,
         space: Space | None = None,
-        reading_space: Space | None = None,
         covariance: bool = False,
         draws: Literal["exact", "random"] = "exact",
-        **keys: Unpack[EnsembleAnalysisKeys],
+        **options: Unpack[EnsembleOptions],
     ):
         pair = isinstance(taper, tuple) and len(taper) == 2 and all(isinstance(part, torch.Tensor) for part in taper)
         if taper is not None and not pair:
@@ -89,19 +85,9 @@ class EnsembleAnalysis(EnsembleUpdate):
         check_choice("scheme", scheme, ("sensor", "perturbed", "etkf", "sakov"))
         if taper is not None and scheme == "etkf":
             raise ValueError('taper is for scheme "sensor", "perturbed" or "sakov"; "etkf" has none.')
-        if rotate and scheme != "etkf":
+        if options.get("rotate") and scheme != "etkf":
             raise ValueError(f'rotate=True belongs to scheme="etkf"; got {scheme!r}.')
-        super().__init__(
-            inflation=inflation,
-            relaxation=relaxation,
-            rotate=rotate,
-            space=space,
-            reading_space=reading_space,
-            covariance=covariance,
-            localisation=localisation,
-            threshold=threshold,
-            **keys,
-        )
+        super().__init__(space=space, covariance=covariance, **options)
         check_dims("inflated", inflated or [])
         self.exact = is_exact(draws)
         self.inflated = None if inflated is None else list(inflated)
@@ -116,16 +102,14 @@ class EnsembleAnalysis(EnsembleUpdate):
         """Perturbations or rotations, where the scheme needs any."""
         return ("",) if self.rotate or self.scheme == "perturbed" else ()
 
-    def draw_noise(
-        self, batch_size, *, members=None, observation_dim=None, device=None, dtype=None, generator=None, **_
-    ):
+    def draw_noise(self, batch_size, *, members=None, observation_dim=None, generator=None, **where):
         """Draws standard-normal perturbations ``[*B, E, O]`` or rotations ``[*B, E, E]``."""
-        if self.rotate and members is not None:
-            return random_rotation(members, tuple(batch_size), device=device, dtype=dtype, generator=generator)
-        if self.scheme == "perturbed" and None not in (members, observation_dim):
-            shape = (*batch_size, members, observation_dim)
-            return torch.randn(shape, device=device, dtype=dtype, generator=generator)
-        return None
+        if self.scheme != "perturbed":
+            return super().draw_noise(batch_size, members=members, generator=generator, **where)
+        if None in (members, observation_dim):
+            return None
+        where = {name: where.get(name) for name in ("device", "dtype")}
+        return torch.randn((*batch_size, members, observation_dim), generator=generator, **where)
 
     def _noise(self, entries, values, call):
         """Makes perturbations exact here, so that :meth:`compute` and :meth:`move_past` have the same ones."""
@@ -146,7 +130,7 @@ class EnsembleAnalysis(EnsembleUpdate):
     def noise_sizes(self, forecast, predicted, *_):
         """E and O, from the ensemble and its predicted observations."""
         size = predicted.shape[-1] if self.reading_space is None else self.reading_space.tangent_dim
-        return {"members": forecast.shape[-2], "observation_dim": size}
+        return {**super().noise_sizes(forecast), "observation_dim": size}
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""

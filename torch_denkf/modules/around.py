@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
-from typing import Protocol, Self, TypeVar
+from typing import Self, TypeVar
 
 import torch
 from tensordict import NestedKey, unravel_key
@@ -14,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf.running import check_module, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, Initial, SubModel, Update, role
 
-__all__ = ["Around", "AroundInitial", "AugmentedBelief", "Stateful", "Wrapper", "passes_on", "with_state"]
+__all__ = ["Around", "AroundInitial", "AugmentedBelief", "Wrapper", "passes_on"]
 
 W = TypeVar("W", bound="Wrapper")
 
@@ -40,6 +39,7 @@ class Wrapper(SubModel):
         in_keys: of the wrapper; those of the module by default.
         out_keys: likewise.
         optional_keys: likewise.
+        further_keys: what the wrapper reads beside ``in_keys``.
 
     Attributes:
         place: name of the module inside, where its noise has a place inside of the wrapper's, ``("noise",
@@ -55,12 +55,13 @@ class Wrapper(SubModel):
         out_keys: Sequence[NestedKey] | None = None,
         *,
         optional_keys: Sequence[NestedKey] | None = None,
+        further_keys: Sequence[NestedKey] = (),
     ):
-        check_module("module", module)
+        check_module(self.place or "module", module)
         needed, optional = reads(module)
         super().__init__(
             module,
-            needed if in_keys is None else in_keys,
+            list(dict.fromkeys(map(unravel_key, [*(needed if in_keys is None else in_keys), *further_keys]))),
             writes(module) if out_keys is None else out_keys,
             optional_keys=optional if optional_keys is None else optional_keys,
         )
@@ -150,19 +151,6 @@ class AroundInitial(Wrapper, Initial):
     """Goes around an initial belief, and passes on all that it declares."""
 
 
-class Stateful(Protocol):
-    """A module that carries entries of its own from step to step.
-
-    Attributes:
-        state_keys: their keys.
-    """
-
-    state_keys: Sequence[NestedKey]
-
-    def initial_state(self, batch_size, *, device=None, dtype=None) -> list[torch.Tensor]:
-        """Their values at the start of an episode, in the order of the keys."""
-
-
 class AugmentedBelief(AroundInitial):
     """An initial belief, and further entries that begin with the episode.
 
@@ -195,7 +183,6 @@ class AugmentedBelief(AroundInitial):
         follow: Callable[[Entries], Iterable[torch.Tensor]] | None = None,
         nested: bool = False,
     ):
-        check_module("initial", initial)
         out_keys = dict.fromkeys(map(unravel_key, (*initial.out_keys, *keys, *follow_keys)))
         super().__init__(initial, out_keys=list(out_keys))
         self.keys, self.begin = list(map(unravel_key, keys)), begin
@@ -214,30 +201,3 @@ class AugmentedBelief(AroundInitial):
 
     def _following(self, entries: Entries) -> Entries:
         return {} if self.follow is None else dict(zip(self.follow_keys, self.follow(entries), strict=True))
-
-
-def with_state(initial: TensorDictModuleBase, owners: Sequence[Stateful]) -> AugmentedBelief:
-    """An initial belief, and the entries that other modules carry on.
-
-    Args:
-        initial: the initial belief.
-        owners: such as :class:`InnovationMonitor` and :class:`GatedAnalysis`.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> from torch_denkf.modules import GaussianPrior
-        >>> from torch_denkf.monitoring import InnovationMonitor, MonitoredSensor
-        >>> monitor = InnovationMonitor({"gps": MonitoredSensor("info", 2)})
-        >>> start = with_state(GaussianPrior([0.0], [1.0], ensemble_size=4), [monitor])
-        >>> start(TensorDict({}, [3]))["monitor", "gps", "p_value"].flatten()
-        tensor([1., 1., 1.])
-    """
-    # In a tuple the owners are not modules of the belief: the filter has them already.
-    keys = [key for owner in owners for key in owner.state_keys]
-    return AugmentedBelief(initial, keys, partial(_states, tuple(owners)))
-
-
-def _states(owners: Sequence[Stateful], belief: Entries, batch_size: torch.Size) -> list[torch.Tensor]:
-    like = next(value for value in belief.values() if value.is_floating_point())
-    states = (owner.initial_state(batch_size, device=like.device, dtype=like.dtype) for owner in owners)
-    return [value for state in states for value in state]

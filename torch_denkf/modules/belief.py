@@ -10,8 +10,7 @@ from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf._checks import check_count, check_values
-from torch_denkf.beliefs import moments_on
-from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.beliefs import moments_of
 from torch_denkf.functional.draws import exact_draws, is_exact
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.tensors import (
@@ -19,7 +18,7 @@ from torch_denkf.modules.tensors import (
     as_standard_deviations,
     check_dims,
     mean_of_members,
-    register_location,
+    register_constant,
 )
 from torch_denkf.submodel import Initial
 
@@ -62,11 +61,9 @@ class _InitialEnsemble(Initial):
             noise = self.draw_noise(batch_size, device=center.device, dtype=center.dtype)
         noise = noise.to(center.dtype)
         away = std.unsqueeze(-2) * (exact_draws(noise) if self.exact else noise)
-        if self.space is not None:
-            ensemble = self.space.plus(center.unsqueeze(-2), away)
-            return ensemble, *moments_on(self.space, ensemble)
-        ensemble = center.unsqueeze(-2) + away
-        return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)
+        center = center.unsqueeze(-2)
+        ensemble = center + away if self.space is None else self.space.plus(center, away)
+        return ensemble, *moments_of(ensemble, space=self.space)
 
 
 _BELIEF_KEYS = (("belief", "ensemble"), ("belief", "mean"), ("belief", "var"))
@@ -197,7 +194,8 @@ class FromSensor(_InitialEnsemble):
         super().__init__(
             std, ensemble_size, [observation_key, noise_variance_key], out_keys, [observed_key], draws=draws
         )
-        register_location(self, "mean", mean)
+        register_constant(self, "mean", mean)
+        check_values("mean", self.mean)
         check_dims("dims", dims, once=True, size=self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
         self.input_dim, self.observed_key = len(self.dims), unravel_key(observed_key)

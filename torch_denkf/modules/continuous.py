@@ -9,8 +9,8 @@ from torch import nn
 
 from torch_denkf._checks import check_covariance, check_square, check_values
 from torch_denkf.functional.continuous import discretise
+from torch_denkf.modules.around import Wrapper
 from torch_denkf.modules.tensors import as_floating, register_constant
-from torch_denkf.running import check_module, reads, run_module
 from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["ContinuousMotion", "ContinuousNoise", "NoisePerSecond"]
@@ -98,7 +98,7 @@ class ContinuousNoise(SubModel):
         return discretise(drift, self.density, dt.to(drift.dtype))[1]
 
 
-class NoisePerSecond(SubModel):
+class NoisePerSecond(Wrapper):
     r"""Multiplies the variances of another process noise, which are per second, by the seconds since the last step.
 
     It is the noise of a random walk, for motions that read their own ``dt``. Put it inside of a module that maps the
@@ -116,18 +116,14 @@ class NoisePerSecond(SubModel):
         tensor([2.])
     """
 
-    def __init__(self, noise: TensorDictModuleBase, *, dt_key: NestedKey = "dt"):
-        check_module("noise", noise)
-        needed, optional = reads(noise)
-        super().__init__(noise, list(dict.fromkeys([*needed, dt_key])), noise.out_keys[:1], optional_keys=optional)
-        self.dt_key = dt_key
+    place = "noise"
 
-    def parts(self):
-        """The noise module."""
-        return {"noise": self.module}
+    def __init__(self, noise: TensorDictModuleBase, *, dt_key: NestedKey = "dt"):
+        super().__init__(noise, further_keys=[dt_key])
+        self.dt_key = dt_key
 
     def on_entries(self, entries, call):
         """The variances or the covariance of the step."""
-        key = self.out_keys[0]
-        noise, dt = run_module(self.module, entries, call.part("noise"))[key], self.required(entries, self.dt_key)
-        return {key: noise * (dt if noise.ndim == dt.ndim else dt.unsqueeze(-1)).to(noise.dtype)}
+        written, key = self.run_inside(entries, call), self.out_keys[0]
+        noise, dt = written[key], self.required(entries, self.dt_key)
+        return {**written, key: noise * (dt if noise.ndim == dt.ndim else dt.unsqueeze(-1)).to(noise.dtype)}

@@ -10,11 +10,12 @@ from tensordict import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_choice, check_number, check_values
+from torch_denkf.functional.inflation import random_rotation
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.spaces import told
 from torch_denkf.submodel import Call, Entries, Update
 
-__all__ = ["EnsembleAnalysisKeys", "EnsembleUpdate"]
+__all__ = ["EnsembleAnalysisKeys", "EnsembleOptions", "EnsembleUpdate", "Rotated"]
 
 
 class EnsembleAnalysisKeys(TypedDict, total=False):
@@ -43,19 +44,65 @@ class EnsembleAnalysisKeys(TypedDict, total=False):
     info_prefix: str
 
 
-class EnsembleUpdate(Update):
+class EnsembleOptions(EnsembleAnalysisKeys, total=False):
+    """What every update of an ensemble takes beside its keys.
+
+    Attributes:
+        inflation: factor on the analysis anomalies, where anything is observed; 1, by default, for none.
+        relaxation: relaxation to prior spread in [0, 1]; 0, by default, for none.
+        rotate: random mean-preserving rotation of the anomalies.
+        reading_space: of the reading; ``None`` for plain numbers.
+        localisation: ``"significance"`` or ``None``.
+        threshold: of ``"significance"``, in standard deviations; 3 by default.
+    """
+
+    inflation: float
+    relaxation: float
+    rotate: bool
+    reading_space: Space | None
+    localisation: Literal["significance"] | None
+    threshold: float | Tensor
+
+
+class Rotated(Update):
+    """An update of an ensemble that may rotate its anomalies at random.
+
+    Attributes:
+        rotate: whether it does.
+    """
+
+    rotate: bool = False
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Rotations, where wanted."""
+        return ("",) if self.rotate else ()
+
+    def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
+        """Draws rotations ``[*B, E, E]``, which keep the mean."""
+        if not self.rotate or members is None:
+            return None
+        return random_rotation(members, tuple(batch_size), device=device, dtype=dtype, generator=generator)
+
+    def noise_sizes(self, ensemble, *_):
+        """E, from the ensemble."""
+        return {"members": ensemble.shape[-2]}
+
+    def rotated(self, ensemble: Tensor, rotation: Tensor | None) -> Tensor:
+        """Returns the ensemble with its anomalies rotated; as it is without a rotation."""
+        if rotation is None:
+            return ensemble
+        mean = ensemble.mean(-2, keepdim=True)
+        return mean + rotation @ (ensemble - mean)
+
+
+class EnsembleUpdate(Rotated):
     """Reads a forecast ensemble, its predicted observations and a reading, writes the belief and the diagnostics.
 
     Args:
-        inflation: factor on the analysis anomalies, where anything is observed; 1 for none.
-        relaxation: relaxation to prior spread in [0, 1]; 0 for none.
-        rotate: random mean-preserving rotation of the anomalies.
         space: of the state; ``None`` for plain numbers.
-        reading_space: of the reading; ``None`` for plain numbers.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
-        localisation: ``"significance"`` or ``None``.
-        threshold: of ``"significance"``, in standard deviations.
-        **keys: see :class:`EnsembleAnalysisKeys`.
+        **options: see :class:`EnsembleOptions`.
 
     Raises:
         ValueError: if ``inflation`` or ``threshold`` is not positive, ``relaxation`` is outside [0, 1], or
@@ -65,9 +112,9 @@ class EnsembleUpdate(Update):
     def __init__(
         self,
         *,
-        inflation: float,
-        relaxation: float,
-        rotate: bool,
+        inflation: float = 1.0,
+        relaxation: float = 0.0,
+        rotate: bool = False,
         space: Space | None = None,
         reading_space: Space | None = None,
         covariance: bool = False,

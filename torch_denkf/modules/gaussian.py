@@ -260,14 +260,9 @@ def further_keys(
     modules: Iterable[TensorDictModuleBase], known: Iterable[NestedKey]
 ) -> tuple[list[NestedKey], list[NestedKey]]:
     """Returns the keys that ``modules`` must find, and those that they may, next to the entries ``known``."""
-    known = set(map(unravel_key, known))
-    needed: dict[NestedKey, None] = {}
-    optional: dict[NestedKey, None] = {}
-    for module in modules:
-        must, may = reads(module)
-        needed.update((key, None) for key in must if key not in known)
-        optional.update((key, None) for key in may if key not in known)
-    return list(needed), list(optional)
+    known, read = set(map(unravel_key, known)), list(map(reads, modules))
+    needed, optional = ([key for keys in read for key in keys[kind] if key not in known] for kind in (0, 1))
+    return list(dict.fromkeys(needed)), list(dict.fromkeys(optional))
 
 
 def refuse_random_layers(module: nn.Module, owner: str) -> None:

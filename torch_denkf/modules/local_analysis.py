@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, Unpack
+from typing import Any, Unpack
 
 import torch
 
 from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import ensemble_mean, ensemble_var, letkf, neighbours
-from torch_denkf.functional.inflation import random_rotation, relax_to_prior_spread
+from torch_denkf.functional.inflation import relax_to_prior_spread
 from torch_denkf.functional.localisation import Neighbours, neighbours_of_taper
-from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules.ensemble import EnsembleAnalysisKeys, EnsembleUpdate
+from torch_denkf.modules.ensemble import EnsembleOptions, EnsembleUpdate
 from torch_denkf.modules.tensors import mean_of_members, refuse_trained
 
 __all__ = ["LocalEnsembleAnalysis"]
@@ -45,8 +44,10 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
             their correlation from chance, see :class:`EnsembleAnalysis`.
         threshold: of ``"significance"``, in standard deviations; a ``Parameter`` is trained.
         reading_space: in which the reading lives, such as ``Circle()`` for an angle; innovation and R are tangents.
-        **keys: see :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. Of learned observations the
-            mean is taken. What is not observed may be NaN, readings and variances alike.
+        **options: those above that every update of an ensemble has, see
+            :class:`~torch_denkf.modules.ensemble.EnsembleOptions`, and the keys,
+            :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. Of learned observations the mean is taken. What
+            is not observed may be NaN, readings and variances alike.
 
     Raises:
         ValueError: if a taper is not a matrix or asks for a gradient, or the sizes do not fit.
@@ -71,31 +72,15 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         self,
         near: Neighbours | torch.Tensor,
         *,
-        inflation: float = 1.0,
-        relaxation: float = 0.0,
-        rotate: bool = False,
         tile: int = 4096,
-        localisation: Literal["significance"] | None = None,
-        threshold: float | torch.nn.Parameter = 3.0,
-        reading_space: Space | None = None,
-        **keys: Unpack[EnsembleAnalysisKeys],
+        **options: Unpack[EnsembleOptions],
     ):
         check_count("tile", tile)
-        if isinstance(near, torch.Tensor) and near.ndim != 2:
-            raise ValueError(f"near is Neighbours, or a taper; a taper must be [S, O], got {list(near.shape)}")
         if not isinstance(near, (Neighbours, torch.Tensor)):
             raise TypeError(f"near is Neighbours, or a taper [S, O]; got {near!r}")
-        super().__init__(
-            inflation=inflation,
-            relaxation=relaxation,
-            rotate=rotate,
-            reading_space=reading_space,
-            localisation=localisation,
-            threshold=threshold,
-            **keys,
-        )
-        if isinstance(threshold, torch.Tensor) and threshold.numel() > 1:
-            raise ValueError(f"threshold is one number for all components; got {list(threshold.shape)}")
+        super().__init__(**options)
+        if isinstance(self.threshold, torch.Tensor) and self.threshold.numel() > 1:
+            raise ValueError(f"threshold is one number for all components; got {list(self.threshold.shape)}")
         if isinstance(near, torch.Tensor):
             near = neighbours_of_taper(near, tile=tile)
         check_values("near's taper", near.taper, least=0)
@@ -131,21 +116,6 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         period = None if period is None else torch.as_tensor(period, dtype=states.dtype)
         return cls(neighbours(states, observations, radius, period=period), **kwargs)
 
-    @property
-    def noise_names(self) -> tuple[str, ...]:
-        """Rotations, if any."""
-        return ("",) if self.rotate else ()
-
-    def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
-        """Draws rotations ``[*B, E, E]``; ``None`` without, or where E is not known."""
-        if not self.rotate or members is None:
-            return None
-        return random_rotation(members, tuple(batch_size), device=device, dtype=dtype, generator=generator)
-
-    def noise_sizes(self, forecast, *_):
-        """E, from the ensemble."""
-        return {"members": forecast.shape[-2]}
-
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
         observation = mean_of_members(observation, predicted.shape[:-2])
@@ -180,11 +150,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
             index, taper = index.repeat(copies, 1), taper.repeat(copies, 1)
         near = Neighbours(index, taper)
         options: dict[str, Any] = {"observed": observed, "significance": self.significance, "tile": self.tile}
-        ensemble = letkf(ensemble, predicted, observation, variance, near, **options)
-        if noise is None:
-            return ensemble
-        mean = ensemble.mean(-2, keepdim=True)
-        return mean + noise @ (ensemble - mean)
+        return self.rotated(letkf(ensemble, predicted, observation, variance, near, **options), noise)
 
     def _reached(self, observed: torch.Tensor | None, variance: torch.Tensor) -> torch.Tensor:
         """Marks components near which anything is observed, ``[S]`` or ``[*B, S]``."""

@@ -10,18 +10,17 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number, check_values
+from torch_denkf.modules.around import Wrapper
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import (
     as_standard_deviations,
     mean_of_members,
-    register_location,
-    register_scale,
+    register_location_and_scale,
     variance_and_floor,
 )
-from torch_denkf.running import check_module, reads, run_module
-from torch_denkf.submodel import Sensor, SubModel
+from torch_denkf.submodel import Sensor
 
-__all__ = ["ConstantNoise", "DiagonalNoise", "ScaledNoise", "MemberGain"]
+__all__ = ["ConstantNoise", "DiagonalNoise", "ScaledNoise"]
 
 
 class DiagonalNoise(Sensor):
@@ -77,8 +76,9 @@ class DiagonalNoise(Sensor):
         variance, floor = variance_and_floor("DiagonalNoise", observation_dim, r, floor)
         self.register_buffer("variance", variance)
         self.register_buffer("floor", floor)
-        register_location(self, "loc", torch.zeros(in_features) if loc is None else loc)
-        register_scale(self, "scale", torch.ones(in_features) if scale is None else scale)
+        register_location_and_scale(
+            self, torch.zeros(in_features) if loc is None else loc, torch.ones(in_features) if scale is None else scale
+        )
 
     def compute(self, features, *, batch_size):
         """The variances."""
@@ -131,7 +131,7 @@ class ConstantNoise(Sensor):
         return variance.expand(*batch_size, -1)
 
 
-class ScaledNoise(Sensor):
+class ScaledNoise(Wrapper, Sensor):
     r"""Multiplies the variances of another noise module by the square of a factor that is set by hand after training.
 
     A filter that is too sure of itself needs more spread. Scaling Q and R by one factor widens its intervals and
@@ -155,78 +155,14 @@ class ScaledNoise(Sensor):
         tensor([ 0.0900, 36.0000])
     """
 
-    def __init__(self, noise: TensorDictModuleBase, factor: float = 1.0):
-        check_module("noise", noise)
-        check_number("factor", factor, least=0)
-        needed, optional = reads(noise)
-        super().__init__(noise, needed, noise.out_keys, optional_keys=optional)
-        self.factor = factor
+    place = "noise"
 
-    def parts(self):
-        """The noise module."""
-        return {"noise": self.module}
+    def __init__(self, noise: TensorDictModuleBase, factor: float = 1.0):
+        check_number("factor", factor, least=0)
+        super().__init__(noise)
+        self.factor = factor
 
     def on_entries(self, entries, call):
         """The scaled variances or covariance."""
-        out, key = run_module(self.module, entries, call.part("noise")), self.out_keys[0]
+        out, key = self.run_inside(entries, call), self.out_keys[0]
         return {**out, key: self.factor**2 * out[key]}
-
-
-class MemberGain(SubModel):
-    r"""Multiplies the sensor's samples by factors that belong to the members: :math:`\tilde y^i e^{\sigma z^i}`.
-
-    A camera that is mounted a little lower reads all speeds a little too high, today and tomorrow. Drawn anew for each
-    frame, such an error averages out over time, and the filter becomes too sure of itself; or its noise model takes the
-    error for white noise, and the filter follows too slowly. Here the :math:`z^i` are the normal quantiles of E
-    members, always the same: each member keeps its calibration, the ensemble its doubt. Put it behind the sensor.
-
-    Args:
-        std: standard deviation :math:`\sigma` of the logarithm of the factor, for each observation dimension ``[O]``,
-            before training; it is learned.
-        ensemble_size: E.
-        seed: of the order in which the members take the quantiles, for each dimension its own.
-        in_key: the sensor's samples ``[*B, E, O]``.
-        out_key: where to write them, by default in their place.
-
-    Raises:
-        ValueError: if a standard deviation is not positive, or the samples are of another number of members.
-
-    Source:
-        The "consider" parameters of Schmidt (1966), which a filter doubts but does not estimate, as an ensemble.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> td = TensorDict({("sensor", "ensemble"): torch.full((4, 1), 10.0)})
-        >>> MemberGain([0.1], ensemble_size=4)(td)["sensor", "ensemble"].flatten().sort().values.round(decimals=1)
-        tensor([ 8.7000,  9.6000, 10.4000, 11.5000], grad_fn=...)
-    """
-
-    def __init__(
-        self,
-        std: Sequence[float] | torch.Tensor,
-        *,
-        ensemble_size: int = 32,
-        seed: int = 0,
-        in_key: NestedKey = ("sensor", "ensemble"),
-        out_key: NestedKey | None = None,
-    ):
-        super().__init__(nn.Identity(), [in_key], [in_key if out_key is None else out_key])
-        std = as_standard_deviations("std", std)
-        check_values("std, a standard deviation,", std, above=0)
-        check_count("ensemble_size", ensemble_size, least=2)
-        self.log_std = nn.Parameter(std.log())
-        generator = torch.Generator().manual_seed(seed)
-        levels = (torch.arange(ensemble_size, dtype=std.dtype) + 0.5) / ensemble_size
-        quantiles = torch.special.ndtri(levels)
-        quantiles = quantiles / quantiles.square().mean().sqrt()  # few quantiles spread less than the distribution
-        orders = [torch.randperm(ensemble_size, generator=generator) for _ in std]
-        self.register_buffer("quantiles", torch.stack([quantiles[order] for order in orders], -1))
-
-    def compute(self, samples):
-        """The samples, each with its member's gain."""
-        if samples.shape[-2:] != self.quantiles.shape:
-            raise ValueError(
-                f"MemberGain was made for samples [*B, {self.quantiles.shape[0]}, {self.quantiles.shape[1]}], "
-                f"ensemble_size by the entries of std; {self.in_keys[0]!r} has shape {list(samples.shape)}."
-            )
-        return samples * (self.log_std.exp() * self.quantiles).exp()

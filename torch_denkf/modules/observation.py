@@ -2,39 +2,18 @@ r"""Observation models: predicted observations :math:`H X_{t|t-1} = [h_\psi(x^1)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.functional.linalg import product_of_known
-from torch_denkf.modules.tensors import check_dims, register_location, register_matrix, register_scale
+from torch_denkf.modules.tensors import check_dims, register_location_and_scale, register_matrix
 from torch_denkf.modules.transition import MemberNetwork
-from torch_denkf.running import check_network
 from torch_denkf.submodel import SubModel
 
 __all__ = ["LearnedObservation", "LinearObservation", "Select"]
-
-
-class _Observation(SubModel):
-    """Reads the forecast ensemble ``[*B, E, S]``, writes the predicted observations ``[*B, E, O]``."""
-
-    def __init__(
-        self,
-        network: nn.Module,
-        in_key: NestedKey = ("forecast", "ensemble"),
-        out_key: NestedKey = ("forecast", "observation"),
-    ):
-        super().__init__(network, [in_key], [out_key])
-
-    def observe(self, state: torch.Tensor) -> torch.Tensor:
-        """Returns :math:`h` of states ``[*, S]``, as ``[*, O]``."""
-        return self.module(state)
-
-    def compute(self, ensemble):
-        """The predicted observations."""
-        return self.observe(ensemble)
 
 
 class LearnedObservation(MemberNetwork):
@@ -57,17 +36,15 @@ class LearnedObservation(MemberNetwork):
 
     def __init__(
         self,
-        network: nn.Module,
+        network: Callable[..., torch.Tensor],
         *,
         loc: torch.Tensor | Sequence[float] | None = None,
         scale: torch.Tensor | Sequence[float] | None = None,
         in_key: NestedKey = ("forecast", "ensemble"),
         out_key: NestedKey = ("forecast", "observation"),
     ):
-        check_network("network", network)
         super().__init__(network, [in_key], [out_key])
-        register_location(self, "loc", loc)
-        register_scale(self, "scale", scale)
+        register_location_and_scale(self, loc, scale)
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
         """Returns the mean network's observation of states ``[*, S]``, as ``[*, O]``."""
@@ -82,7 +59,7 @@ class LearnedObservation(MemberNetwork):
         return self._run(ensemble, noise)
 
 
-class Select(_Observation):
+class Select(SubModel):
     """Known observation of single state dimensions, e.g. the velocities of [x, y, theta, v, theta_dot].
 
     Args:
@@ -104,7 +81,7 @@ class Select(_Observation):
         in_key: NestedKey = ("forecast", "ensemble"),
         out_key: NestedKey = ("forecast", "observation"),
     ):
-        super().__init__(nn.Identity(), in_key, out_key)
+        super().__init__(nn.Identity(), [in_key], [out_key])
         check_dims("dims", dims)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
 
@@ -113,8 +90,12 @@ class Select(_Observation):
         # Not index_select: inductor (torch 2.13) adds the rows of its Jacobian up.
         return state.gather(-1, self.dims.expand(*state.shape[:-1], -1))
 
+    def compute(self, ensemble):
+        """The predicted observations of all members."""
+        return self.observe(ensemble)
 
-class LinearObservation(_Observation):
+
+class LinearObservation(SubModel):
     """Known linear observation, ``y = H x``.
 
     Args:
@@ -136,7 +117,7 @@ class LinearObservation(_Observation):
         in_key: NestedKey = ("forecast", "ensemble"),
         out_key: NestedKey = ("forecast", "observation"),
     ):
-        super().__init__(nn.Identity(), in_key, out_key)
+        super().__init__(nn.Identity(), [in_key], [out_key])
         register_matrix(self, "matrix", matrix, "[O, S]")
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:

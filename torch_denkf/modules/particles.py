@@ -21,11 +21,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_choice, check_count, check_number
-from torch_denkf.beliefs import moments_on
+from torch_denkf.beliefs import moments_of
 from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.resampling import effective_sample_size, jitter_copies
-from torch_denkf.functional.weighted import weighted_innovation, weighted_mean, weighted_var
+from torch_denkf.functional.weighted import weighted_innovation
 from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.likelihood import GaussianLikelihood
 from torch_denkf.modules.spaces import told
@@ -129,7 +129,7 @@ class ResampledTransition(Transition):
         if ess_threshold is not None:
             check_number("ess_threshold", ess_threshold, least=0, most=1, cure="It is a share of E")
         check_number("jitter", jitter, least=0)
-        if jitter and (scheme not in ("systematic", "soft") or jitter < 0):
+        if jitter and scheme not in ("systematic", "soft"):
             raise ValueError(
                 f'jitter moves the copies apart that "systematic" and "soft" resampling make, 0 or more; got {jitter} '
                 f"with {scheme!r}."
@@ -199,14 +199,11 @@ class ResampledTransition(Transition):
 
     def with_past(self, past_key: NestedKey, out_past_key: NestedKey) -> ResampledTransition:
         """Returns the transition for particles with a lag window; the motion is shared, not copied."""
+        options = ("alpha", "epsilon", "iterations", "ess_threshold", "jitter")
         return ResampledTransition(
             self.module,
             self.scheme,
-            alpha=self.alpha,
-            epsilon=self.epsilon,
-            iterations=self.iterations,
-            ess_threshold=self.ess_threshold,
-            jitter=self.jitter,
+            **{name: getattr(self, name) for name in options},
             log_weight_key=self.in_keys[1],
             out_log_weight_key=self.out_keys[1],
             observed_key=self.mask_key,
@@ -331,15 +328,10 @@ class ParticleAnalysis(Update):
         # particle can explain the reading, in this precision, Bayes' rule is 0 / 0; the log-likelihood, -inf, tells.
         seen = (log_likelihood != 0).any(-1, keepdim=True) & (total != -math.inf)
         log_weights = torch.where(seen, joint - total, prior)
-        moments = (
-            (weighted_mean(particles, log_weights), weighted_var(particles, log_weights))
-            if self.space is None
-            else moments_on(self.space, particles, log_weights)
-        )
         return (
             particles,
             log_weights,
-            *moments,
+            *moments_of(particles, log_weights, self.space),
             effective_sample_size(log_weights).unsqueeze(-1),
             torch.where(seen | (total == -math.inf), total, torch.zeros_like(total)),
             *(self._innovation(prior, *of_reading) if of_reading else ()),
@@ -351,4 +343,4 @@ class ParticleAnalysis(Update):
             predicted, reading = self.reading_space.align(predicted, reading, observed)
         if reading.ndim == predicted.ndim:
             reading = reading.mean(-2)
-        return weighted_innovation(predicted, prior, reading, variance, observed=observed)
+        return weighted_innovation(predicted, prior, reading, variance, observed=observed)[:2]

@@ -10,23 +10,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, unravel_key
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torch.nn import functional as F
 
 from torch_denkf._checks import check_count, check_values
+from torch_denkf.modules.around import Wrapper
 from torch_denkf.modules.noise import ConstantNoise
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import (
     as_floating,
     mean_of_members,
-    register_location,
+    register_location_and_scale,
     register_matrix,
-    register_scale,
     variance_and_floor,
 )
-from torch_denkf.running import check_module, reads, run_module
 from torch_denkf.submodel import Initial, SubModel, role
 
 __all__ = ["CholeskyNoise", "MappedNoise", "NoiseThrough", "as_process_noise"]
@@ -128,8 +127,9 @@ class CholeskyNoise(SubModel):
             self.raw = nn.Parameter(torch.zeros(size, dtype=variance.dtype))
         self.register_buffer("std", variance.sqrt())
         self.register_buffer("floor", floor)
-        register_location(self, "loc", torch.zeros(in_features) if loc is None else loc)
-        register_scale(self, "scale", torch.ones(in_features) if scale is None else scale)
+        register_location_and_scale(
+            self, torch.zeros(in_features) if loc is None else loc, torch.ones(in_features) if scale is None else scale
+        )
         self.register_buffer("rows", torch.tril_indices(dim, dim), persistent=False)
 
     def compute(self, features, *, batch_size):
@@ -147,22 +147,15 @@ class CholeskyNoise(SubModel):
         return factor @ factor.mT + self.floor.to(raw.dtype).diag_embed()
 
 
-class NoiseThrough(SubModel):
+class NoiseThrough(Wrapper):
     """Runs another noise module and writes G Q G^T in its place, in the same entry; a sub-class gives G."""
 
-    def __init__(self, noise: TensorDictModuleBase, in_keys: Sequence[NestedKey]):
-        check_module("noise", noise)
-        needed, optional = reads(noise)
-        keys = list(dict.fromkeys([*needed, *map(unravel_key, in_keys)]))
-        super().__init__(noise, keys, [unravel_key(noise.out_keys[0])], optional_keys=optional)
-
-    def parts(self):
-        """The noise module."""
-        return {"noise": self.module}
+    place = "noise"
 
     def on_entries(self, entries, call):
         """The covariance."""
-        noise = run_module(self.module, entries, call.part("noise"))[self.out_keys[0]]
+        written, key = self.run_inside(entries, call), self.out_keys[0]
+        noise = written[key]
         matrix = self._matrix(entries).to(noise.dtype)
         if noise.shape[-1] != matrix.shape[-1]:
             raise ValueError(
@@ -171,7 +164,7 @@ class NoiseThrough(SubModel):
             )
         variances = noise.ndim == len(call.batch_size) + 1
         scaled = matrix * noise.unsqueeze(-2) if variances else matrix @ noise
-        return {self.out_keys[0]: scaled @ matrix.mT}
+        return {**written, key: scaled @ matrix.mT}
 
     def _matrix(self, entries) -> torch.Tensor:
         """G, ``[S, N]`` or ``[*B, S, N]``."""
@@ -197,7 +190,7 @@ class MappedNoise(NoiseThrough):
     """
 
     def __init__(self, noise: TensorDictModuleBase, matrix: torch.Tensor):
-        super().__init__(noise, [])
+        super().__init__(noise)
         register_matrix(self, "matrix", matrix, "[S, N]")
 
     def _matrix(self, entries):

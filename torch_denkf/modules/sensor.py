@@ -2,7 +2,6 @@ r"""Learned sensors: :math:`\tilde y^i_t \sim s_\xi(\tilde y^i_t \mid y_t)` (the
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Literal
 
@@ -10,18 +9,17 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf._checks import check_count, has_values
+from torch_denkf._checks import check_count
+from torch_denkf._registered import diagnosis
 from torch_denkf.modules._trunk import activation_bytes, couples_frames, in_chunks, reduced_precision
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.modules.tensors import as_vector, register_location, register_scale
+from torch_denkf.modules.tensors import as_vector, register_location_and_scale
 from torch_denkf.submodel import Sensor
 
 __all__ = ["ImageSensor", "VectorSensor", "convolutional_trunk"]
 
 #: Bytes of a trunk's results at a time, on a CPU: glibc keeps blocks of this size for the next chunk.
 CPU_TRUNK_MEMORY = 32 * 2**20
-#: No image in [0, 1] has such a value, and hardly a standardised one; nearly every image in [0, 255] has.
-_TOO_BRIGHT = 10.0
 #: Table I: (channels, kernel, stride) of each convolution.
 PAPER_TRUNK = ((64, 7, 2), (32, 3, 2), (16, 3, 2))
 
@@ -85,8 +83,7 @@ class _Sensor(StochasticSensor):
         )
         self.ensemble_size, self.event_ndim, self.observation_dim = ensemble_size, event_ndim, head.out_features
         check_count("ensemble_size", ensemble_size)
-        register_location(self, "loc", 0.0 if loc is None else loc)
-        register_scale(self, "scale", 1.0 if scale is None else scale)
+        register_location_and_scale(self, 0.0 if loc is None else loc, 1.0 if scale is None else scale)
 
     def _prepare(self, measurement: torch.Tensor) -> torch.Tensor:
         return measurement
@@ -229,21 +226,8 @@ class ImageSensor(_Sensor):
             return (measurement - self.pixel_loc) / self.pixel_scale if self.standardise else measurement
         measurement = (measurement - self.pixel_loc) / self.pixel_scale if self.standardise else measurement
         if not torch.compiler.is_compiling() and not self._looked:  # in this order: no compiled code depends on it
-            self._look(measurement)
+            self._looked = diagnosis().look_at_brightness(self.in_keys[0], measurement)
         return measurement
-
-    def _look(self, pixels: torch.Tensor) -> None:
-        if not pixels.numel() or not has_values(pixels):
-            return
-        largest = float(pixels.detach().abs().nan_to_num().max())
-        self._looked = largest > 0  # specs are tried out on zeros
-        if largest > _TOO_BRIGHT:
-            warnings.warn(
-                f"ImageSensor reads {self.in_keys[0]!r} in floating point up to {largest:.0f}; it expects [0, 1]. Give "
-                "it uint8 images, which it divides by 255, or divide them; with pixel_loc and pixel_scale in the units "
-                "of the pixels any range will do. Said once.",
-                stacklevel=2,
-            )
 
 
 class VectorSensor(_Sensor):

@@ -21,8 +21,7 @@ __all__ = [
     "refuse_trained",
     "register_constant",
     "register_matrix",
-    "register_location",
-    "register_scale",
+    "register_location_and_scale",
     "variance_and_floor",
 ]
 
@@ -89,26 +88,24 @@ def refuse_trained(name: str, value: Any, why: str) -> None:
         )
 
 
-def register_location(module: nn.Module, name: str, value: Tensor | Sequence | float | None) -> None:
-    """Keeps a mean that standardises inputs: finite numbers, or ``None``.
+def register_location_and_scale(
+    module: nn.Module, loc: Tensor | Sequence | float | None, scale: Tensor | Sequence | float | None, prefix: str = ""
+) -> None:
+    """Keeps the mean and the standard deviation that standardise inputs, each a buffer, or ``None``.
+
+    Args:
+        module: that keeps them.
+        loc: finite numbers.
+        scale: positive numbers; an infinite one hides its input.
+        prefix: of the names of the buffers, ``"loc"`` and ``"scale"``.
 
     Raises:
-        ValueError: if one is not finite.
+        ValueError: if a number is not of these.
     """
-    register_constant(module, name, value)
-    if value is not None:
-        check_values(name, getattr(module, name))
-
-
-def register_scale(module: nn.Module, name: str, value: Tensor | Sequence | float | None) -> None:
-    """Keeps a standard deviation that standardises inputs: positive numbers, an infinite one hides its input.
-
-    Raises:
-        ValueError: if one is not positive.
-    """
-    register_constant(module, name, value)
-    if value is not None:
-        check_values(name, getattr(module, name), above=0, infinite=True)
+    for name, value, above in (("loc", loc, None), ("scale", scale, 0)):
+        register_constant(module, prefix + name, value)
+        if value is not None:
+            check_values(prefix + name, getattr(module, prefix + name), above=above, infinite=above is not None)
 
 
 def as_standard_deviations(name: str, value: Any) -> Tensor:

@@ -2,15 +2,13 @@ r"""Transition models: forecast :math:`x^i_{t|t-1} \sim f_\theta(x^i_{t-1|t-1})`
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey
-from torch import nn
 
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.modules.tensors import register_location, register_scale
-from torch_denkf.running import check_network
+from torch_denkf.modules.tensors import register_location_and_scale
 from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["LearnedTransition", "MemberNetwork"]
@@ -76,7 +74,7 @@ class LearnedTransition(MemberNetwork, Transition):
 
     def __init__(
         self,
-        network: nn.Module,
+        network: Callable[..., torch.Tensor],
         *,
         residual: bool = True,
         loc: torch.Tensor | Sequence[float] | None = None,
@@ -88,15 +86,12 @@ class LearnedTransition(MemberNetwork, Transition):
         in_key: NestedKey = ("belief", "ensemble"),
         out_key: NestedKey = ("forecast", "ensemble"),
     ):
-        check_network("network", network)
         if dt_key is not None and not residual:
             raise ValueError(f"dt_key={dt_key!r} scales a change: it needs residual=True.")
         super().__init__(network, [in_key, *(key for key in (action_key, dt_key) if key is not None)], [out_key])
         self.residual, self.action_key, self.dt_key = residual, action_key, dt_key
-        register_location(self, "loc", loc)
-        register_scale(self, "scale", scale)
-        register_location(self, "action_loc", action_loc)
-        register_scale(self, "action_scale", action_scale)
+        register_location_and_scale(self, loc, scale)
+        register_location_and_scale(self, action_loc, action_scale, "action_")
 
     def compute(self, state, action=None, dt=None, *, noise):
         """The forecast ensemble."""

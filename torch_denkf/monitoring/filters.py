@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Unpack
 
 import torch
@@ -12,11 +13,11 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters.base import Filter
 from torch_denkf.fusion.parts import StateObservation
-from torch_denkf.modules.around import with_state
+from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.monitoring.gate import GatedAnalysis, GateOptions, can_be_gated
 from torch_denkf.monitoring.monitor import InnovationMonitor
 from torch_denkf.running import check_module, in_sequences, is_sequence, named_modules_of, writes
-from torch_denkf.submodel import Call, Sensor, SubModel, Update, role
+from torch_denkf.submodel import Call, Entries, Sensor, SubModel, Update, role
 
 __all__ = ["Gated", "Monitored"]
 
@@ -70,7 +71,7 @@ class Monitored(Filter):
         while place in modules:
             place += "_"
         modules[place] = monitor if like is None else monitor.to(like.device, like.dtype)
-        super().__init__(modules, initial=with_state(filter.initial, [monitor]), **filter.options())
+        super().__init__(modules, initial=_with_state(filter.initial, [monitor]), **filter.options())
         self._place = place
 
     @property
@@ -164,7 +165,7 @@ class Gated(Filter):
                 like = filter.like()
                 gates[-1] = gates[-1] if like is None else gates[-1].to(like.device, like.dtype)
                 modules[name] = _with(modules[name], analysis, gates[-1])
-        super().__init__(modules, initial=with_state(filter.initial, gates), **filter.options())
+        super().__init__(modules, initial=_with_state(filter.initial, gates), **filter.options())
 
     @property
     def gates(self) -> list[GatedAnalysis]:
@@ -226,3 +227,32 @@ def _dim(filter: Filter, analysis: Update) -> int:
         raise ValueError(
             f"how many components the reading of {type(analysis).__name__} has is not known; pass observation_dim"
         ) from None
+
+
+def _with_state(initial: TensorDictModuleBase, owners: Sequence[InnovationMonitor | GatedAnalysis]) -> AugmentedBelief:
+    """An initial belief, and the entries that other modules carry on.
+
+    Args:
+        initial: the initial belief.
+        owners: such as :class:`InnovationMonitor` and :class:`GatedAnalysis`.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import GaussianPrior
+        >>> from torch_denkf.monitoring import InnovationMonitor, MonitoredSensor
+        >>> monitor = InnovationMonitor({"gps": MonitoredSensor("info", 2)})
+        >>> start = _with_state(GaussianPrior([0.0], [1.0], ensemble_size=4), [monitor])
+        >>> start(TensorDict({}, [3]))["monitor", "gps", "p_value"].flatten()
+        tensor([1., 1., 1.])
+    """
+    # In a tuple the owners are not modules of the belief: the filter has them already.
+    keys = [key for owner in owners for key in owner.state_keys]
+    return AugmentedBelief(initial, keys, partial(_states, tuple(owners)))
+
+
+def _states(
+    owners: Sequence[InnovationMonitor | GatedAnalysis], belief: Entries, batch_size: torch.Size
+) -> list[torch.Tensor]:
+    like = next(value for value in belief.values() if value.is_floating_point())
+    states = (owner.initial_state(batch_size, device=like.device, dtype=like.dtype) for owner in owners)
+    return [value for state in states for value in state]

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch_denkf._checks import check_mask
 from torch_denkf._registered import diagnosis
 from torch_denkf.beliefs import is_samples
-from torch_denkf.functional.manifolds import Space, is_flat, whole_parts
+from torch_denkf.functional.manifolds import Euclidean, Space, is_flat, whole_parts
 from torch_denkf.running import writes
 from torch_denkf.submodel import Initial, Update, in_role, role
 
@@ -80,7 +80,7 @@ class Reading(NamedTuple):
         """Finds the reading of the sensor that ``keys`` name, or of the only one; no model where there are several."""
         found: dict[NestedKey, Update] = {}
         default, observed = cls(), keys.observed
-        for module in filter.update_modules:
+        for _, module in filter.structure.update:
             for part in in_role(module, Update):
                 found.update((key, part) for key in map(unravel_key, part.reading_keys[:1]) if key not in found)
         names = [key for key in filter.structure.frame_keys if is_samples(key)] or [default.samples]
@@ -91,7 +91,7 @@ class Reading(NamedTuple):
         parts = [found[key] for key in read] or list(found.values())
         if len(parts) > 1:
             return default if observed is None else cls(names[0], observed)
-        part, owners = parts[0] if parts else role(None, Update), filter.update_modules
+        part, owners = parts[0] if parts else role(None, Update), [module for _, module in filter.structure.update]
         if len(found) > 1:
             owners = [part, *(module for module in owners if unravel_key(part.predicted_key) in writes(module))]
         model = next((part for module in owners for part in module.modules() if hasattr(part, "observe")), None)
@@ -266,25 +266,17 @@ class Truth:
         space = {"state": self.loss.space, "target": self.loss.reading_space}.get(name)
         if space is not None and size != space.point_dim:
             raise ValueError(f"a point of {space} has {space.point_dim} numbers, but what is scored has {size}")
-        if space is not None and space.flat is None:
-            return self._points(space, values, size, dims)
-        known = self._known(name, values, size, dims)
-        dims = range(min(values.shape[-1], size)) if dims is None else dims
-        counting = torch.zeros(size, dtype=torch.bool, device=known.device)
+        on: Space = space or Euclidean(size)
+        flat = is_flat(space)
+        known = self._known(name, values, size, dims if flat else None)
+        whole, mask = whole_parts(on, ~known.isnan())
+        if dims is None:
+            given = torch.arange(size) < values.shape[-1]
+            dims = range(int(whole_parts(on, given)[1].sum()))
+        counting = torch.zeros(on.tangent_dim, dtype=torch.bool, device=known.device)
         counting[list(dims)] = True
-        mask = ~known.isnan() & counting
-        return Labels(torch.where(mask, known, 0), mask, dims, space=space)
-
-    def _points(self, space: Space, values: Tensor, size: int, dims: Sequence[int] | None) -> Labels:
-        """True points, and which components of tangents they have labels for."""
-        known = self._known("state", values, size, None)
-        whole, mask = whole_parts(space, ~known.isnan())
-        given = torch.arange(size) < values.shape[-1]
-        dims = range(int(whole_parts(space, given)[1].sum())) if dims is None else dims
-        counting = torch.zeros(space.tangent_dim, dtype=torch.bool, device=known.device)
-        counting[list(dims)] = True
-        points = space.normalise(torch.where(whole, known, space.neutral(known)))
-        return Labels(points, mask & counting, dims, space=space)
+        points = torch.where(whole, known, on.neutral(known))
+        return Labels(points if flat else on.normalise(points), mask & counting, dims, space=space)
 
     def _known(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None) -> Tensor:
         """Labels ``[*B, N]`` in the places of their components, ``[*B, size]``, NaN where there is none.

@@ -15,9 +15,10 @@ from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
 
 from torch_denkf._arguments import check_key
 from torch_denkf._checks import check_count, check_values, flag_value
+from torch_denkf._slices import one_earlier
 from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record
-from torch_denkf.filters.structure import previous_key
+from torch_denkf.filters.gather import controls_of
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules.tensors import as_floating
 from torch_denkf.objectives import _terms
@@ -353,11 +354,7 @@ def forecasts_from_truth(
     entries.update(carried)
     for key in structure.carry:
         entries[key] = one_earlier(entries[key], time)
-    for key in structure.controls:
-        if previous_key(key) in entries:
-            entries[key] = entries[previous_key(key)]
-        elif key in entries:
-            entries[key] = one_earlier(entries[key], time)
+    entries.update(controls_of(structure, entries, time))
     written = run_module(transition, entries, call.part(place))
     return {key: written[forecast] for key, forecast in structure.forecast_of.items()}
 
@@ -378,9 +375,3 @@ def _belief_at(truth: Tensor, belief: str, spread: Tensor, members: int | None, 
         (belief, "mean"): truth,
         (belief, "var"): std.square(),
     }
-
-
-def one_earlier(value: Tensor, time: int) -> Tensor:
-    """Every element from one step before; the first stays where it is."""
-    count = value.shape[time]
-    return torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, count - 1)], time)

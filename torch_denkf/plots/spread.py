@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from tensordict import NestedKey, TensorDictBase
 
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.metrics.calibration import spread_error
 from torch_denkf.plots._axes import BELIEF, MARKERS, OTHERS, TRUTH, axes_for, labels_for, legend_above, one_each
 from torch_denkf.plots._belief import Truth, dims_of, read_belief, with_truth
 from torch_denkf.plots._space import angles_of, in_tangents, names_of
+from torch_denkf.plots.histograms import spread_error
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

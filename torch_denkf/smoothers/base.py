@@ -12,7 +12,7 @@ from torch import Tensor
 from torch_denkf._arguments import Checked
 from torch_denkf._slices import as_rows, starts_of
 from torch_denkf.filters import Filter
-from torch_denkf.functional.smoothing.rts import check_lag
+from torch_denkf.functional.smoothing.backward import check_lag
 from torch_denkf.submodel import Entries
 
 __all__ = ["Smoother"]

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_number
+from torch_denkf.beliefs import moments_of
 from torch_denkf.filters import Filter
 from torch_denkf.functional.smoothing.ensemble import enrts_smooth
 from torch_denkf.smoothers.base import Smoother, last_of_runs
-from torch_denkf.smoothers.fixed_lag import FixedLag, kind_of
-from torch_denkf.smoothers.past import moments_of
+from torch_denkf.smoothers.fixed_lag import FixedLag, prefix_of
 from torch_denkf.submodel import SubModel, in_role
 
 __all__ = ["EnKS", "EnRTS"]
@@ -48,11 +48,7 @@ class EnRTS(Smoother):
     """
 
     def __init__(self, filter: Filter, lag: int | None = None, *, damping: float | None = None):
-        kind, prefix = kind_of(filter)
-        if kind != "ensemble":
-            raise TypeError(
-                f"EnRTS takes a filter with an ensemble; {type(filter).__name__} carries {filter.carry_keys}."
-            )
+        prefix = prefix_of(filter, "ensemble", self)
         if any(getattr(part, "rotate", False) for part in in_role(filter, SubModel)):
             raise ValueError(
                 "An analysis with rotate=True gives each member another's place, so that EnRTS cannot tell what a "
@@ -113,11 +109,7 @@ class EnKS(Smoother):
     """
 
     def __init__(self, filter: Filter, lag: int | None = None):
-        kind, self.prefix = kind_of(filter)
-        if kind != "ensemble":
-            raise TypeError(
-                f"EnKS takes a filter with an ensemble; {type(filter).__name__} carries {filter.carry_keys}."
-            )
+        self.prefix = prefix_of(filter, "ensemble", self)
         keys = [(self.prefix, "ensemble")] + [(self.prefix, "past")] * (lag != 0)
         super().__init__(filter, lag, keys, ("ensemble", "mean", "var"))
         self._filter_for(2)  # refuses what a lag cannot be added to

@@ -14,7 +14,7 @@ from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief
 from torch_denkf.smoothers.past_moments import MOMENTS_PAST, CrossTransition, LaggedMoments, MomentsPast
 from torch_denkf.submodel import Update, role
 
-__all__ = ["FixedLag", "kind_of", "rebuilt"]
+__all__ = ["FixedLag", "kind_of", "prefix_of"]
 
 
 class FixedLag(Filter):
@@ -72,7 +72,7 @@ class FixedLag(Filter):
         space = filter.structure.space
         if kind == "moments":
             forecast = filter.structure.forecast_of[prefix, "mean"][0]
-            modules[names[place]] = CrossTransition(modules[names[place]], (forecast, "cross"), (forecast, "open"))
+            modules[names[place]] = CrossTransition(modules[names[place]], with_open=True)
             past = MomentsPast(belief_prefix=prefix, forecast_prefix=forecast)
             last = LaggedMoments(belief_prefix=prefix, forecast_prefix=forecast, space=space)
             initial = with_past(filter.initial, lag, MOMENTS_PAST, age=age, belief_prefix=prefix)
@@ -139,11 +139,19 @@ def kind_of(filter: Filter) -> tuple[str, str]:
     )
 
 
-def rebuilt(filter: Filter, changed: Mapping[str, TensorDictModuleBase]) -> Filter:
-    """A filter of the same modules, some of which are replaced in their places."""
-    modules = OrderedDict(named_modules_of(filter))
-    modules.update(changed)
-    return Filter(modules, initial=filter.initial, **filter.options())
+def prefix_of(filter: Filter, kind: str, owner: object) -> str:
+    """Returns the prefix of the belief's entries.
+
+    Raises:
+        TypeError: for a filter whose belief is of another kind than its smoother, ``owner``, takes.
+    """
+    found, prefix = kind_of(filter)
+    if found != kind:
+        words = {"ensemble": "an ensemble", "moments": "a mean and a covariance", "particles": "particles"}[kind]
+        raise TypeError(
+            f"{type(owner).__name__} takes a filter with {words}; {type(filter).__name__} carries {filter.carry_keys}."
+        )
+    return prefix
 
 
 def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> OrderedDict[str, TensorDictModuleBase]:

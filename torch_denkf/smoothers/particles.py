@@ -8,18 +8,17 @@ import torch
 from tensordict import unravel_key
 from torch import Tensor
 
+from torch_denkf.beliefs import moments_of
 from torch_denkf.filters import Filter
-from torch_denkf.filters.structure import previous_key
+from torch_denkf.filters.gather import controls_of
 from torch_denkf.functional.linalg import as_covariance, cholesky
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing.particles import backward_smooth
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules import NoisyTransition
-from torch_denkf.modules.particles import ResampledTransition
 from torch_denkf.running import run_module
 from torch_denkf.smoothers.base import Smoother
-from torch_denkf.smoothers.fixed_lag import kind_of
-from torch_denkf.smoothers.past import moments_of
+from torch_denkf.smoothers.fixed_lag import prefix_of
 from torch_denkf.submodel import Call, Entries
 
 __all__ = ["ParticleSmoother"]
@@ -68,13 +67,8 @@ class ParticleSmoother(Smoother):
     """
 
     def __init__(self, filter: Filter, lag: int | None = None):
-        kind, prefix = kind_of(filter)
-        transition = filter.transition_module
-        if kind != "particles" or not isinstance(transition, ResampledTransition):
-            raise TypeError(
-                f"ParticleSmoother takes a filter with particles; {type(filter).__name__} carries {filter.carry_keys}."
-            )
-        motion = transition.module
+        prefix = prefix_of(filter, "particles", self)
+        motion = filter.transition_module.module
         if not isinstance(motion, NoisyTransition) or motion.before or motion.dims is not None:
             raise TypeError(
                 "ParticleSmoother needs the density of the motion: a NoisyTransition with noise in all dimensions, "
@@ -108,11 +102,7 @@ class ParticleSmoother(Smoother):
         # A step reads the belief before it, the action that led out of there, and what else there is at its own time.
         work = {name: after(value) for name, value in entries.items() if value.ndim > time}
         work.update({name: before(entries[name]) for name in structure.belief if name in entries})
-        for control in structure.controls:
-            if control in entries:
-                work[control] = before(entries[control])
-            if previous_key(control) in entries:
-                work[control] = after(entries[previous_key(control)])
+        work.update({name: after(value) for name, value in controls_of(structure, entries, time).items()})
         old, weights = before(particles), before(log_weights)
         work.update({key: old, motion.mean_key: mean(old)})
         call = Call(old.shape[:-2], sample=False)

@@ -14,19 +14,20 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_shape
-from torch_denkf.beliefs import moments_on
-from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.beliefs import moments_of
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules.around import Around, AugmentedBelief
 from torch_denkf.submodel import Entries, Initial, SubModel, Update, role
 
 __all__ = ["ENSEMBLE_PAST", "EnsemblePast", "LaggedAnalysis", "LaggedBelief", "Past", "lagged", "with_past"]
+
+
+#: The pasts of the members on their way through a step, and how old what is smoothed is.
+PAST_KEY, AGE_KEY = ("forecast", "past"), ("smoothed", "age")
 
 
 class Past(NamedTuple):
@@ -54,7 +55,6 @@ def with_past(
     *,
     age: int = 0,
     belief_prefix: str = "belief",
-    smoothed_prefix: str = "smoothed",
 ) -> AugmentedBelief:
     """An initial belief with a past: L copies of its state.
 
@@ -65,7 +65,6 @@ def with_past(
         age: steps between the first belief of an episode and the first state: 0, or -1 where that belief is yet to be
             updated with its own frame.
         belief_prefix: prefix of what ``initial`` writes, and of the past.
-        smoothed_prefix: prefix of what follows of the oldest state, and of its ``age``, see :class:`LaggedBelief`.
 
     Raises:
         ValueError: if ``lag`` is not positive.
@@ -81,9 +80,9 @@ def with_past(
     space = role(initial, Initial).space
     return AugmentedBelief(
         initial,
-        [*((belief_prefix, name) for name in past.carried), (smoothed_prefix, "age")],
+        [*((belief_prefix, name) for name in past.carried), AGE_KEY],
         partial(_begin, past.copies, belief_prefix, lag, age),
-        follow_keys=[*((belief_prefix, name) for name in past.present), *((smoothed_prefix, n) for n in past.follow)],
+        follow_keys=[*((belief_prefix, name) for name in past.present), *(("smoothed", name) for name in past.follow)],
         follow=partial(past.oldest, belief_prefix, lag, **({} if space is None else {"space": space})),
     )
 
@@ -111,7 +110,6 @@ class EnsemblePast(SubModel):
 
     Args:
         belief_prefix: prefix of ``ensemble`` ``[*B, E, S]`` and ``past`` ``[*B, E, L, S]``, the latest first.
-        out_key: the past of the new time, ``[*B, E, L, S]``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -120,8 +118,8 @@ class EnsemblePast(SubModel):
         tensor([3., 2.])
     """
 
-    def __init__(self, *, belief_prefix: str = "belief", out_key: NestedKey = ("forecast", "past")):
-        super().__init__(nn.Identity(), [(belief_prefix, "ensemble"), (belief_prefix, "past")], [out_key])
+    def __init__(self, *, belief_prefix: str = "belief"):
+        super().__init__(nn.Identity(), [(belief_prefix, "ensemble"), (belief_prefix, "past")], [PAST_KEY])
 
     def compute(self, ensemble, past):
         """The past."""
@@ -136,7 +134,6 @@ class LaggedAnalysis(Around):
     Args:
         analysis: :class:`EnsembleAnalysis`, :class:`LocalEnsembleAnalysis`, or one of your own that updates an
             ensemble; its keys and its noise are kept.
-        past_key: the past ``[*B, E, L, S]``, read and written.
 
     Raises:
         TypeError: for another analysis, which does not say what it does to other states.
@@ -154,19 +151,14 @@ class LaggedAnalysis(Around):
         (tensor([2.]), tensor(1.))
     """
 
-    def __init__(
-        self,
-        analysis: Update,
-        *,
-        past_key: NestedKey = ("forecast", "past"),
-    ):
+    def __init__(self, analysis: Update):
         if not (isinstance(analysis, Update) and analysis.updates_ensemble):
             raise TypeError(
                 f"{type(analysis).__name__} does not say what a reading means for earlier states. A lag needs an "
                 "EnsembleAnalysis, a LocalEnsembleAnalysis, or one of your own whose in_keys begin with the ensemble, "
                 "its predicted_key and its reading_keys; smooth other ensembles with EnRTS."
             )
-        super().__init__(analysis, [*analysis.in_keys, past_key], [*analysis.out_keys, past_key])
+        super().__init__(analysis, out_keys=[*analysis.out_keys, PAST_KEY], further_keys=[PAST_KEY])
 
     updates_ensemble = True
 
@@ -199,13 +191,13 @@ def lagged(analysis: Update) -> Update:
 
 
 class LaggedBelief(SubModel):
-    """Writes the posterior of the state L steps ago, given all readings up to now.
+    """Writes the posterior of the state L steps ago, given all readings up to now, under ``"smoothed"``.
+
+    There stand ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``, and ``age`` ``[*B, 1]``: by how many
+    steps the state lies back, L, or fewer where the episode is younger.
 
     Args:
         belief_prefix: prefix of the ``past`` ``[*B, E, L, S]`` that is carried on, and of ``log_weight`` ``[*B, E]``.
-        smoothed_prefix: prefix of ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``, and ``age`` ``[*B,
-            1]``: by how many steps the state lies back, L, or fewer where the episode is younger.
-        past_key: the past after the analysis, ``[*B, E, L, S]``.
         weighted: whether the members are particles with log-weights.
         space: in which the state lives; ``None`` for plain numbers.
 
@@ -221,14 +213,11 @@ class LaggedBelief(SubModel):
         self,
         *,
         belief_prefix: str = "belief",
-        smoothed_prefix: str = "smoothed",
-        past_key: NestedKey = ("forecast", "past"),
         weighted: bool = False,
         space: Space | None = None,
     ):
-        age = (smoothed_prefix, "age")
-        out_keys = [(belief_prefix, "past"), *((smoothed_prefix, name) for name in ("ensemble", "mean", "var")), age]
-        super().__init__(nn.Identity(), [past_key, age] + [(belief_prefix, "log_weight")] * weighted, out_keys)
+        out_keys = [(belief_prefix, "past"), *(("smoothed", name) for name in ("ensemble", "mean", "var")), AGE_KEY]
+        super().__init__(nn.Identity(), [PAST_KEY, AGE_KEY] + [(belief_prefix, "log_weight")] * weighted, out_keys)
         self.space = space
 
     def compute(self, past, age, log_weight=None):
@@ -241,15 +230,3 @@ class LaggedBelief(SubModel):
 def check_age(age: torch.Tensor, batch_size: Sequence[int]) -> None:
     """Raise unless the age of the oldest state that is carried is ``[*B, 1]``."""
     check_shape("the age of what is smoothed", age, (*batch_size, 1), "[*B, 1]")
-
-
-def moments_of(
-    ensemble: torch.Tensor, log_weight: torch.Tensor | None, space: Space | None = None
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean and variance ``[*B, S]`` of members, or of weighted particles."""
-    if space is not None:
-        return moments_on(space, ensemble, log_weight)
-    if log_weight is not None:
-        return weighted_mean(ensemble, log_weight), weighted_var(ensemble, log_weight)
-    mean = ensemble_mean(ensemble)
-    return mean, ensemble_var(ensemble, mean)

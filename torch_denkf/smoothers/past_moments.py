@@ -11,7 +11,6 @@ Of points of a space, V and D are of the tangents at the means: each time a mean
 from __future__ import annotations
 
 import torch
-from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.functional.linalg import divide
@@ -20,7 +19,7 @@ from torch_denkf.functional.smoothing.rts import left_open, smoothing_gain
 from torch_denkf.modules.around import Wrapper
 from torch_denkf.modules.gaussian import GaussianTransition
 from torch_denkf.modules.kalman import LinearTransition
-from torch_denkf.smoothers.past import Past, check_age
+from torch_denkf.smoothers.past import AGE_KEY, Past, check_age
 from torch_denkf.submodel import Entries, SubModel, Transition
 
 __all__ = ["MOMENTS_PAST", "CrossTransition", "LaggedMoments", "MomentsPast"]
@@ -32,9 +31,8 @@ class CrossTransition(Wrapper, Transition):
     Args:
         transition: :class:`LinearTransition`, :class:`EKFTransition` or :class:`UKFTransition`; its keys and its noise
             are kept.
-        cross_key: the covariance, ``[*B, S, S]``, rows before the step.
-        open_key: the covariance of the state before the step where that after it is known, ``[*B, S, S]``; ``None`` not
-            to write it.
+        with_open: whether it also writes ``"open"``, the covariance of the state before the step where that after it is
+            known, ``[*B, S, S]``; ``"cross"`` has rows before the step, ``[*B, S, S]``, and both stand beside the mean.
 
     Raises:
         TypeError: for another transition.
@@ -46,28 +44,22 @@ class CrossTransition(Wrapper, Transition):
         tensor([[2.]])
     """
 
-    def __init__(
-        self,
-        transition: LinearTransition | GaussianTransition,
-        cross_key: NestedKey = ("forecast", "cross"),
-        open_key: NestedKey | None = None,
-    ):
+    def __init__(self, transition: LinearTransition | GaussianTransition, with_open: bool = False):
         if not isinstance(transition, LinearTransition | GaussianTransition):
             raise TypeError(
                 f"{type(transition).__name__} does not give the covariance of the states before and after a step; "
                 "LinearTransition, EKFTransition and UKFTransition do."
             )
-        keys = [cross_key] if open_key is None else [cross_key, open_key]
+        keys = [(transition.out_keys[0][0], name) for name in ("cross", "open")[: 1 + with_open]]
         super().__init__(transition, out_keys=[*transition.out_keys, *keys])
 
     def on_entries(self, entries, call):
         """The forecast and the cross-covariance."""
         written, link = self.module.with_link(entries, call)
         before, middle, after = link[:3]
-        cross = before @ middle @ after.mT
-        made = [cross]
+        made = [before @ middle @ after.mT]
         if len(self.out_keys) > 3:
-            made.append(left_open(smoothing_gain(cross, written[self.module.out_keys[1]]), *link))
+            made.append(left_open(smoothing_gain(made[0], written[self.module.out_keys[1]]), *link))
         return {**written, **dict(zip(self.out_keys[2:], made, strict=True))}
 
     def without_step(self, entries):
@@ -105,8 +97,6 @@ class MomentsPast(SubModel):
     Args:
         belief_prefix: prefix of ``mean`` and of the past, see ``MOMENTS_PAST``.
         forecast_prefix: prefix of ``cov``, ``cross`` and ``open`` of the forecast, see :class:`CrossTransition`.
-        smoothed_prefix: prefix of ``age``.
-        out_key: prefix of ``mean``, ``cov`` and ``gain`` of the past at the new time, before its reading.
     """
 
     def __init__(
@@ -114,15 +104,13 @@ class MomentsPast(SubModel):
         *,
         belief_prefix: str = "belief",
         forecast_prefix: str = "forecast",
-        smoothed_prefix: str = "smoothed",
-        out_key: str = "past",
     ):
         in_keys = [
             (belief_prefix, "mean"),
             *((forecast_prefix, name) for name in ("cov", "cross", "open")),
         ]
-        in_keys += [*((belief_prefix, name) for name in MOMENTS_PAST.carried), (smoothed_prefix, "age")]
-        super().__init__(nn.Identity(), in_keys, [(out_key, name) for name in ("mean", "cov", "gain")])
+        in_keys += [*((belief_prefix, name) for name in MOMENTS_PAST.carried), AGE_KEY]
+        super().__init__(nn.Identity(), in_keys, [("past", name) for name in ("mean", "cov", "gain")])
 
     def compute(self, mean, cov, cross, open_cov, past_mean, past_cov, past_gain, age):
         """The past."""
@@ -144,9 +132,6 @@ class LaggedMoments(SubModel):
     Args:
         belief_prefix: prefix of ``mean``, ``cov`` and of the past that is carried on, see ``MOMENTS_PAST``.
         forecast_prefix: prefix of ``mean`` of the forecast.
-        smoothed_prefix: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]``, ``var`` ``[*B, S]`` and ``age``
-            ``[*B, 1]``, see :class:`LaggedBelief`.
-        past_key: prefix of what :class:`MomentsPast` writes.
         space: in which the state lives; ``None`` for plain numbers.
     """
 
@@ -155,14 +140,12 @@ class LaggedMoments(SubModel):
         *,
         belief_prefix: str = "belief",
         forecast_prefix: str = "forecast",
-        smoothed_prefix: str = "smoothed",
-        past_key: str = "past",
         space: Space | None = None,
     ):
         in_keys = [(belief_prefix, "mean"), (belief_prefix, "cov"), (forecast_prefix, "mean")]
-        in_keys += [*((past_key, name) for name in ("mean", "cov", "gain")), (smoothed_prefix, "age")]
+        in_keys += [*(("past", name) for name in ("mean", "cov", "gain")), AGE_KEY]
         out_keys = [(belief_prefix, name) for name in MOMENTS_PAST.carried]
-        out_keys += [(smoothed_prefix, name) for name in (*MOMENTS_PAST.follow, "age")]
+        out_keys += [("smoothed", name) for name in (*MOMENTS_PAST.follow, "age")]
         super().__init__(nn.Identity(), in_keys, out_keys)
         self.space = space
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch_denkf.filters import Filter
 from torch_denkf.functional.smoothing.rts import rts_smooth
 from torch_denkf.smoothers.base import Smoother
-from torch_denkf.smoothers.fixed_lag import kind_of, rebuilt
+from torch_denkf.smoothers.fixed_lag import prefix_of
 from torch_denkf.smoothers.past_moments import CrossTransition
 
 __all__ = ["RTSSmoother"]
@@ -44,21 +44,15 @@ class RTSSmoother(Smoother):
     """
 
     def __init__(self, filter: Filter, lag: int | None = None):
-        kind, prefix = kind_of(filter)
-        if kind != "moments":
-            raise TypeError(
-                f"RTSSmoother takes a filter with a mean and a covariance; {type(filter).__name__} has none."
-            )
+        prefix = prefix_of(filter, "moments", self)
         self.place = filter.structure.transition[0]
         forecast = filter.structure.forecast_of[prefix, "mean"][0]
-        self.link_keys = {"cross_key": (forecast, "cross"), "open_key": (forecast, "open")}
         CrossTransition(filter.transition_module)  # refuses what gives no cross-covariance
         keys = [(prefix, "mean"), (prefix, "cov"), *((forecast, name) for name in ("mean", "cov", "cross", "open"))]
         super().__init__(filter, lag, keys, ("mean", "cov", "var"))
 
     def _extended(self, lag):
-        own = CrossTransition(self.filter.transition_module, **self.link_keys)
-        return rebuilt(self.filter, {self.place: own})
+        return self.filter.with_modules({self.place: CrossTransition(self.filter.transition_module, with_open=True)})
 
     def _smooth(self, entries, follows, out):
         space = self.filter.structure.space

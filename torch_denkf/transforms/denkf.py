@@ -229,10 +229,7 @@ class DEnKFTransform(Checked, Transform):
                     "in the place of a transform declares nothing."
                 )
                 raise diagnosis().missing_entry("The filter", [key], source.keys(True, True), cure)
-            if isinstance(target, dict):
-                target[key] = value
-            else:
-                target.set(key, value)
+            target[key] = value
 
     # ------------------------------------------------------------------------------------------------- the specs
 

@@ -9,10 +9,10 @@ from tensordict.nn import TensorDictSequential
 from benchmarks.kitti.recipes._base import HISTORY, KITTIRecipe, register
 from benchmarks.kitti.sensors import SAMPLES
 from torch_denkf.applications.car import UnicycleMotion
+from torch_denkf.applications.car.modules.member_gain import MemberGain
 from torch_denkf.applications.car.modules.pairs import with_history
 from torch_denkf.applications.car.odometry.filter import velocity_analysis
 from torch_denkf.modules import AroundState, EnsembleAnalysis, StochasticMLP
-from torch_denkf.modules.noise import MemberGain
 
 
 @register

@@ -14,11 +14,11 @@ from benchmarks.reliability.borders.filters_made import IMAGE_SHAPE, SIGMA
 from benchmarks.reliability.target import Subject, Target, targets_of
 from torch_denkf import modules as m
 from torch_denkf.applications.car import FlowSensor, UnicycleMotion, UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car.modules.member_gain import MemberGain
 from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, with_history
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.baselines.lstm_cell import LSTMUpdate, with_memory
 from torch_denkf.modules.keypoints import SpatialSoftArgmax
-from torch_denkf.modules.noise import MemberGain
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
 from torch_denkf.modules.stochastic import FlipoutLinear
 

@@ -6,7 +6,6 @@ import torch
 from torch_denkf.functional.kernels.random_bits import (
     dropout_factor,
     random_bytes,
-    random_keep_mask,
     random_signs,
     representable_rate,
 )
@@ -32,19 +31,15 @@ def test_rate_outside_its_range(rate):
 @pytest.mark.parametrize("rate", [0.1, 0.25, 0.5, 0.9])
 def test_keep_rate_in_every_byte_of_a_word(rate):
     words = 200_000
-    kept = random_keep_mask((words, 8), rate).sum(0)
+    kept = (random_bytes((words, 8)) >= 256 * representable_rate(rate)).sum(0)
     keep = 1 - representable_rate(rate)
     assert ((kept - words * keep).abs() < binomial_bound(words, keep)).all()
-
-
-def test_rate_zero_keeps_everything():
-    assert random_keep_mask((1000, 8), 0.0).all()
 
 
 def test_neighbours_are_independent():
     # Under independence the product of two neighbours is Bernoulli(keep^2).
     n, keep = 400_001, 0.75
-    mask = random_keep_mask((n,), 0.25)
+    mask = random_bytes((n,)) >= 64
     both = (mask[1:] & mask[:-1]).sum()
     # Overlapping pairs are correlated; each shares a bit with two others, so the variance is at most trebled.
     assert abs(both - (n - 1) * keep**2) < 3**0.5 * binomial_bound(n - 1, keep**2)
@@ -52,14 +47,14 @@ def test_neighbours_are_independent():
 
 @pytest.mark.parametrize("shape", [(), (1,), (7,), (8,), (9,), (3, 5, 7), (0, 4)])
 def test_any_shape(shape):
-    mask = random_keep_mask(shape, 0.5)
+    mask = random_signs(shape)
     assert mask.shape == shape
     assert mask.dtype == torch.bool
 
 
 def test_generator_repeats_and_leaves_the_global_one_alone():
     before = torch.get_rng_state()
-    draws = [random_keep_mask((999,), 0.3, generator=torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+    draws = [random_bytes((999,), generator=torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
     assert draws[0].equal(draws[1])
     assert not draws[0].equal(draws[2])
     assert torch.get_rng_state().equal(before)
@@ -79,9 +74,3 @@ def test_dropout_factor_of_every_byte_at_every_rate(dtype):
         expected = torch.where(torch.arange(256) >= numerator, kept, 0)
         assert dropout_factor(draws, rate, dtype).equal(expected), rate
         assert dropout_factor(torch.arange(256) >= numerator, rate, dtype).equal(expected), rate
-
-
-def test_masks_are_the_bytes_at_or_above_the_threshold():
-    draws = random_bytes((1001,), generator=torch.Generator().manual_seed(4))
-    mask = random_keep_mask((1001,), 0.1, generator=torch.Generator().manual_seed(4))
-    assert mask.equal(draws.int() >= 26)

@@ -7,12 +7,14 @@ from torch_denkf.functional import kalman_update
 from torch_denkf.functional.kernels.small_system import (
     LARGEST,
     LARGEST_FACTOR,
-    cholesky_solve_written_out,
-    cholesky_written_out,
-    gain_written_out,
-    solve_written_out,
+    WrittenOut,
 )
 from torch_denkf.functional.linalg import cholesky
+
+
+def solutions(gram, cross, shift, mean_shift):
+    system = WrittenOut(gram, ridge=1)
+    return system.between(shift, cross), system.square(mean_shift.mT), system.log_det()
 
 
 def systems(size, batch=(3,)):
@@ -29,7 +31,7 @@ def test_solution_and_gradients_are_those_of_linalg(float64, size):
         square = (mean_shift @ torch.linalg.solve(matrix, mean_shift.mT)).squeeze(-1)
         return shift @ torch.linalg.solve(matrix, cross), square, matrix.logdet().unsqueeze(-1)
 
-    ours, theirs = solve_written_out(*inputs), oracle(*inputs)
+    ours, theirs = solutions(*inputs), oracle(*inputs)
     for value, expected in zip(ours, theirs, strict=True):
         torch.testing.assert_close(value, expected, rtol=1e-12, atol=1e-12)
     seeds = [torch.randn_like(value) for value in ours]
@@ -44,7 +46,7 @@ def test_solution_and_gradients_are_those_of_linalg(float64, size):
 def test_what_is_not_positive_definite_is_nan_and_alone(float64):
     gram, cross, shift, mean_shift = systems(2)
     gram[1] = torch.tensor([[-3.0, 0.0], [0.0, 1.0]])
-    for value in solve_written_out(gram, cross, shift, mean_shift):
+    for value in solutions(gram, cross, shift, mean_shift):
         assert value[1].isnan().all()
         assert value[[0, 2]].isfinite().all()
 
@@ -52,7 +54,7 @@ def test_what_is_not_positive_definite_is_nan_and_alone(float64):
 @pytest.mark.parametrize("size", range(1, LARGEST_FACTOR + 1))
 def test_the_factor_and_its_gradient_are_those_of_linalg(float64, size):
     matrix = (systems(size)[0] + torch.eye(size)).requires_grad_()
-    ours, theirs = cholesky_written_out(matrix), torch.linalg.cholesky(matrix)
+    ours, theirs = WrittenOut(matrix).factor(), torch.linalg.cholesky(matrix)
     torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
     seed = torch.randn_like(ours).tril()
     gradients = [torch.autograd.grad(value, matrix, seed)[0] for value in (ours, theirs)]
@@ -64,29 +66,18 @@ def test_the_solution_by_a_factor_is_that_of_linalg(float64, size):
     gram, right, *_ = systems(size)
     matrix = gram + torch.eye(size)
     expected = torch.linalg.solve(matrix, right)
-    torch.testing.assert_close(cholesky_solve_written_out(matrix, right), expected, rtol=1e-11, atol=1e-11)
-    assert cholesky_solve_written_out(-matrix, right).isnan().all()
+    torch.testing.assert_close(WrittenOut(matrix).solve(right), expected, rtol=1e-11, atol=1e-11)
+    assert WrittenOut(-matrix).solve(right).isnan().all()
 
 
 @pytest.mark.parametrize("place", range(3))
 def test_a_matrix_without_a_factor_is_nan_and_alone(float64, place):
     matrix = torch.eye(3).repeat(2, 1, 1)
     matrix[1, place, place] = -1
-    factor = cholesky_written_out(matrix)
+    factor = WrittenOut(matrix).factor()
     assert torch.equal(factor[0], torch.eye(3))
     assert factor[1].isnan().all()
     torch.testing.assert_close(factor, cholesky(matrix), equal_nan=True)
-
-
-@pytest.mark.parametrize("size", range(1, LARGEST + 1))
-def test_the_gain_is_that_of_linalg(float64, size):
-    gram, cross, _, residual = systems(size)
-    matrix, residual = gram + torch.eye(size), residual.squeeze(-2)
-    gain, square, log_det = gain_written_out(matrix, cross, residual)
-    torch.testing.assert_close(gain, torch.linalg.solve(matrix, cross).mT, rtol=1e-12, atol=1e-12)
-    solved = torch.linalg.solve(matrix, residual)
-    torch.testing.assert_close(square, (residual * solved).sum(-1, keepdim=True), rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(log_det, matrix.logdet().unsqueeze(-1), rtol=1e-12, atol=1e-12)
 
 
 def test_a_compiled_update_equals_the_eager_one(float64):

@@ -14,7 +14,7 @@ import torch
 
 from torch_denkf.functional.kernels.small_system import made_once, on_gpu
 
-__all__ = ["balanced_bytes", "dropout_factor", "random_bytes", "random_keep_mask", "random_signs", "representable_rate"]
+__all__ = ["balanced_bytes", "dropout_factor", "random_bytes", "random_signs", "representable_rate"]
 
 _INT64_MIN = -(2**63)
 _GOLDEN = 0.6180339887498949
@@ -158,33 +158,6 @@ def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torc
     return line.mul_(1024).add_(2 * kept - 1024 * round(256 * rate)).clamp_(0.0, kept).to(dtype)
 
 
-def random_keep_mask(
-    shape: Sequence[int],
-    rate: float,
-    *,
-    device: torch.device | str | None = None,
-    generator: torch.Generator | None = None,
-) -> torch.Tensor:
-    """Draws a mask that is ``True`` (keep) with probability ``1 - representable_rate(rate)``.
-
-    Args:
-        shape: shape of the mask.
-        rate: drop probability in [0, 1); rounded to a multiple of 1/256.
-        device: where the mask is drawn.
-        generator: source of randomness; torch's global one by default.
-
-    Returns:
-        A boolean tensor of shape ``shape``.
-
-    Example:
-        >>> keep = random_keep_mask((4, 1000), rate=0.25, generator=torch.Generator().manual_seed(0))
-        >>> keep.shape, 0.72 < keep.float().mean() < 0.78
-        (torch.Size([4, 1000]), tensor(True))
-    """
-    draws = random_bytes(shape, device=device, generator=generator)
-    return draws >= int(representable_rate(rate) * 256)
-
-
 def random_signs(
     shape: Sequence[int],
     *,
@@ -192,4 +165,4 @@ def random_signs(
     generator: torch.Generator | None = None,
 ) -> torch.Tensor:
     """Draws fair coins, as a boolean tensor of shape ``shape``: ``True`` stands for +1, ``False`` for -1."""
-    return random_keep_mask(shape, 0.5, device=device, generator=generator)
+    return random_bytes(shape, device=device, generator=generator) >= 128

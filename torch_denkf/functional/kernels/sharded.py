@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 
 import torch
 import torch.distributed as dist
@@ -89,17 +90,5 @@ def analyse_sharded(
         return [part.view_as(one).to(one.dtype) for part, one in zip(parts, sums, strict=True)]
 
     columns = max(TILE_ELEMENTS // forecast[..., 0].numel(), 64)
-    return Analysis(
-        *analyse_in_tiles(
-            forecast,
-            predicted,
-            observation,
-            noise,
-            scheme=scheme,
-            columns=columns,
-            observed=observed,
-            perturbation=perturbation,
-            rotation=rotation,
-            total=total,
-        )
-    )
+    tiled = partial(analyse_in_tiles, scheme=scheme, columns=columns, observed=observed, total=total)
+    return Analysis(*tiled(*given.values(), perturbation=perturbation, rotation=rotation))

@@ -8,7 +8,7 @@ or cannot be captured into a CUDA graph, as MAGMA's: :func:`inverse_of` takes th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable
 
 import torch
 from torch import Tensor
@@ -83,157 +83,89 @@ def inverse_of(matrix: Tensor, ridge: float = 0) -> tuple[Tensor, Tensor]:
     return root.mT @ root, torch.cat(pivots, -2).log().sum(-2)
 
 
-def solve_written_out(gram: Tensor, cross: Tensor, shift: Tensor, mean_shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Solve with I + G, G symmetric and O x O, without a call of LAPACK or a product of matrices.
-
-    Args:
-        gram: G, ``[*B, O, O]`` with O of 1 to 4; its lower triangle is read.
-        cross: right-hand sides C, ``[*B, O, S]``.
-        shift: rows D, ``[*B, E, O]`` or ``[*B, 1, O]``.
-        mean_shift: one row d, ``[*B, 1, O]``.
-
-    Returns:
-        D (I + G)⁻¹ C, ``[*B, E, S]``; d (I + G)⁻¹ dᵀ and log det (I + G), ``[*B, 1]`` each. NaN where I + G is not
-        positive definite.
-
-    Examples:
-        >>> one = torch.ones(1, 1)
-        >>> increment, square, log_det = solve_written_out(3 * one, one, 2 * one, 2 * one)
-        >>> increment.item(), square.item(), log_det.exp().item()
-        (0.5, 1.0, 4.0)
-    """
-    lower = _factor(gram, ridge=1)
-    solved = _solve(lower, _rows(cross))
-    increment = _sum(shift[..., i, None] * value.unsqueeze(-2) for i, value in enumerate(solved))
-    square = _squared_norm(_forward(lower, _entries(mean_shift.squeeze(-2))))
-    return increment, square, _log_det(lower)
+def is_written_out(matrix: Tensor, largest: int = LARGEST) -> bool:
+    """Tells whether a compiler is to see a system of one to ``largest`` unknowns written out."""
+    return torch.compiler.is_compiling() and 0 < matrix.shape[-1] <= largest
 
 
-def gain_written_out(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The gain of a symmetric M, O x O, and what its likelihood needs, without a call of LAPACK.
+class WrittenOut:
+    """The Cholesky factor L of a symmetric matrix M, N x N, element by element: no call of LAPACK.
 
-    Args:
-        matrix: M, ``[*B, O, O]`` with O of 1 to 4; its lower triangle is read.
-        cross: C, ``[*B, O, S]``.
-        residual: r, ``[*B, O]``.
-
-    Returns:
-        Cᵀ M⁻¹, ``[*B, S, O]``; rᵀ M⁻¹ r and log det M, ``[*B, 1]`` each. NaN where M is not positive definite.
-
-    Examples:
-        >>> one = torch.ones(1, 1)
-        >>> gain, square, log_det = gain_written_out(4 * one, 2 * one, 2 * one[0])
-        >>> gain.item(), square.item(), log_det.exp().item()
-        (0.5, 1.0, 4.0)
-    """
-    lower = _factor(matrix)
-    gain = torch.stack(_solve(lower, _rows(cross)), -1)
-    return gain, _squared_norm(_forward(lower, _entries(residual))), _log_det(lower)
-
-
-def cholesky_written_out(matrix: Tensor) -> Tensor:
-    """The lower Cholesky factor of a symmetric N x N matrix, all NaN where there is none; N of 1 to 6.
-
-    Examples:
-        >>> cholesky_written_out(torch.tensor([[[4.0]], [[-1.0]]])).flatten()
-        tensor([2., nan])
-    """
-    lower = _factor(matrix)
-    last = lower[-1][-1]  # NaN where any pivot is not positive
-    zero = torch.where(last > 0, torch.zeros_like(last), last)
-    rows = [torch.cat([*row, *[zero] * (len(lower) - len(row))], -1) for row in lower]
-    factor = torch.stack(rows, -2)
-    return torch.where((last > 0).unsqueeze(-1), factor, torch.nan)
-
-
-def cholesky_solve_written_out(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve M X = Y with a symmetric M, N x N with N of 1 to 6; NaN where M is not positive definite.
+    What it returns is NaN where M is not positive definite.
 
     Args:
         matrix: M, ``[*B, N, N]``; its lower triangle is read.
-        right: Y, ``[*B, N, K]``.
-
-    Returns:
-        X, ``[*B, N, K]``.
+        ridge: is added to the diagonal.
 
     Examples:
-        >>> cholesky_solve_written_out(torch.tensor([[2.0, 0.0], [1.0, 1.0]]), torch.tensor([[1.0], [0.0]])).mT
-        tensor([[ 1., -1.]])
+        >>> system = WrittenOut(torch.tensor([[4.0, 0.0], [2.0, 2.0]]))
+        >>> system.factor()
+        tensor([[2., 0.],
+                [1., 1.]])
+        >>> right = torch.tensor([[2.0], [0.0]])
+        >>> system.forward(right).mT, system.solve(right).mT, system.square(right), system.log_det().exp()
+        (tensor([[ 1., -1.]]), tensor([[ 1., -1.]]), tensor([2.]), tensor([4.]))
     """
-    return torch.stack(_solve(_factor(matrix), _rows(right)), -2)
+
+    def __init__(self, matrix: Tensor, ridge: float = 0):
+        lower: list[list[Tensor]] = []
+        for i in range(matrix.shape[-1]):  # each element is [*B, 1], NaN from a pivot on that has no root
+            row: list[Tensor] = []
+            for j in range(i + 1):
+                rest = matrix[..., i, j, None]
+                for k in range(j):
+                    rest = rest - row[k] * (lower[j][k] if j < i else row[k])
+                if j < i:
+                    row.append(rest / lower[j][j])
+                else:
+                    pivot = rest + ridge if ridge else rest
+                    row.append(torch.where(pivot > 0, pivot, torch.nan).sqrt())
+            lower.append(row)
+        self.lower = lower
+
+    def factor(self) -> Tensor:
+        """Returns L, ``[*B, N, N]``, all NaN where there is none."""
+        last = self.lower[-1][-1]  # NaN where any pivot is not positive
+        zero = torch.where(last > 0, torch.zeros_like(last), last)
+        rows = [torch.cat([*row, *[zero] * (len(self.lower) - len(row))], -1) for row in self.lower]
+        return torch.where((last > 0).unsqueeze(-1), torch.stack(rows, -2), torch.nan)
+
+    def forward(self, right: Tensor) -> Tensor:
+        """Returns L⁻¹ Y, ``[*B, N, K]``."""
+        return torch.stack(self._forward(right), -2)
+
+    def solve(self, right: Tensor) -> Tensor:
+        """Returns M⁻¹ Y, ``[*B, N, K]``."""
+        return torch.stack(self._solve(right), -2)
+
+    def between(self, left: Tensor, right: Tensor) -> Tensor:
+        """Returns D M⁻¹ Y, ``[*B, E, K]``, for D ``[*B, E, N]``, without a product of matrices."""
+        return _sum([left[..., i, None] * value.unsqueeze(-2) for i, value in enumerate(self._solve(right))])
+
+    def square(self, vector: Tensor) -> Tensor:
+        """Returns rᵀ M⁻¹ r, ``[*B, 1]``, for r ``[*B, N, 1]``."""
+        return _sum([value.square() for value in self._forward(vector)])
+
+    def log_det(self) -> Tensor:
+        """Returns log det M, ``[*B, 1]``."""
+        return 2 * _sum([row[-1].log() for row in self.lower])
+
+    def _forward(self, right: Tensor) -> list[Tensor]:
+        solved: list[Tensor] = []
+        for i, rest in enumerate(right.unbind(-2)):
+            for k in range(i):
+                rest = rest - self.lower[i][k] * solved[k]
+            solved.append(rest / self.lower[i][i])
+        return solved
+
+    def _solve(self, right: Tensor) -> list[Tensor]:
+        solved = self._forward(right)
+        for i in reversed(range(len(solved))):  # with the transpose of L, in place
+            for k in range(i + 1, len(solved)):
+                solved[i] = solved[i] - self.lower[k][i] * solved[k]
+            solved[i] = solved[i] / self.lower[i][i]
+        return solved
 
 
-def forward_written_out(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve L X = Y with the Cholesky factor L of a symmetric M, N x N with N of 1 to 6.
-
-    Args:
-        matrix: M, ``[*B, N, N]``; its lower triangle is read.
-        right: Y, ``[*B, N, K]``.
-
-    Returns:
-        X, ``[*B, N, K]``; NaN where M is not positive definite.
-
-    Examples:
-        >>> forward_written_out(torch.tensor([[4.0, 0.0], [2.0, 2.0]]), torch.tensor([[2.0], [0.0]])).mT
-        tensor([[ 1., -1.]])
-    """
-    return torch.stack(_forward(_factor(matrix), _rows(right)), -2)
-
-
-def _rows(matrix: Tensor) -> Sequence[Tensor]:
-    return matrix.unbind(-2)
-
-
-def _entries(vector: Tensor) -> Sequence[Tensor]:
-    return vector.split(1, -1)
-
-
-def _factor(matrix: Tensor, ridge: float = 0) -> list[list[Tensor]]:
-    """L of the matrix and ``ridge`` on its diagonal; each element ``[*B, 1]``, NaN from a pivot on that has no root."""
-    lower: list[list[Tensor]] = []
-    for i in range(matrix.shape[-1]):
-        row: list[Tensor] = []
-        for j in range(i + 1):
-            rest = matrix[..., i, j, None]
-            for k in range(j):
-                rest = rest - row[k] * (lower[j][k] if j < i else row[k])
-            if j < i:
-                row.append(rest / lower[j][j])
-            else:
-                pivot = rest + ridge if ridge else rest
-                row.append(torch.where(pivot > 0, pivot, torch.nan).sqrt())
-        lower.append(row)
-    return lower
-
-
-def _forward(lower: list[list[Tensor]], values: Sequence[Tensor]) -> list[Tensor]:
-    """L⁻¹ times rows ``[*B, ...]``."""
-    solved: list[Tensor] = []
-    for i, rest in enumerate(values):
-        for k in range(i):
-            rest = rest - lower[i][k] * solved[k]
-        solved.append(rest / lower[i][i])
-    return solved
-
-
-def _solve(lower: list[list[Tensor]], values: Sequence[Tensor]) -> list[Tensor]:
-    """(L Lᵀ)⁻¹ times rows."""
-    solved = _forward(lower, values)
-    for i in reversed(range(len(solved))):  # with the transpose of L, in place
-        for k in range(i + 1, len(solved)):
-            solved[i] = solved[i] - lower[k][i] * solved[k]
-        solved[i] = solved[i] / lower[i][i]
-    return solved
-
-
-def _squared_norm(entries: Sequence[Tensor]) -> Tensor:
-    return _sum(value.square() for value in entries)
-
-
-def _log_det(lower: list[list[Tensor]]) -> Tensor:
-    return 2 * _sum(row[-1].log() for row in lower)
-
-
-def _sum(values: Iterable[Tensor]) -> Tensor:
-    first, *others = values
-    return sum(others, first)
+def _sum(values: list[Tensor]) -> Tensor:
+    return sum(values[1:], values[0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -101,8 +101,67 @@ class Opposite(Space):
         return self.part.near(points, weights)
 
 
+class _Made(Space):
+    """A space that is made of others: what each of them does, side by side."""
+
+    @property
+    def flat(self):
+        """The joined lines and circles."""
+        circular, size = [], 0
+        for part in self.parts:
+            if part.flat is None:
+                return None
+            circular += [size + index for index in part.flat.circular]
+            size += part.flat.size
+        return Flat(size, circular)
+
+    def compose(self, first, second):
+        """Composes each part."""
+        return self._each("compose", first, second)
+
+    def inverse(self, point):
+        """Returns the inverse of each part."""
+        return self._each("inverse", point)
+
+    def exp(self, tangent):
+        """Returns the point of each part's tangent."""
+        return self._each("exp", tangent)
+
+    def log(self, point):
+        """Returns the tangent of each part."""
+        return self._each("log", point)
+
+    def normalise(self, point):
+        """Normalises each part."""
+        return self._each("normalise", point)
+
+    def right_jacobian(self, tangent):
+        """Returns those of the parts, as blocks."""
+        return self._diagonal("right_jacobian", tangent)
+
+    def adjoint(self, point):
+        """Returns those of the parts, as blocks."""
+        return self._diagonal("adjoint", point)
+
+    def basis(self, point):
+        """Returns those of the parts, as blocks."""
+        return self._diagonal("basis", point)
+
+    def dual_basis(self, point):
+        """Returns those of the parts, as blocks."""
+        return self._diagonal("dual_basis", point)
+
+    def _each(self, name: str, *values: Tensor) -> Tensor:
+        """Returns what a method of each part makes of its own numbers, side by side."""
+        raise NotImplementedError
+
+    def _diagonal(self, name: str, value: Tensor) -> Tensor:
+        """Returns what a method of each part makes of its own numbers, as blocks of a diagonal."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True)
-class Product(Space):
+class Product(_Made):
     """Several spaces side by side: points and tangents are those of the parts, one behind the other.
 
     Args:
@@ -126,73 +185,38 @@ class Product(Space):
         object.__setattr__(self, "point_dim", sum(part.point_dim for part in parts))
         object.__setattr__(self, "tangent_dim", sum(part.tangent_dim for part in parts))
 
-    @property
-    def flat(self):
-        """The parts side by side, where all are lines and circles."""
-        return _joined(self.parts)
-
-    def compose(self, first, second):
-        """Part by part."""
-        return self._each(lambda part, *both: part.compose(*both), self.points(first), self.points(second))
-
-    def inverse(self, point):
-        """Part by part."""
-        return self._each(lambda part, own: part.inverse(own), self.points(point))
-
-    def exp(self, tangent):
-        """Part by part."""
-        return self._each(lambda part, own: part.exp(own), self.tangents(tangent))
-
-    def log(self, point):
-        """Part by part."""
-        return self._each(lambda part, own: part.log(own), self.points(point))
-
-    def right_jacobian(self, tangent):
-        """Blocks on the diagonal."""
-        return blocks([part.right_jacobian(own) for part, own in zip(self.parts, self.tangents(tangent), strict=True)])
-
-    def adjoint(self, point):
-        """Blocks on the diagonal."""
-        return blocks([part.adjoint(own) for part, own in zip(self.parts, self.points(point), strict=True)])
-
-    def basis(self, point):
-        """Blocks on the diagonal."""
-        return blocks([part.basis(own) for part, own in zip(self.parts, self.points(point), strict=True)])
-
-    def dual_basis(self, point):
-        """Blocks on the diagonal."""
-        return blocks([part.dual_basis(own) for part, own in zip(self.parts, self.points(point), strict=True)])
-
     def neutral(self, like=None):
-        """Part by part."""
+        """Returns those of the parts."""
         return torch.cat([part.neutral(like) for part in self.parts])
 
-    def normalise(self, point):
-        """Part by part."""
-        return self._each(lambda part, own: part.normalise(own), self.points(point))
-
     def mean(self, points, weights=None):
-        """Part by part."""
-        return self._each(lambda part, own: part.mean(own, weights), self.points(points))
+        """Returns the mean of each part."""
+        return self._each("mean", points, weights=weights)
 
     def near(self, points, weights=None):
-        """Part by part."""
-        return self._each(lambda part, own: part.near(own, weights), self.points(points))
+        """Returns a point near those of each part."""
+        return self._each("near", points, weights=weights)
 
     def points(self, point: Tensor) -> Sequence[Tensor]:
-        """The parts of a point."""
+        """Returns the numbers of each part."""
         return point.split([part.point_dim for part in self.parts], -1)
 
-    def tangents(self, tangent: Tensor) -> Sequence[Tensor]:
-        """The parts of a tangent."""
-        return tangent.split([part.tangent_dim for part in self.parts], -1)
+    def _apart(self, name: str, value: Tensor) -> Sequence[Tensor]:
+        if name not in ("exp", "right_jacobian"):
+            return self.points(value)
+        return value.split([part.tangent_dim for part in self.parts], -1)
 
-    def _each(self, function: Callable[..., Tensor], *values: Sequence[Tensor]) -> Tensor:
-        return torch.cat([function(*own) for own in zip(self.parts, *values, strict=True)], -1)
+    def _each(self, name, *values, **options):
+        apart = zip(self.parts, *(self._apart(name, value) for value in values), strict=True)
+        return torch.cat([getattr(part, name)(*own, **options) for part, *own in apart], -1)
+
+    def _diagonal(self, name, value):
+        apart = zip(self.parts, self._apart(name, value), strict=True)
+        return blocks([getattr(part, name)(own) for part, own in apart])
 
 
 @dataclass(frozen=True)
-class Repeated(Space):
+class Repeated(_Made):
     """N points of one space side by side: ``Product(space, space, ...)``, worked out for all at once.
 
     Args:
@@ -223,61 +247,20 @@ class Repeated(Space):
         """N times the same."""
         return (self.part,) * self.count
 
-    @property
-    def flat(self):
-        """The parts side by side, where these are lines and circles."""
-        return _joined(self.parts)
-
-    def compose(self, first, second):
-        """Point by point."""
-        return self._each(self.part.compose, first, second)
-
-    def inverse(self, point):
-        """Point by point."""
-        return self._each(self.part.inverse, point)
-
-    def exp(self, tangent):
-        """Point by point."""
-        return self._each(self.part.exp, tangent)
-
-    def log(self, point):
-        """Point by point."""
-        return self._each(self.part.log, point)
-
-    def right_jacobian(self, tangent):
-        """Blocks on the diagonal."""
-        return self._diagonal(self.part.right_jacobian, tangent)
-
-    def adjoint(self, point):
-        """Blocks on the diagonal."""
-        return self._diagonal(self.part.adjoint, point)
-
-    def basis(self, point):
-        """Blocks on the diagonal."""
-        return self._diagonal(self.part.basis, point)
-
-    def dual_basis(self, point):
-        """Blocks on the diagonal."""
-        return self._diagonal(self.part.dual_basis, point)
-
     def neutral(self, like=None):
         """N times the same."""
         return self.part.neutral(like).repeat(self.count)
-
-    def normalise(self, point):
-        """Point by point."""
-        return self._each(self.part.normalise, point)
 
     def near(self, points, weights=None):
         """Point by point."""
         apart = points.unflatten(-1, (self.count, -1)).movedim(-2, -3)
         return self.part.near(apart, None if weights is None else weights.unsqueeze(-2)).flatten(-2)
 
-    def _each(self, function: Callable[..., Tensor], *values: Tensor) -> Tensor:
-        return function(*(value.unflatten(-1, (self.count, -1)) for value in values)).flatten(-2)
+    def _each(self, name, *values):
+        return getattr(self.part, name)(*(value.unflatten(-1, (self.count, -1)) for value in values)).flatten(-2)
 
-    def _diagonal(self, function: Callable[[Tensor], Tensor], value: Tensor) -> Tensor:
-        blocks = function(value.unflatten(-1, (self.count, -1)))
+    def _diagonal(self, name, value):
+        blocks = getattr(self.part, name)(value.unflatten(-1, (self.count, -1)))
         return (eye(value, self.count)[..., None, :, None] * blocks.unsqueeze(-2)).flatten(-2).flatten(-3, -2)
 
 
@@ -336,14 +319,3 @@ def whole_parts(space: Space, known: Tensor) -> tuple[Tensor, Tensor]:
         tensor([False, False, False,  True, False])
     """
     return side_by_side([place.space._whole(known[..., place.point]) for place in places_of(space)])
-
-
-def _joined(parts: Sequence[Space]) -> Flat | None:
-    """Spaces of lines and circles side by side; ``None`` where one is another."""
-    circular, size = [], 0
-    for part in parts:
-        if part.flat is None:
-            return None
-        circular += [size + index for index in part.flat.circular]
-        size += part.flat.size
-    return Flat(size, circular)

@@ -89,14 +89,12 @@ class Space:
 
     def plus(self, point: Tensor, tangent: Tensor) -> Tensor:
         """The point ``[*, P]`` that a tangent ``[*, D]`` leads to."""
-        self.check(point=point)
-        self.check(tangent=tangent)
+        self.check(point=point, tangent=tangent)
         return self.compose(point, self.exp(tangent))
 
     def minus(self, point: Tensor, origin: Tensor) -> Tensor:
         """The shortest tangent ``[*, D]`` from ``origin`` to ``point``, both ``[*, P]``."""
-        self.check(point=point)
-        self.check(origin=origin)
+        self.check(point=point, origin=origin)
         return self.log(self.compose(self.inverse(origin), point))
 
     def distance(self, point: Tensor, other: Tensor) -> Tensor:

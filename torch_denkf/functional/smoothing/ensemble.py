@@ -16,7 +16,7 @@ from torch_denkf._checks import check_ensemble, check_number, check_shape
 from torch_denkf.functional.linalg import semidefinite_solve, solve
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_anomalies
-from torch_denkf.functional.smoothing.rts import check_lag
+from torch_denkf.functional.smoothing.backward import run_backward
 
 
 def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping: float = 1.0) -> Tensor:
@@ -108,31 +108,14 @@ def enrts_smooth(
         >>> enrts_smooth(beliefs, torch.stack([members, members]))[0].mean().round(decimals=4)
         tensor(1.)
     """
-    check_lag(lag)
-    check_ensemble("ensemble", ensemble, min_size=2)
-    check_shape("forecast", forecast, ensemble.shape, "[*B, T, E, S]")
-    before, moved = ensemble[..., :-1, :, :], forecast[..., 1:, :, :]
-    if follows is not None:
-        check_shape("follows", follows, ensemble.shape[:-2], "[*B, T]")
-        follows = follows[..., 1:]
 
-    def back(index: slice | int, later: Tensor) -> Tensor:
-        own, forecast = before[..., index, :, :], moved[..., index, :, :]
+    def step(own, link, later):
+        values = (*own, *link, *later)
         if space is None:
-            out = enrts_step(own, forecast, later, damping=damping)
-        else:
-            center, expected = (space.mean(points).unsqueeze(-2) for points in (own, forecast))
-            tangents = [space.minus(points, expected) for points in (forecast, later)]
-            out = space.plus(center, enrts_step(space.minus(own, center), *tangents, damping=damping))
-        return out if follows is None else torch.where(follows[..., index][..., None, None], out, own)
+            return (enrts_step(*values, damping=damping),)
+        center, expected = (space.mean(points).unsqueeze(-2) for points in values[:2])
+        tangents = map(space.minus, values, (center, expected, expected))
+        return (space.plus(center, enrts_step(*tangents, damping=damping)),)
 
-    count = ensemble.shape[-3]
-    if lag is None or lag >= count - 1:
-        out = [ensemble[..., -1, :, :]]
-        for t in range(count - 2, -1, -1):
-            out.append(back(t, out[-1]))
-        return torch.stack(out[::-1], -3)
-    smoothed = ensemble
-    for _ in range(lag):  # all times at once: each round takes in one more reading
-        smoothed = torch.cat([back(slice(None), smoothed[..., 1:, :, :]), ensemble[..., -1:, :, :]], -3)
-    return smoothed
+    check_ensemble("ensemble", ensemble, min_size=2)
+    return run_backward(step, ensemble.ndim - 3, (ensemble,), (forecast,), follows=follows, lag=lag)[0]

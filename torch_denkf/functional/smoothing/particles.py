@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_shape
-from torch_denkf.functional.smoothing.rts import check_lag
+from torch_denkf.functional.smoothing.backward import run_backward
 
 
 def backward_weights(log_weights: Tensor, log_transition: Tensor, log_smoothed: Tensor) -> Tensor:
@@ -72,24 +72,8 @@ def backward_smooth(
         >>> backward_smooth(weights, apart)[0].exp()
         tensor([0.2000, 0.8000])
     """
-    check_lag(lag)
-    before, moves = log_weights[..., :-1, :], log_transition[..., 1:, :, :]
-    if follows is not None:
-        check_shape("follows", follows, log_weights.shape[:-1], "[*B, T]")
-        follows = follows[..., 1:]
 
-    def back(index: slice | int, later: Tensor) -> Tensor:
-        own = before[..., index, :]
-        out = backward_weights(own, moves[..., index, :, :], later)
-        return out if follows is None else torch.where(follows[..., index].unsqueeze(-1), out, own)
+    def step(own, link, later):
+        return (backward_weights(*own, *link, *later),)
 
-    count = log_weights.shape[-2]
-    if lag is None or lag >= count - 1:
-        out = [log_weights[..., -1, :]]
-        for t in range(count - 2, -1, -1):
-            out.append(back(t, out[-1]))
-        return torch.stack(out[::-1], -2)
-    smoothed = log_weights
-    for _ in range(lag):
-        smoothed = torch.cat([back(slice(None), smoothed[..., 1:, :]), log_weights[..., -1:, :]], -2)
-    return smoothed
+    return run_backward(step, log_weights.ndim - 2, (log_weights,), (log_transition,), follows=follows, lag=lag)[0]

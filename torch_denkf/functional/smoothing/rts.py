@@ -9,12 +9,12 @@ Source: Rauch, Tung & Striebel 1965; Särkkä 2013, theorem 8.2 and section 9 (f
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from torch_denkf._checks import check_count, check_shape
+from torch_denkf._checks import check_shape
 from torch_denkf.functional.linalg import divide, semidefinite_solve
 from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.smoothing.backward import run_backward
 
 
 def smoothing_gain(cross: Tensor, forecast_cov: Tensor) -> Tensor:
@@ -163,40 +163,10 @@ def rts_smooth(
         >>> smoothed.flatten().round(decimals=4)
         tensor([1., 2.])
     """
-    check_lag(lag)
-    values = (mean[..., :-1, :], cov[..., :-1, :, :]), (forecast_mean[..., 1:, :], forecast_cov[..., 1:, :, :])
-    (before, before_cov), (forecast, predicted_cov), link = *values, cross[..., 1:, :, :]
-    if follows is not None:
-        check_shape("follows", follows, mean.shape[:-1], "[*B, T]")
-        follows = follows[..., 1:]
+    links = (forecast_mean, forecast_cov, cross, *(() if open_cov is None else (open_cov,)))
 
-    def back(index: slice | int, later_mean: Tensor, later_cov: Tensor) -> tuple[Tensor, Tensor]:
-        own = before[..., index, :], before_cov[..., index, :, :]
-        step = forecast[..., index, :], predicted_cov[..., index, :, :], link[..., index, :, :]
-        rest = None if open_cov is None else open_cov[..., 1:, :, :][..., index, :, :]
-        new_mean, new_cov = rts_step(*own, *step, later_mean, later_cov, open_cov=rest, space=space)
-        if follows is None:
-            return new_mean, new_cov
-        joined = follows[..., index].unsqueeze(-1)
-        return torch.where(joined, new_mean, own[0]), torch.where(joined.unsqueeze(-1), new_cov, own[1])
+    def step(own, link, later):
+        return rts_step(*own, *link[:3], *later, open_cov=(*link, None)[3], space=space)
 
-    count = mean.shape[-2]
-    if lag is None or lag >= count - 1:
-        means, covs = [mean[..., -1, :]], [cov[..., -1, :, :]]
-        for t in range(count - 2, -1, -1):
-            new_mean, new_cov = back(t, means[-1], covs[-1])
-            means.append(new_mean)
-            covs.append(new_cov)
-        return torch.stack(means[::-1], -2), torch.stack(covs[::-1], -3)
-    smoothed, smoothed_cov = mean, cov
-    for _ in range(lag):  # all times at once: each round takes in one more reading
-        moved = back(slice(None), smoothed[..., 1:, :], smoothed_cov[..., 1:, :, :])
-        smoothed = torch.cat([moved[0], mean[..., -1:, :]], -2)
-        smoothed_cov = torch.cat([moved[1], cov[..., -1:, :, :]], -3)
-    return smoothed, smoothed_cov
-
-
-def check_lag(lag: int | None) -> None:
-    """Raise unless ``lag`` is ``None`` or a whole number, 0 or more."""
-    if lag is not None:
-        check_count("lag", lag, least=0, cure="It counts the later readings that are used; None is for all")
+    mean, cov = run_backward(step, mean.ndim - 2, (mean, cov), links, follows=follows, lag=lag)
+    return mean, cov

@@ -163,7 +163,6 @@ class ClonedPrior(AroundInitial):
     derived = Initial.derived  # the module inside knows entries of another size
 
     def __init__(self, initial: TensorDictModuleBase, lags: int):
-        check_module("initial", initial)
         check_count("lags", lags)
         super().__init__(initial)
         self.input_dim, self.state_dim = 5, 5 + 2 * lags

@@ -2,7 +2,7 @@ r"""A vehicle whose pose follows from its velocities: the motion is known, their
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey
@@ -11,10 +11,9 @@ from torch import nn
 from torch_denkf.applications.car.modules.pairs import within_pair
 from torch_denkf.applications.car.unicycle import unicycle_move
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.modules.tensors import register_location, register_scale
+from torch_denkf.modules.tensors import register_location_and_scale
 from torch_denkf.modules.transition import MemberNetwork
 from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
-from torch_denkf.running import check_network
 from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["UnicycleMotion", "UnicycleTransition"]
@@ -60,7 +59,7 @@ class UnicycleTransition(MemberNetwork, Transition):
 
     def __init__(
         self,
-        velocity: nn.Module,
+        velocity: Callable[..., torch.Tensor],
         dt: float | NestedKey,
         *,
         loc: Sequence[float] | torch.Tensor = (0.0, 0.0),
@@ -70,14 +69,12 @@ class UnicycleTransition(MemberNetwork, Transition):
         in_key: NestedKey = ("belief", "ensemble"),
         out_key: NestedKey = ("forecast", "ensemble"),
     ):
-        check_network("velocity", velocity)
         check_dt(dt)
         histories = [] if history_key is None else [history_key]
         super().__init__(velocity, [in_key, *histories, *keys_of_dt(dt)], [out_key])
         self.dt, self.drift = dt, drift
         self.raw_trend = None if history_key is None else nn.Parameter(torch.full((2,), -2.0))
-        register_location(self, "loc", loc)
-        register_scale(self, "scale", scale)
+        register_location_and_scale(self, loc, scale)
 
     def compute(self, state, *others, noise):
         """The forecast ensemble."""

@@ -52,7 +52,7 @@ class UnicycleNoise(NoiseThrough):
         forecast_mean_key: NestedKey = ("forecast", "mean"),
     ):
         check_dt(dt)
-        super().__init__(noise, [mean_key, forecast_mean_key, *keys_of_dt(dt)])
+        super().__init__(noise, further_keys=[mean_key, forecast_mean_key, *keys_of_dt(dt)])
         self.mean_key, self.forecast_mean_key, self.dt = unravel_key(mean_key), unravel_key(forecast_mean_key), dt
 
     def _matrix(self, entries):

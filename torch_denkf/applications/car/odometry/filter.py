@@ -12,12 +12,12 @@ from torch import Tensor
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.applications.car.modules.flow_sensor import FlowSensor
+from torch_denkf.applications.car.modules.member_gain import MemberGain
 from torch_denkf.applications.car.modules.pairs import PairObservation, with_history
 from torch_denkf.applications.car.modules.unicycle import UnicycleMotion, UnicycleTransition
 from torch_denkf.applications.car.vision.poses import KITTI_DT
 from torch_denkf.filters import Filter
 from torch_denkf.modules import AroundState, DiagonalNoise, EnsembleAnalysis, StochasticMLP
-from torch_denkf.modules.noise import MemberGain
 from torch_denkf.modules.tensors import as_vector
 
 __all__ = ["CarFilter", "CarSettings", "VELOCITIES", "car_filter"]

@@ -5,7 +5,7 @@ import torch
 from scipy.stats import norm
 from tensordict import TensorDict
 
-from torch_denkf.modules.noise import MemberGain
+from torch_denkf.applications.car.modules.member_gain import MemberGain
 
 
 def test_factors_are_lognormal_quantiles_that_stay_with_their_members(float64):

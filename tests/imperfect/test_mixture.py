@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torch_denkf.functional.mixture import log_mixture, mix_members, mix_moments, responsibility
+from torch_denkf.imperfect.mixture import log_mixture, mix_members, mix_moments, responsibility
 
 
 def cov(members):

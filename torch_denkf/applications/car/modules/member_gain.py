@@ -1,0 +1,75 @@
+"""A gain of each sample of a learned reading, drawn once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey
+from torch import nn
+
+from torch_denkf._checks import check_count, check_values
+from torch_denkf.modules.tensors import as_standard_deviations
+from torch_denkf.submodel import SubModel
+
+__all__ = ["MemberGain"]
+
+
+class MemberGain(SubModel):
+    r"""Multiplies the sensor's samples by factors that belong to the members: :math:`\tilde y^i e^{\sigma z^i}`.
+
+    A camera that is mounted a little lower reads all speeds a little too high, today and tomorrow. Drawn anew for each
+    frame, such an error averages out over time, and the filter becomes too sure of itself; or its noise model takes the
+    error for white noise, and the filter follows too slowly. Here the :math:`z^i` are the normal quantiles of E
+    members, always the same: each member keeps its calibration, the ensemble its doubt. Put it behind the sensor.
+
+    Args:
+        std: standard deviation :math:`\sigma` of the logarithm of the factor, for each observation dimension ``[O]``,
+            before training; it is learned.
+        ensemble_size: E.
+        seed: of the order in which the members take the quantiles, for each dimension its own.
+        in_key: the sensor's samples ``[*B, E, O]``.
+        out_key: where to write them, by default in their place.
+
+    Raises:
+        ValueError: if a standard deviation is not positive, or the samples are of another number of members.
+
+    Source:
+        The "consider" parameters of Schmidt (1966), which a filter doubts but does not estimate, as an ensemble.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({("sensor", "ensemble"): torch.full((4, 1), 10.0)})
+        >>> MemberGain([0.1], ensemble_size=4)(td)["sensor", "ensemble"].flatten().sort().values.round(decimals=1)
+        tensor([ 8.7000,  9.6000, 10.4000, 11.5000], grad_fn=...)
+    """
+
+    def __init__(
+        self,
+        std: Sequence[float] | torch.Tensor,
+        *,
+        ensemble_size: int = 32,
+        seed: int = 0,
+        in_key: NestedKey = ("sensor", "ensemble"),
+        out_key: NestedKey | None = None,
+    ):
+        super().__init__(nn.Identity(), [in_key], [in_key if out_key is None else out_key])
+        std = as_standard_deviations("std", std)
+        check_values("std, a standard deviation,", std, above=0)
+        check_count("ensemble_size", ensemble_size, least=2)
+        self.log_std = nn.Parameter(std.log())
+        generator = torch.Generator().manual_seed(seed)
+        levels = (torch.arange(ensemble_size, dtype=std.dtype) + 0.5) / ensemble_size
+        quantiles = torch.special.ndtri(levels)
+        quantiles = quantiles / quantiles.square().mean().sqrt()  # few quantiles spread less than the distribution
+        orders = [torch.randperm(ensemble_size, generator=generator) for _ in std]
+        self.register_buffer("quantiles", torch.stack([quantiles[order] for order in orders], -1))
+
+    def compute(self, samples):
+        """The samples, each with its member's gain."""
+        if samples.shape[-2:] != self.quantiles.shape:
+            raise ValueError(
+                f"MemberGain was made for samples [*B, {self.quantiles.shape[0]}, {self.quantiles.shape[1]}], "
+                f"ensemble_size by the entries of std; {self.in_keys[0]!r} has shape {list(samples.shape)}."
+            )
+        return samples * (self.log_std.exp() * self.quantiles).exp()
