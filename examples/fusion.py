@@ -19,7 +19,8 @@ from torch import nn
 
 from torch_denkf import FusedFilter, FusedSensor, GaussianLoss
 from torch_denkf.fusion import SensorAttention
-from torch_denkf.modules import ContinuousMotion, ContinuousNoise, LinearTransition, MomentPrior, Select
+from torch_denkf.modules import LinearTransition, MomentPrior, Select
+from torch_denkf.motions import ContinuousMotion, ContinuousNoise
 
 DT, LATE = 0.02, 15  # s; steps by which the GPS is late
 PUSH = 1.0  # m/s for each root of a second: how much the speed wanders

@@ -127,6 +127,12 @@ def test_no_docstring_names_a_study():
     assert not found
 
 
+def test_docstrings_open_with_a_verb_and_the_term():
+    riddle = re.compile(r"(What|Where|Whether|Which|How|Of|Those|Likewise|The same)\b")
+    paths = (ROOT / "torch_denkf").rglob("*.py")
+    assert not {(path.name, text.splitlines()[0]) for path in paths for text in docstrings(path) if riddle.match(text)}
+
+
 IMPORTS = """
 import json, sys
 

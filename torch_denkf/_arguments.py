@@ -13,10 +13,10 @@ __all__ = ["Checked", "check_arguments", "check_key"]
 
 
 class Checked:
-    """A class whose constructor is told by its annotations what it takes.
+    """A class whose constructor checks its arguments by their annotations.
 
     An argument that is annotated as a key, a list of keys, a flag or a function is one; an argument of another name is
-    refused. Numbers and tensors are checked by the constructors, which know their limits.
+    an error. Numbers and tensors are checked by the constructors, which know their limits.
 
     Example:
         >>> class Reader(Checked):
@@ -77,7 +77,7 @@ _VARIABLE = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 @cache
 def _signature(owner: type) -> tuple[inspect.Signature, dict[str, str], bool]:
-    """The signature without ``self``; what ``**options`` hold, by name; and whether these may be anything."""
+    """Returns the signature without ``self``; what ``**options`` hold, by name; and whether these may be anything."""
     function = inspect.unwrap(getattr(owner, "__init__"))  # noqa: B009  # mypy distrusts it on a type
     signature = inspect.signature(function)
     parameters = list(signature.parameters.values())[1:]

@@ -37,7 +37,7 @@ __all__ = [
 
 
 def check_shape(name: str, tensor: Tensor, shape: Sequence[int], layout: str) -> None:
-    """Raise unless ``tensor`` has exactly this shape.
+    """Raises unless ``tensor`` has exactly this shape.
 
     Args:
         name: the argument's name, for the message.
@@ -61,7 +61,7 @@ def check_shapes(*checks: tuple[str, Tensor, Sequence[int], str]) -> None:
 
 
 def check_ensemble(name: str, ensemble: Tensor, min_size: int = 1) -> None:
-    """Raise unless ``ensemble`` is ``[*B, E, S]`` with ``E >= min_size``.
+    """Raises unless ``ensemble`` is ``[*B, E, S]`` with ``E >= min_size``.
 
     Args:
         name: the argument's name, for the message.
@@ -84,7 +84,7 @@ def check_ensemble(name: str, ensemble: Tensor, min_size: int = 1) -> None:
 
 
 def check_one_dtype(**tensors: Tensor | None) -> None:
-    """Raise unless all tensors have the dtype of the first.
+    """Raises unless all tensors have the dtype of the first.
 
     Args:
         **tensors: the arguments by name; ``None`` is passed over.
@@ -112,7 +112,7 @@ def check_one_dtype(**tensors: Tensor | None) -> None:
 
 
 def check_observed(mask: Tensor, batch: Sequence[int], dim: int) -> None:
-    """Raise unless ``observed`` is boolean, ``[*B, 1]`` or ``[*B, O]``.
+    """Raises unless ``observed`` is boolean, ``[*B, 1]`` or ``[*B, O]``.
 
     Raises:
         ValueError: if it is not.
@@ -122,7 +122,7 @@ def check_observed(mask: Tensor, batch: Sequence[int], dim: int) -> None:
 
 
 def check_mask(name: str, mask: Tensor | None) -> None:
-    """Raise unless a mask is boolean, or ``None``.
+    """Raises unless a mask is boolean, or ``None``.
 
     Raises:
         ValueError: if it has another dtype.
@@ -144,7 +144,7 @@ def check_number(
     most: float | None = None,
     cure: str = "",
 ) -> None:
-    """Raise unless ``value`` is a finite number within limits; a tensor, if all of its values are.
+    """Raises unless ``value`` is a finite number within limits; a tensor, if all of its values are.
 
     Args:
         name: the argument's name, for the message.
@@ -175,7 +175,7 @@ def check_number(
 
 
 def check_count(name: str, value: Any, *, least: int = 1, most: int | None = None, cure: str = "") -> None:
-    """Raise unless ``value`` is a whole number, at least so large, and at most so large where ``most`` says so.
+    """Raises unless ``value`` is a whole number, at least so large, and at most so large where ``most`` says so.
 
     Raises:
         TypeError: if it is no whole number.
@@ -195,7 +195,7 @@ def check_count(name: str, value: Any, *, least: int = 1, most: int | None = Non
 
 
 def check_choice(name: str, value: Any, choices: Sequence[str | None]) -> None:
-    """Raise unless ``value`` is one of several words.
+    """Raises unless ``value`` is one of several words.
 
     Raises:
         ValueError: if it is none of them.
@@ -222,7 +222,7 @@ def check_values(
     infinite: bool = False,
     cure: str = "",
 ) -> None:
-    """Raise unless all values of a constant are finite and within limits; one without values, on "meta", passes.
+    """Raises unless all values of a constant are finite and within limits; one without values, on "meta", passes.
 
     Args:
         name: the argument's name, for the message.
@@ -253,7 +253,7 @@ def check_values(
 
 
 def check_square(name: str, matrix: Tensor, size: int | None = None, layout: str = "[S, S]") -> None:
-    """Raise unless ``matrix`` is square, and of ``size`` where that is given.
+    """Raises unless ``matrix`` is square, and of ``size`` where that is given.
 
     Raises:
         ValueError: if it is not.
@@ -265,7 +265,7 @@ def check_square(name: str, matrix: Tensor, size: int | None = None, layout: str
 
 
 def check_covariance(name: str, cov: Tensor, size: int | None = None, layout: str = "[S, S]") -> None:
-    """Raise unless a constant is a covariance: square, finite, symmetric and positive semi-definite, up to rounding.
+    """Raises unless a constant is a covariance: square, finite, symmetric and positive semi-definite, up to rounding.
 
     What is tested are the correlations, so that metres and milliradians count alike.
 
@@ -307,8 +307,8 @@ def check_covariance(name: str, cov: Tensor, size: int | None = None, layout: st
         row, column = wrong.nonzero()[0].tolist()
         raise ValueError(
             f"{name} must be a symmetric covariance; it has {matrix[row, column]:g} at {[row, column]} and "
-            f"{matrix[column, row]:g} at {[column, row]}, beside variances {variance[row]:g} and {variance[column]:g}. "
-            "Pass (P + P.T) / 2, and zero beside a variance of zero"
+            f"{matrix[column, row]:g} at {[column, row]}, with variances {variance[row]:g} and {variance[column]:g}. "
+            "Pass (P + P.T) / 2, and zero next to a variance of zero"
         )
     lowest = float(torch.linalg.eigvalsh((correlation + correlation.mT) / 2)[0]) if len(matrix) else 0.0
     if lowest < -rounding:
@@ -329,7 +329,7 @@ def has_values(tensor: Tensor) -> bool:
 
 
 def flag_value(flag: Tensor) -> bool | None:
-    """The value of a boolean tensor without dimensions; ``None`` where nothing has a value, see :func:`has_values`.
+    """Returns the value of a boolean tensor without dimensions; ``None`` without a value, see :func:`has_values`.
 
     Example:
         >>> flag_value(torch.tensor(True)), flag_value(torch.tensor(True, device="meta"))

@@ -36,25 +36,25 @@ def commands() -> dict[str, tuple[str, str]]:
 
 
 def compiler() -> ModuleType:
-    """The room that knows torch's compiler; importing inductor itself, which it does later, takes half a second."""
+    """Returns the room of torch's compiler; importing inductor itself, which it does later, takes half a second."""
     return import_module("torch_denkf.compilation")
 
 
 def deployment() -> ModuleType:
-    """The room of packaged steps."""
+    """Returns the room of packaged steps."""
     return import_module("torch_denkf.deployment")
 
 
 def diagnosis() -> ModuleType:
-    """The room of a filter's default observers."""
+    """Returns the room of a filter's default observers."""
     return import_module("torch_denkf.diagnosis")
 
 
 def primers() -> ModuleType:
-    """The room of torchrl's transforms, which stands on the filters."""
+    """Returns the room of torchrl's transforms, which stands on the filters."""
     return import_module("torch_denkf.transforms")
 
 
 def weights() -> dict[str, Path]:
-    """Folders of trained filters, by name."""
+    """Returns folders of trained filters, by name."""
     return {file.parent.name: file.parent for file in sorted(APPLICATIONS.glob("*/weights/*/config.json"))}

@@ -57,7 +57,7 @@ def as_rows(tensordict: TensorDictBase, new: Tensor | None) -> tuple[TensorDictB
 
 
 def one_earlier(value: Tensor, time: int) -> Tensor:
-    """Every element from one step before; the first stays where it is."""
+    """Returns every element from one step before; the first stays where it is."""
     count = value.shape[time]
     return torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, count - 1)], time)
 

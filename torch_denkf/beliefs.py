@@ -235,7 +235,7 @@ def is_samples(key: NestedKey) -> bool:
 
 
 def summary_keys(carry: Collection[NestedKey], written: Iterable[NestedKey]) -> list[NestedKey]:
-    """Returns the moments among ``written`` keys that stand beside an entry that is carried."""
+    """Returns the moments among ``written`` keys that stand next to an entry that is carried."""
     prefixes = {key[:-1] for key in carry if not isinstance(key, str)}
     moments = (*_SUMMARIES, "cov")
     return [key for key in written if not isinstance(key, str) and key[:-1] in prefixes and key[-1] in moments]

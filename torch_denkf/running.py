@@ -8,15 +8,17 @@ from typing import Any, TypeGuard
 import torch
 from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
-from torch import nn
+from torch import Tensor, nn
 
 from torch_denkf._registered import diagnosis
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.submodel import EXPLAINED, Call, Entries, Sensor, SubModel, role
 
 __all__ = [
     "check_module",
     "in_sequences",
     "is_sequence",
+    "linearise",
     "marks_of",
     "named_modules_of",
     "random_parts",
@@ -78,6 +80,19 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
     return {key: tensordict.get(key) for key in map(unravel_key, module.out_keys)}
 
 
+def linearise(
+    module: TensorDictModuleBase, entries: Entries, call: Call
+) -> tuple[Entries, Tensor, tuple[Space, Space] | None] | None:
+    """Returns what a module says of itself, see :meth:`SubModel.linearised`; ``None`` where only autograd knows."""
+    hooked = module._forward_hooks or module._forward_pre_hooks
+    if hooked or not isinstance(module, SubModel) or type(module).forward is not SubModel.forward:
+        return None
+    try:
+        return module.linearised(entries, call)
+    except (KeyError, *EXPLAINED):  # a run says what is wrong
+        return None
+
+
 def run_modules(modules: Iterable[tuple[str, TensorDictModuleBase]], entries: Entries, call: Call) -> Entries:
     """Runs named modules one after the other, and returns what they write."""
     entries, written = dict(entries), {}
@@ -97,7 +112,7 @@ def is_sequence(module: Any) -> TypeGuard[TensorDictSequential]:
 
 
 def named_modules_of(sequence: TensorDictSequential) -> list[tuple[str, TensorDictModuleBase]]:
-    """The modules of a sequence and their names, which are numbers unless it was made of a dictionary."""
+    """Returns the modules of a sequence and their names, which are numbers unless it was made of a dictionary."""
     return list(sequence.module._modules.items())
 
 
@@ -129,7 +144,7 @@ def writes(module: TensorDictModuleBase) -> list[NestedKey]:
 
 
 def in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
-    """The module, or those of a plain sequence."""
+    """Yields the module, or those of a plain sequence."""
     if is_sequence(module):
         for _, part in named_modules_of(module):
             yield from in_sequences(part)
@@ -144,12 +159,12 @@ def reading_of(sensor: TensorDictModuleBase) -> NestedKey:
 
 
 def marks_of(module: TensorDictModuleBase) -> dict[NestedKey, NestedKey]:
-    """The masks that a module makes where it finds readings that are missing, and of which masks it makes them."""
+    """Maps each mask that a module derives, for readings that it finds missing, to the mask that it derives it from."""
     return {made: given for part in in_sequences(module) for made, given in role(part, Sensor).marks.items()}
 
 
 def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str, SubModel]]:
-    """The sub-models that draw noise, and their places, in the order in which they run."""
+    """Yields the sub-models that draw noise, and their places, in the order in which they run."""
     parts: Iterable[tuple[str, TensorDictModuleBase]]
     if isinstance(module, SubModel):
         if module.noise_names:

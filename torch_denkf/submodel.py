@@ -24,6 +24,10 @@ __all__ = ["Call", "Entries", "Initial", "Noise", "Sensor", "SubModel", "Transit
 
 R = TypeVar("R", bound="SubModel")
 
+#: The methods that decide what a sub-model computes, and those that know its Jacobian.
+_COMPUTES = frozenset({"compute", "on_entries", "forward", "observe", "move", "features", "_run"})
+_JACOBIANS = ("jacobian", "linearised", "gradient", "move_and_gradient")
+
 #: Tensors by unravelled key: what a step of a filter works on.
 Entries: TypeAlias = dict[NestedKey, Tensor]
 #: The noise of one call of a sub-model: one tensor, several by name, or ``None`` for the deterministic forward.
@@ -48,12 +52,12 @@ class Call(NamedTuple):
     raw: bool = False
 
     def part(self, name: str) -> Call:
-        """The call of a part of the module."""
+        """Returns the call of a part of the module."""
         return self._replace(place=name if self.place == "self" else f"{self.place}.{name}")
 
 
 def flat_noise(noise: Noise | TensorDictBase, *place: str) -> Entries:
-    """Noise as entries ``("noise", *place)``, or ``("noise", *place, name)`` where it is several tensors."""
+    """Returns noise as entries ``("noise", *place)``, or ``("noise", *place, name)`` where it is several tensors."""
     if noise is None:
         return {}
     if isinstance(noise, Tensor):
@@ -99,16 +103,20 @@ class SubModel(Checked, TensorDictModule):
 
         @property
         def noise_names(self) -> tuple[str, ...]:
-            """A tuple in the class, or a property."""
+            """Names the noise of a call: a tuple in the class, or a property."""
 
     else:
         noise_names = ()
+    tangents_of: tuple[Space, Space] | None = None
     _wants: frozenset[str] = frozenset()
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
         # tensordict wraps every __init__ and so must come first; what compute asks for is looked up once a class.
         cls._wants = frozenset({"noise", "batch_size"} & inspect.signature(cls.compute).parameters.keys())
+        if vars(cls).keys().isdisjoint(_JACOBIANS) and not _COMPUTES.isdisjoint(vars(cls)):
+            # What is inherited is that of another function.
+            cls.jacobian, cls.linearised = SubModel.jacobian, SubModel.linearised  # type: ignore[method-assign]
 
     def __init__(
         self,
@@ -134,6 +142,27 @@ class SubModel(Checked, TensorDictModule):
                 ``noise_names``, for ``noise``: what :meth:`draw_noise` drew, or ``None`` for the deterministic forward.
         """
         raise TypeError(f"{type(self).__name__} has no compute(): write it, see SubModel.")
+
+    def jacobian(self, *values: Any) -> tuple[Tensor, Tensor] | None:
+        """Returns what :meth:`compute` does without noise, and its Jacobian by what it reads first, if it is known.
+
+        Otherwise automatic differentiation finds it, which takes ten times as long. A subclass that writes a new
+        :meth:`compute` or the like, and no new Jacobian, has none.
+
+        Args:
+            *values: as :meth:`compute` takes them, of which the first are states ``[*B, E, S]``.
+
+        Returns:
+            The result ``[*B, E, N]``, and the Jacobian ``[*B, E, N, S]``, or ``[N, S]`` if it is constant; between
+            tangents where the sub-model has ``tangents_of``, the spaces of what it reads and writes. ``None`` where it
+            is not known.
+        """
+        return None
+
+    def linearised(self, entries: Entries, call: Call) -> tuple[Entries, Tensor, tuple[Space, Space] | None] | None:
+        """Returns what :meth:`on_entries` does, the :meth:`jacobian`, and between whose tangents it leads, if known."""
+        found = self.jacobian(*self.values(entries))
+        return None if found is None else ({self.out_keys[0]: found[0]}, found[1], self.tangents_of)
 
     def draw_noise(
         self,
@@ -166,7 +195,7 @@ class SubModel(Checked, TensorDictModule):
         return None
 
     def noise_sizes(self, *values: Any, **_: Any) -> dict[str, int]:
-        """The sizes that :meth:`draw_noise` needs, from the values that :meth:`compute` gets by position."""
+        """Returns the sizes that :meth:`draw_noise` needs, from the values that :meth:`compute` gets by position."""
         return {}
 
     def parts(self) -> dict[str, TensorDictModuleBase]:
@@ -202,7 +231,7 @@ class SubModel(Checked, TensorDictModule):
         return self.by_key(out)
 
     def values(self, entries: Entries) -> list[Any]:
-        """The entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
+        """Returns the entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
 
         Raises:
             KeyError: if an entry of ``in_keys`` is missing.
@@ -225,10 +254,10 @@ class SubModel(Checked, TensorDictModule):
         return dict(zip(self.out_keys, values, strict=True))
 
     def required(self, entries: Entries, key: NestedKey) -> Tensor:
-        """The entry ``key``.
+        """Returns the entry ``key``.
 
         Raises:
-            KeyError: if it is missing; the message names it and lists what is there.
+            KeyError: if it is missing; the message names it and lists the entries.
         """
         value = entries.get(key)
         if value is None:
@@ -266,7 +295,7 @@ class SubModel(Checked, TensorDictModule):
             given = given if len(given) == len(found) else None
         if given is None:
             where: dict[str, Any] = {}
-            # Where nothing is read, what is drawn lies beside the constants.
+            # Where nothing is read, what is drawn lies next to the constants.
             for value in values if values else (*self.parameters(), *self.buffers()):
                 if value is not None and value.is_floating_point():
                     where = {"device": value.device, "dtype": value.dtype}
@@ -385,10 +414,11 @@ class Update(SubModel):
     reading_space: Space | None = None
     observation_dim: int | None = None
 
-    def reading_dims(self, entries: Entries, call: Call) -> Sequence[int]:
+    def reading_dims(self, entries: Entries, call: Call) -> Sequence[int | tuple[int, ...]]:
         """Returns how many numbers each of ``reading_keys`` has, to put zeros behind a mask where it is missing.
 
-        By default O: ``observation_dim``, or what :attr:`predicted_key` holds. On a space the noise is of tangents.
+        Of samples ``(E, O)``. By default O: ``observation_dim``, or what :attr:`predicted_key` holds. On a space the
+        noise is of tangents.
 
         Raises:
             KeyError: if that is not known.

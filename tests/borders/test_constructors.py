@@ -90,7 +90,7 @@ KALMAN = [
             (NAN * EYE, "nan"),
             (ASYMMETRIC, "symmetric", "0.5 at [0, 1]"),
             (INDEFINITE, "positive semi-definite", "-1"),
-            (BESIDE_ZERO, "0.1", "zero beside a variance of zero"),
+            (BESIDE_ZERO, "0.1", "zero next to a variance of zero"),
             (torch.eye(3), "[3, 3]"),
         )
     ],

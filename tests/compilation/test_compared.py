@@ -13,7 +13,7 @@ from torch._dynamo.backends.common import aot_autograd
 from tests.filters.factories import has_compiler, linear_denkf, toy_denkf, toy_frames
 from tests.filters.gaussian_for_tests import linear_filter, linear_frames
 from tests.filters.test_contract import particles
-from torch_denkf.compilation import compared, refuse_other_numbers
+from torch_denkf.compilation import check_same_numbers, compared
 from torch_denkf.filters import EKF, Filter, KalmanFilter
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, LinearTransition, MomentPrior, Select
@@ -252,11 +252,11 @@ def test_it_draws_no_number_of_the_users():
 def test_what_has_no_value_in_both_is_equal_and_in_one_is_not():
     names = {"names": ["x"], "outputs": ["y"], "frames": [], "what": "thing", "cure": ""}
     nan = torch.tensor([1.0, torch.nan, torch.inf])
-    refuse_other_numbers(lambda x: 1 * x, lambda x: x, (nan,), **names)
+    check_same_numbers(lambda x: 1 * x, lambda x: x, (nan,), **names)
     with pytest.raises(RuntimeError, match="'y' is up to inf off"):
-        refuse_other_numbers(lambda x: x.nan_to_num(), lambda x: x, (nan,), **names)
+        check_same_numbers(lambda x: x.nan_to_num(), lambda x: x, (nan,), **names)
     with pytest.raises(RuntimeError, match="'y' is up to 1 off"):  # of marks, too
-        refuse_other_numbers(lambda x: x > 2, lambda x: x > 0, (nan,), **names)
+        check_same_numbers(lambda x: x > 2, lambda x: x > 0, (nan,), **names)
 
 
 def test_half_precision_inside_rounds_as_such():
@@ -268,18 +268,18 @@ def test_half_precision_inside_rounds_as_such():
         return (x.bfloat16() @ weight.bfloat16()).float()
 
     assert (half(x) - x @ weight).abs().max() > 1e-3 * half(x).abs().max()
-    refuse_other_numbers(lambda x: x @ weight, half, (x,), **names)
+    check_same_numbers(lambda x: x @ weight, half, (x,), **names)
     with pytest.raises(RuntimeError, match="'y' is up to"):
-        refuse_other_numbers(half, lambda x: x @ weight, (x,), **names)
+        check_same_numbers(half, lambda x: x @ weight, (x,), **names)
 
 
 def test_numbers_drawn_inside_by_another_generator_are_no_error():
     names = {"names": ["x"], "outputs": ["y"], "frames": [], "what": "thing", "cure": ""}
     own = torch.Generator().manual_seed(1)
     x = torch.zeros(100)
-    refuse_other_numbers(lambda x: x + torch.randn(100, generator=own), lambda x: x + torch.randn(100), (x,), **names)
+    check_same_numbers(lambda x: x + torch.randn(100, generator=own), lambda x: x + torch.randn(100), (x,), **names)
     with pytest.raises(RuntimeError, match="'y' is up to"):
-        refuse_other_numbers(lambda x: x + 50, lambda x: x + torch.randn(100), (x,), **names)
+        check_same_numbers(lambda x: x + 50, lambda x: x + torch.randn(100), (x,), **names)
 
 
 def test_running_means_are_those_of_the_step_alone():

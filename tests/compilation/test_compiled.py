@@ -32,7 +32,7 @@ def assert_close(ours, theirs, keys, dtype):
 @pytest.mark.parametrize("dtype", [pytest.param(torch.float32, marks=pytest.mark.slow), torch.float64])
 def test_compiled_is_eager_forward_and_backward(dtype):
     filter = toy_denkf("perturbed").to(dtype)
-    frames = toy_frames((2, 7), masks=2)  # a chunk, chunks that detach the belief, and a step that is left over
+    frames = toy_frames((2, 7), masks=2)  # a chunk, chunks that detach the belief, the last of which is not whole
     frames["measurement"], frames["action"] = frames["measurement"].to(dtype), frames["action"].to(dtype)
     filter.draw_noise(frames)
     eager = filter.sequence(frames.copy(), detach_every=2)
@@ -41,7 +41,7 @@ def test_compiled_is_eager_forward_and_backward(dtype):
     filter.compile(chunk=2, backend="eager")
     compiled = filter.sequence(frames.copy(), detach_every=2)
     compiled_step = filter.step(eager[:, 2].copy())
-    assert sorted(kind[0] for kind in filter.compiled._functions) == ["chunk", "chunk", "chunk", "step"]
+    assert sorted(kind[0] for kind in filter.compiled._functions) == ["chunk", "chunk", "step"]
     assert_close(compiled, eager, filter.out_keys, dtype)
     assert_close(compiled_step, eager_step, filter.out_keys, dtype)
     ours = torch.autograd.grad(compiled["belief", "mean"].square().sum(), list(filter.parameters()))
@@ -203,6 +203,41 @@ def test_a_first_call_that_resets_all_rows_is_compared_all_the_same():
     filter = linear_kalman().compile(chunk=1, backend=wrong_after_a_step)
     with torch.no_grad(), pytest.raises(RuntimeError, match="compiled sequence is wrong"):
         filter.sequence(frames)
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_one_graph_serves_all_chunks_lengths_and_first_elements(float64, batch):
+    graphs = []
+
+    def counted(graph, example):
+        graphs.append(graph)
+        return graph
+
+    eager, compiled = (toy_denkf().double().eval() for _ in range(2))
+    compiled.load_state_dict(eager.state_dict())
+    compiled.compile(chunk=3, backend=counted)
+    for length, resets in ((7, False), (4, True), (2, False), (9, True)):
+        frames = toy_frames((batch, length), masks=2, resets=resets)
+        eager.draw_noise(frames)
+        ours, theirs = (model.sequence(frames.copy()) for model in (compiled, eager))
+        assert_close(ours, theirs, eager.out_keys, torch.float64)
+        gradients = (
+            torch.autograd.grad(out["belief", "mean"].square().sum(), list(model.parameters()))
+            for out, model in ((ours, compiled), (theirs, eager))
+        )
+        for one, other in zip(*gradients, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-11)
+    assert len(graphs) == 1
+
+
+def test_a_long_first_call_says_what_it_does(monkeypatch, caplog):
+    monkeypatch.setattr("torch_denkf.compilation.compiled.PATIENCE", 0.0)
+    frames = TensorDict({"observation": torch.randn(2, 3, 2)}, [2, 3])
+    filter = linear_kalman().compile(chunk=3, backend="eager")
+    for _ in range(2):
+        filter.sequence(frames.copy())
+    assert [record.message for record in caplog.records if "compiled sequence" in record.message]
+    assert len([record for record in caplog.records if record.name == "torch_denkf"]) == 1
 
 
 def test_a_compiled_step_draws_its_noise_outside_and_anew():

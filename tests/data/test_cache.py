@@ -208,7 +208,7 @@ def test_a_damaged_entry_is_made_anew_with_one_line(entry, how, caplog):
     with caplog.at_level(logging.WARNING, "torch_denkf"):
         assert same(cached(entry, content), content())
     (record,) = caplog.records
-    assert f"the cache entry {entry} is damaged, and is made anew: " in record.getMessage()
+    assert f"the cache entry {entry} is damaged, and is made again: " in record.getMessage()
     assert same(cached(entry, never), content())
     assert os.listdir(entry.parent) == [NAME]
 

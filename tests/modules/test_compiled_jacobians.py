@@ -17,7 +17,6 @@ from torch_denkf.imperfect import FadingBias
 from torch_denkf.imperfect.bias import BiasedObservation, BiasedTransition
 from torch_denkf.modules import (
     ConstantNoise,
-    ContinuousMotion,
     EKFAnalysis,
     EKFTransition,
     LearnedObservation,
@@ -28,6 +27,7 @@ from torch_denkf.modules import (
     UKFAnalysis,
     UKFTransition,
 )
+from torch_denkf.motions import ContinuousMotion
 from torch_denkf.running import run_module
 from torch_denkf.submodel import Call
 

@@ -99,7 +99,8 @@ def test_each_of_several_learned_sensors_is_named(kind):
         torch.testing.assert_close(loss(drive)["loss_sensor"], off(drive, component, key).abs().mean())
     loss.set_keys(sensor=None)
     for several in (loss, SensorLoss(filter)):
-        with pytest.raises(KeyError, match=r"several sensors, of which none is named.*set_keys\(sensor="):
+        none = r"several sensors, of which none is named \(there are \['camera', 'lidar'\]\).*set_keys\(sensor="
+        with pytest.raises(KeyError, match=none):
             several(drive)
         with pytest.raises(KeyError, match=r"writes the samples .*'lidar'.*: name one of several sensors"):
             several(drive.copy().set("target_observation", drive["wheel"]))
@@ -126,3 +127,10 @@ def test_a_filter_of_one_sensor_with_keys_of_its_own(kind, score):
     filter = kind(**parts, noise=noise, initial=start(gaussian), observed_key="seen", process_noise=[0.1, 0.1])
     loss = SensorLoss(filter) if score == "SensorLoss" else (GaussianLoss if gaussian else DEnKFLoss)(filter)
     torch.testing.assert_close(loss(drive)["loss_sensor"], off(drive).abs().mean())
+
+
+def test_a_frame_that_is_missing_is_named_with_what_is_there():
+    loss = SensorLoss(fused("ensemble", lidar=True))
+    loss.set_keys(sensor="lidar")
+    with pytest.raises(KeyError, match=r"SensorLoss reads 'scan', which is missing. There is .*scans"):
+        loss(data().rename_key_("scan", "scans"))

@@ -251,6 +251,34 @@ def test_the_best_is_kept(tmp_path, keep, best, handed_on):
     assert results["second"]["value"] == pytest.approx(net.weight.sum().item())
 
 
+@pytest.mark.parametrize(
+    ("errors", "keep", "said"),
+    [
+        (
+            [5.0, 6.0, 7.0, 8.0],
+            "best",
+            "gained nothing: the error is 5 as before it. Likely: lr=0.002 is too high",
+        ),
+        ([5.0, 4.99, 7.0, 8.0], "best", "the error is 4.99, and 5 before it. Likely: lr=0.002 is too low"),
+        (
+            [5.0, 4.0, 3.0, 6.0],
+            "last",
+            "made the error worse, 5 to 6. Likely: lr=0.002 is too high; windows of 4",
+        ),
+        ([5.0, 4.0, 3.0, 6.0], "best", ""),
+    ],
+)
+def test_a_stage_that_gained_nothing_is_said_and_why_that_is_likely(tmp_path, caplog, errors, keep, said):
+    net, errors = nn.Linear(2, 1), iter(errors)
+    stage = line_stage(net, lengths={0: 2, 2: 4})
+    options = {"validate": lambda: {"error": next(errors)}, "validate_every": 2, "keep": keep}
+    with caplog.at_level("WARNING", "torch_denkf"):
+        FilterTrainer(net, [stage], out=tmp_path, device="cpu", **options).fit()
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == bool(said)
+    assert said in "".join(messages)
+
+
 def test_validation_leaves_the_training_alone(tmp_path):
     finals = []
     for draws in (0, 5):

@@ -15,7 +15,7 @@ __all__ = ["IEnKS"]
 
 
 class IEnKS(Filter):
-    """Iterated ensemble Kalman smoother: each reading corrects the state before the step, and the step is made anew.
+    """Iterated ensemble Kalman smoother: each reading corrects the state before the step, and the step is made again.
 
     Where a step bends much (long steps of a chaotic system, say), the linear update of an ensemble filter is a poor map
     from readings to states. Here a few members suffice. Its belief of t is ``("belief", "ensemble")``, ``mean`` and

@@ -22,7 +22,7 @@ from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.ensemble import Rotated
 from torch_denkf.modules.gaussian import further_keys
 from torch_denkf.modules.motion_noise import NoisyTransition
-from torch_denkf.modules.spaces import mean_reading, told
+from torch_denkf.modules.spaces import mean_reading, narrowed_mask
 from torch_denkf.running import check_module, random_parts, run_module
 from torch_denkf.submodel import Call, Entries, Initial, flat_noise, role
 
@@ -32,7 +32,7 @@ _SMOOTHED = ("ensemble", "mean", "var", "age")
 
 
 def with_smoothed(initial: TensorDictModuleBase, *, belief_prefix: str = "belief") -> AugmentedBelief:
-    """An initial belief that is also what is believed of the state before it.
+    """Returns an initial belief that is also the smoothed belief of the state before it.
 
     Args:
         initial: writes ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]`` under ``belief_prefix``.
@@ -64,7 +64,7 @@ def _twice(prefix: str, keys: Sequence[NestedKey], space: Space | None, belief: 
 
 
 class IteratedAnalysis(Rotated):
-    r"""Finds from where the reading says that the last step began, and makes the step anew from there.
+    r"""Finds from where the reading says that the last step began, and makes the step again from there.
 
     Gauss-Newton steps in the space of the members, each with a run of transition and observation; see
     :func:`~torch_denkf.baselines.iterated_smoothing.iterated_smoothing`. Where the motion has Gaussian noise, the
@@ -114,7 +114,7 @@ class IteratedAnalysis(Rotated):
         check_module("observation", observation)
         check_count("iterations", iterations)
         check_number("inflation", inflation, above=0)
-        _refuse_other_noise(transition, observation)
+        _check_same_noise(transition, observation)
         self_made = [ensemble_key, *map(unravel_key, transition.out_keys)]
         further, optional = further_keys([transition, observation], [*self_made, observation_key, noise_variance_key])
         out_keys = [(belief_prefix, name) for name in ("ensemble", "mean", "var")]
@@ -132,14 +132,14 @@ class IteratedAnalysis(Rotated):
         self.reading_keys = self.in_keys[1:3]
 
     def parts(self):
-        """The transition, whose noise is looked for; the observation has none."""
+        """Returns the transition, whose noise is looked for; the observation has none."""
         return {"transition": self.module["transition"]}
 
     def on_entries(self, entries, call):
-        """The belief, the smoothed belief, and the diagnostics."""
+        """Returns the belief, the smoothed belief, and the diagnostics."""
         ensemble, reading, variance = (self.required(entries, key) for key in self.in_keys[:3])
         space, on = self.space, self.reading_space
-        observed = told(on, entries.get(self.observed_key))
+        observed = narrowed_mask(on, entries.get(self.observed_key))
         if reading.ndim == ensemble.ndim:
             reading = mean_reading(on, reading, observed)
         center = ensemble[..., :1, :] if space is None else space.mean(ensemble).unsqueeze(-2)
@@ -185,7 +185,7 @@ class IteratedAnalysis(Rotated):
         return dict(zip(self.out_keys, out, strict=True))
 
     def _motion_noise(self, entries: Entries, ensemble: torch.Tensor, call: Call) -> Entries:
-        """The noise of the members' motion, drawn once for all iterations."""
+        """Returns the noise of the members' motion, drawn once for all iterations."""
         noise: Entries = {}
         if not call.sample:
             return noise
@@ -197,12 +197,12 @@ class IteratedAnalysis(Rotated):
         return noise
 
     def _after(self, smoothed, observed, rotation) -> torch.Tensor:
-        """The smoothed members, inflated and rotated where anything was observed."""
+        """Returns the smoothed members, inflated and rotated where anything was observed."""
         changed = self.rotated(inflate(smoothed, self.inflation) if self.inflation != 1.0 else smoothed, rotation)
         return changed if observed is None else torch.where(observed.any(-1)[..., None, None], changed, smoothed)
 
 
-def _refuse_other_noise(transition: TensorDictModuleBase, observation: TensorDictModuleBase) -> None:
+def _check_same_noise(transition: TensorDictModuleBase, observation: TensorDictModuleBase) -> None:
     parts: Sequence = [*random_parts(transition, "transition"), *random_parts(observation, "observation")]
     other = [f"{place} ({type(part).__name__})" for place, part in parts if not isinstance(part, NoisyTransition)]
     if other or any(place.startswith("observation") for place, _ in parts):

@@ -27,7 +27,7 @@ def iterated_smoothing(
     observed: Tensor | None = None,
     iterations: int = 10,
 ) -> tuple[Tensor, Tensor]:
-    """Condition an ensemble on a reading of what becomes of it.
+    """Conditions an ensemble on a reading of what becomes of it.
 
     One iteration is the "etkf" analysis of the reading, applied to the members before the step.
 

@@ -1,4 +1,4 @@
-r"""A recurrent network in a filter's place: it remembers what it likes, and says what it believes as a Gaussian.
+r"""A recurrent network in a filter's place: it keeps a memory, and writes its belief as a Gaussian.
 
 The baseline without any model: no motion, no noise, no gain, only a memory that is trained. It keeps the keys of the
 filters with a mean and a covariance, so that objectives, metrics and environments treat it as one of them.
@@ -31,7 +31,7 @@ _MOST_LAYERS = 1000  # more are a slip, and would be built one by one until memo
 def with_memory(
     initial: TensorDictModuleBase, hidden_size: int, *, num_layers: int = 1, belief_prefix: str = "belief"
 ) -> AugmentedBelief:
-    """An initial belief with an empty memory: hidden and cell states of zero, as in ``torch.nn.LSTM``.
+    """Returns an initial belief with an empty memory: hidden and cell states of zero, as in ``torch.nn.LSTM``.
 
     Args:
         initial: the initial belief with a mean: :class:`MomentPrior`, :class:`GaussianAround`.
@@ -77,12 +77,12 @@ class LSTMTransition(Transition):
         super().__init__(nn.Identity(), in_keys, out_keys)
 
     def compute(self, *values):
-        """The forecast."""
+        """Returns the forecast."""
         return values
 
 
 class LSTMUpdate(Update):
-    r"""Remembers the frame, and believes :math:`N(m + s \circ W h_t, s^2 \circ (\mathrm{softplus}(U h_t) + c))`.
+    r"""Updates the memory; the belief is :math:`N(m + s \circ W h_t, s^2 \circ (\mathrm{softplus}(U h_t) + c))`.
 
     The LSTM reads, in this order: the sensor's encoding, its reading in units of ``observation_scale``, a flag for
     each component of the reading (or one for the frame) that is 1 where it was observed, and what ``extra_keys`` name.
@@ -113,7 +113,7 @@ class LSTMUpdate(Update):
             written.
 
     Raises:
-        ValueError: if there is nothing to read, or an input has another size than was said.
+        ValueError: if there is nothing to read, or an input has another size than given.
         KeyError: if an entry is missing.
 
     Reference:
@@ -203,7 +203,7 @@ class LSTMUpdate(Update):
         return self.feature_sizes
 
     def compute(self, hidden, cell, *rest, batch_size):
-        """The memory and the belief."""
+        """Returns the memory and the belief."""
         *inputs, observed = rest
         features = self._features(inputs, observed, batch_size)
         # A cell takes one batch dimension; the tensordict may have none or many.

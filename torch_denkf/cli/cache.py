@@ -77,7 +77,7 @@ class Cache(Command):
             return 0
         say(f"{len(entries)} entries, {size / 1e6:.1f} MB, in {folder}")
         if damaged:
-            say(f"{damaged} damaged: each is made anew when it is next used, or goes with denkf cache clear --damaged")
+            say(f"{damaged} damaged: each is made again when it is next used, or goes with denkf cache clear --damaged")
         return 1 if damaged else 0
 
 

@@ -27,7 +27,7 @@ class Command:
     """The base of all sub-commands, which are dataclasses: fields are options, their comments the help.
 
     What :meth:`run` raises as ``ImportError``, ``OSError``, ``ValueError`` or one of ``mistakes``, or as a ``KeyError``
-    with a message, is told to the user in a line.
+    with a message, is printed in a line.
 
     Attributes:
         name: what comes after ``denkf``.
@@ -63,7 +63,7 @@ class Command:
 
     @classmethod
     def main(cls, arguments: Sequence[str] | None = None) -> int:
-        """Run the command.
+        """Runs the command.
 
         Args:
             arguments: its words; by default the process's own.
@@ -96,7 +96,7 @@ class Command:
 
     @classmethod
     def read(cls, words: Sequence[str]) -> Command:
-        """The options that some words ask for.
+        """Returns the options that some words ask for.
 
         Raises:
             SystemExit: after the help, with status 0; after a line on stderr that tells a mistake, with status 2.
@@ -105,8 +105,8 @@ class Command:
 
         drawn = io.StringIO()
         try:
-            _refuse_empty(words)
-            _refuse_unknown(cls, words)
+            _check_no_empty_word(words)
+            _check_known(cls, words)
             with contextlib.redirect_stderr(drawn):
                 return tyro.cli(
                     cls,
@@ -126,7 +126,7 @@ class Command:
 
 
 def alone_in(out: Path) -> AbstractContextManager[None]:
-    """A folder is this command's alone while it works: two would leave files of both.
+    """Locks a folder for this command while it works: two would leave files of both.
 
     Raises:
         OSError: if another command writes to it, or it cannot be written to; names the folder and the process.
@@ -143,19 +143,19 @@ def alone_in(out: Path) -> AbstractContextManager[None]:
 
 
 def say(text: str) -> None:
-    """Write a line to stdout."""
+    """Writes a line to stdout."""
     sys.stdout.write(f"{text}\n")
 
 
-def _refuse_empty(words: Sequence[str]) -> None:
-    """An empty word is a variable of the shell that is not set; as a path it would be the working folder."""
+def _check_no_empty_word(words: Sequence[str]) -> None:
+    """Raises for an empty word: a variable of the shell that is not set, and as a path the working folder."""
     for before, word in zip(["", *words], words, strict=False):
         if not word or (word.startswith("--") and word.endswith("=")):
             raise ValueError(f"argument {word.rstrip('=') or before}: must not be empty")
 
 
-def _refuse_unknown(command: type, words: Sequence[str]) -> None:
-    """An option that is misspelt is named by itself: a parser would first miss what it was to give."""
+def _check_known(command: type, words: Sequence[str]) -> None:
+    """Raises for a misspelt option by its name: a parser would first miss the one that was meant."""
     known = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(command)]
     allowed = {"--help", *known, *(f"--no-{option[2:]}" for option in known)}
     for word in words:
@@ -165,7 +165,7 @@ def _refuse_unknown(command: type, words: Sequence[str]) -> None:
 
 
 def meant(word: str, known: Sequence[str]) -> str:
-    """The end of a message about a word that is unknown: the nearest known one, or all.
+    """Returns the end of a message about a word that is unknown: the nearest known one, or all.
 
     Example:
         >>> meant("dmo", ["demo", "info"]), meant("x", ["demo", "info"])

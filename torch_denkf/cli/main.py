@@ -13,12 +13,13 @@ __all__ = ["commands", "main"]
 
 _OWN = {
     "info": ("torch_denkf.cli.info:Info", "versions, devices, OpenGL, cache, optional extras"),
+    "log": ("torch_denkf.cli.log:Log", "what is in a log: streams, rates, gaps, units, delays"),
     "cache": ("torch_denkf.cli.cache:Cache", "list, check or clear what is kept of earlier runs"),
 }
 
 
 def commands() -> dict[str, tuple[str, str]]:
-    """By name: where the command is, and what it does; applications register theirs.
+    """Maps names of commands to their place and their purpose; applications register theirs.
 
     Example:
         >>> sorted(commands())[:2]
@@ -28,7 +29,7 @@ def commands() -> dict[str, tuple[str, str]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a sub-command.
+    """Runs a sub-command.
 
     Args:
         arguments: words of the command line; by default the process's own.

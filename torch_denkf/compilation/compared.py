@@ -1,4 +1,4 @@
-"""A compiled function beside the eager one, once: a compiler may be wrong, and say nothing."""
+"""A compiled function next to the eager one, once: a compiler may be wrong, and say nothing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-__all__ = ["placed", "put_back", "refuse_other_numbers", "tensors"]
+__all__ = ["check_same_numbers", "placed", "put_back", "tensors"]
 
 #: Roundings by which two orders of the same sums may differ: of the largest number in a column, and in an entry.
 _OF_COLUMN, _OF_ENTRY = 1000, 10
@@ -18,7 +18,7 @@ _OF_COLUMN, _OF_ENTRY = 1000, 10
 _NUDGE, _NUDGES = 8, 32
 
 
-def refuse_other_numbers(
+def check_same_numbers(
     compiled: Callable,
     eager: Callable,
     inputs: Sequence[Any],
@@ -114,7 +114,7 @@ def put_back(kept: Sequence[tuple[Tensor, Tensor]]) -> None:
 
 
 def tensors(value: Any) -> Iterator[Tensor]:
-    """The tensors in nested tuples and lists."""
+    """Yields the tensors in nested tuples and lists."""
     if isinstance(value, Tensor):
         yield value
     elif isinstance(value, tuple | list):
@@ -123,7 +123,7 @@ def tensors(value: Any) -> Iterator[Tensor]:
 
 
 def placed(like: Any, values: Iterator[Tensor]) -> Any:
-    """Tensors in place of those in nested tuples."""
+    """Returns tensors in place of those in nested tuples."""
     if isinstance(like, Tensor):
         return next(values)
     return tuple(placed(part, values) for part in like) if isinstance(like, tuple) else like
@@ -161,7 +161,7 @@ def _waves(value: Tensor) -> Tensor:
 
 
 def _telling(value: Tensor) -> Tensor:
-    """A frame that an update answers to, laid out as the given one; the given one if it is such a frame."""
+    """Returns a frame that an update answers to, laid out as the given one; the given one if it is such a frame."""
     if value.dtype == torch.bool:
         known, numbers = value, torch.ones_like(value)
     elif value.is_floating_point():
@@ -197,7 +197,7 @@ def _distance(one: Tensor, other: Tensor) -> Tensor:
 
 
 def _columns(value: Tensor) -> Tensor:
-    """The largest number in each column."""
+    """Returns the largest number in each column."""
     value = value.reshape(-1, value.shape[-1] if value.ndim and value.numel() else 1)
     return value.amax(0) if len(value) else value.new_zeros(1)
 
@@ -232,7 +232,7 @@ class _Precision(TorchDispatchMode):
 
 
 def _coarsest_rounding(run: Callable, *args: Any) -> float:
-    """The rounding of the coarsest numbers that are computed, such as those of a trunk in bfloat16."""
+    """Returns the rounding of the coarsest numbers that are computed, such as those of a trunk in bfloat16."""
     with _Precision() as mode:
         run(*args)
     products = 0.0 if torch.get_float32_matmul_precision() == "highest" else torch.finfo(torch.bfloat16).eps

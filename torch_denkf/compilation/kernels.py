@@ -68,7 +68,7 @@ def write_out_products(graph: Graph) -> None:
 
 
 def insert_call(graph: Graph, function: Any, *args: Any) -> Node:
-    """A node that calls ``function`` where the graph inserts, and knows the shape of its result."""
+    """Inserts a node that calls ``function``, with the shape of its result."""
     node = graph.call_function(function, args)
     node.meta["val"] = function(*map_arg(args, lambda argument: argument.meta["val"]))
     return node

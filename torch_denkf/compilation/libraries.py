@@ -61,7 +61,7 @@ def clear_damaged_libraries(cache: Path | None = None) -> list[Path]:
 
 @contextmanager
 def clear_full_cache() -> Iterator[None]:
-    """A compilation that fails because the disk of inductor's cache is full says so.
+    """Says so if a compilation fails because the disk of inductor's cache is full.
 
     Raises:
         OSError: naming the cache and the free space.
@@ -108,7 +108,7 @@ def is_whole(library: Path) -> bool:
 
 
 def _remove(library: Path, locks: Path) -> bool:
-    """Under the lock that inductor compiles it under; False while another process does."""
+    """Removes a library under the lock of its compilation; returns False while another process compiles it."""
     locks.mkdir(exist_ok=True)
     held = take_lock(locks / f"{library.name.split('.')[0]}.lock")
     if held is None:

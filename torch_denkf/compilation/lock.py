@@ -50,7 +50,7 @@ def take_lock(file: Path, *, create: bool = True) -> int | None:
 
 @contextmanager
 def locked(folder: Path, name: str, doing: str) -> Iterator[None]:
-    """A folder is this process's alone, until the block or the process ends.
+    """Locks a folder for this process, until the block or the process ends.
 
     Args:
         folder: made where it is not there.

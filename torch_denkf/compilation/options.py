@@ -19,7 +19,7 @@ _said = False
 
 
 def options_for_processors() -> dict[str, Any]:
-    """Options of ``torch.compile`` for small steps on a processor."""
+    """Returns options of ``torch.compile`` for small steps on a processor."""
     global _said
     version = ".".join(torch.__version__.split(".")[:2])
     if version in TESTED_VERSIONS:
@@ -34,6 +34,8 @@ def options_for_processors() -> dict[str, Any]:
                 "post_grad_custom_post_pass": FewCalls(),
                 "_post_fusion_custom_pass": ShortFunctions(),
                 "guard_filter_fn": worth_checking,
+                # Otherwise ten programs are compiled to see what the compiler knows of this processor.
+                "cpp.vec_isa_ok": True,
             }
         except ImportError as error:
             reason = f"could not be imported ({error})"

@@ -149,7 +149,7 @@ def _viewed(node: Node) -> Node:
 
 
 def _in_order_of_one_input(products: Sequence[Node]) -> tuple[Node | None, list[Node]]:
-    """The tensor that consists of the right factors of all ``products``, if there is one, and them in its order."""
+    """Returns the tensor that consists of the right factors of all ``products``, if any, and them in its order."""
     pieces = [_viewed(product.args[1]) for product in products]
     if any(piece.target is not operator.getitem for piece in pieces):
         return None, list(products)

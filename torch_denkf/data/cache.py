@@ -21,12 +21,12 @@ _LOG = logging.getLogger("torch_denkf")
 
 
 def usual_folder() -> Path:
-    """Where the cache is, if nothing else is said: ``$TORCH_DENKF_CACHE``, or ``~/.cache/torch_denkf``."""
+    """Returns the default folder of the cache: ``$TORCH_DENKF_CACHE``, or ``~/.cache/torch_denkf``."""
     return Path(os.environ.get("TORCH_DENKF_CACHE") or Path.home() / ".cache" / "torch_denkf").expanduser()
 
 
 def cache_folder(cache: str | Path | bool | None) -> Path | None:
-    """The folder that an option ``cache`` asks for: True for the usual one, None or False for none."""
+    """Returns the folder that an option ``cache`` asks for: True for the usual one, None or False for none."""
     if cache is None or cache is False:
         return None
     if cache is not True and not isinstance(cache, (str, Path)):
@@ -35,7 +35,7 @@ def cache_folder(cache: str | Path | bool | None) -> Path | None:
 
 
 def stamp(file: Path) -> tuple[int, int]:
-    """Time in ns and size in bytes of a file, by which a cache knows it again; (-1, -1) where there is none."""
+    """Returns time in ns and size in bytes of a file, by which a cache knows it again; (-1, -1) without a file."""
     try:
         status = file.stat()
     except FileNotFoundError:  # its reader says what is missing
@@ -44,7 +44,7 @@ def stamp(file: Path) -> tuple[int, int]:
 
 
 def cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
-    """Opens a cache entry; where there is none, or a damaged one, reads its content anew and stores it.
+    """Opens a cache entry; where there is none, or a damaged one, reads its content again and stores it.
 
     Args:
         entry: folder of the entry.
@@ -64,7 +64,7 @@ def cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
 
 
 def entries_of(folder: Path) -> list[Path]:
-    """The entries in a folder, sound or not, by name; what is not the cache's is left out."""
+    """Returns the entries in a folder, sound or not, by name; what is not the cache's is left out."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if path.is_dir() and is_entry(path))
@@ -83,7 +83,7 @@ def _load(entry: Path) -> TensorDict | None:
     except FileNotFoundError:
         return None
     except DamagedEntry as damage:
-        _LOG.warning("the cache entry %s is damaged, and is made anew: %s", entry, damage)
+        _LOG.warning("the cache entry %s is damaged, and is made again: %s", entry, damage)
         _set_aside(entry)
         return None
 
@@ -106,7 +106,7 @@ def _check_writable(entry: Path) -> None:
 
 @contextmanager
 def _writing(entry: Path) -> Iterator[Path]:
-    """A folder to write to beside an entry, which is renamed when it is complete: an entry that exists is complete."""
+    """Yields a folder next to an entry, which is renamed when it is complete: an entry that exists is complete."""
     with _errors_of(entry), place_beside(entry) as beside:
         yield beside
         try:

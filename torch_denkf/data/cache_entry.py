@@ -53,7 +53,7 @@ _MAP = mmap.MAP_PRIVATE | getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform 
 
 
 class DamagedEntry(Exception):
-    """What is wrong with an entry."""
+    """Raised for a damaged entry; says what is wrong with it."""
 
 
 class CachedTensor(Tensor):
@@ -172,7 +172,7 @@ def check_entry(folder: Path) -> None:
 
 
 def is_entry(folder: Path) -> bool:
-    """Whether a folder is one that this module writes, sound or not."""
+    """Returns True for a folder in the format of this module, valid or not."""
     try:
         with _open(folder / MANIFEST) as stream:
             return FORMAT.encode() in stream.read(_LARGEST_MANIFEST)
@@ -237,7 +237,7 @@ def _whole(stream: BinaryIO) -> int:
 
 
 def _ends(stream: BinaryIO) -> int:
-    """Of a small file, all of it."""
+    """Returns the CRC-32 of both ends of a file, or of all of a small one."""
     size = os.fstat(stream.fileno()).st_size
     stream.seek(0)
     total = zlib.crc32(stream.read(END))
@@ -252,7 +252,7 @@ def _map(file: Path, dtype: torch.dtype, shape: torch.Size) -> Tensor:
     with file.open("rb") as stream:
         there = os.fstat(stream.fileno()).st_size
         if there != size:
-            raise OSError(f"{file} has {there} bytes instead of {size}; delete its folder, and it is made anew")
+            raise OSError(f"{file} has {there} bytes instead of {size}; delete its folder, and it is made again")
         if not size:
             return torch.empty(shape, dtype=dtype)
         mapped = mmap.mmap(stream.fileno(), size, _MAP, mmap.PROT_READ | mmap.PROT_WRITE)
@@ -282,5 +282,5 @@ def _batch_sizes(content: TensorDict) -> Iterator[tuple[tuple[str, ...], torch.S
 
 
 def _place(tensor: Tensor) -> int:
-    """Where in memory the numbers are that it is a view of."""
+    """Returns the address of the memory that a tensor is a view of."""
     return tensor.untyped_storage().data_ptr()

@@ -44,12 +44,12 @@ class Episode:
 
     @property
     def split_name(self) -> str:
-        """What the hashes of splits are made of: episodes that share it are on the same side."""
+        """Returns the name that splits hash: episodes that share it are on the same side."""
         return self.name
 
 
 def hashed_share(name: str, purpose: str) -> float:
-    """A number in [0, 1) made of a name: those below a share are in it, and stay in it as the share grows.
+    """Returns a number in [0, 1) made of a name: those below a share are in it, and stay in it as the share grows.
 
     Args:
         name: of an episode.
@@ -65,7 +65,7 @@ def hashed_share(name: str, purpose: str) -> float:
 
 
 def hashed_tests(share: float) -> Callable[[Episode], bool]:
-    """Whether an episode is among the share of all that is for tests, by :func:`hashed_share`.
+    """Returns a predicate that selects a share of all episodes as test split, by :func:`hashed_share`.
 
     Raises:
         ValueError: if the share is out of range.
@@ -78,7 +78,7 @@ def hashed_tests(share: float) -> Callable[[Episode], bool]:
 def roles_of(
     episodes: Sequence[Any], for_tests: Callable[[Any], bool], validation_share: float
 ) -> list[Literal["train", "validation", "test"]]:
-    """What each episode is for; no other episode has a say in it, so that those added later move none.
+    """Assigns each episode to a split, independently of all others, so that those added later move none.
 
     Args:
         episodes: of the whole data set.
@@ -111,7 +111,7 @@ def episode_flags(first: Tensor, last: Tensor) -> dict[str, Any]:
 
 
 def check_rows(rows: TensorDictBase, episodes: Sequence[Episode]) -> None:
-    """Refuses rows that are no data set's.
+    """Raises for rows that are no data set's.
 
     Raises:
         KeyError: if they lack ``step`` or ``time``.
@@ -137,7 +137,7 @@ def rows_of(episodes: Sequence[Episode]) -> Tensor:
 def select_episodes(
     rows: TensorDictBase, chosen: Sequence[Episode], single: Tensor | None
 ) -> tuple[TensorDict, tuple[Episode, ...]]:
-    """Rows of the chosen episodes with their flags and numbers, and these episodes with their new places.
+    """Returns rows of the chosen episodes with their flags and numbers, and these episodes with their new places.
 
     Args:
         rows: of the whole data set, ``[N]``.

@@ -18,7 +18,7 @@ __all__ = ["ReplayOptions", "check_options"]
 
 
 class ReplayOptions(TypedDict, total=False):
-    """What every data set's constructor takes beside its source; see :class:`torch_denkf.data.EpisodeReplay`."""
+    """Arguments of every data set's constructor besides its source; see :class:`torch_denkf.data.EpisodeReplay`."""
 
     split: Split
     validation_share: float
@@ -37,7 +37,7 @@ class ReplayOptions(TypedDict, total=False):
 
 
 def check_options(options: Mapping[str, Any]) -> None:
-    """Refuses options that are wrong whatever the data are: reading these may take long.
+    """Raises for options that are wrong whatever the data are: reading these may take long.
 
     Raises:
         TypeError: for an option that there is not.

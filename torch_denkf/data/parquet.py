@@ -8,14 +8,14 @@ from typing import Any
 
 from torch_denkf.data.video import EXTRA
 
-__all__ = ["read_parquet"]
+__all__ = ["parquet_names", "read_parquet"]
 
 MOST_ROWS = 10**8
 MOST_BYTES, MOST_RATIO = 1 << 30, 64  # more than so many bytes may not be more than so many times the file
 
 
 def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
-    """Columns of a parquet file, or all, as a pyarrow table.
+    """Returns columns of a parquet file, or all, as a pyarrow table.
 
     Raises:
         ImportError: without pyarrow.
@@ -35,14 +35,22 @@ def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
             missing = sorted(set(columns or ()) - set(there))
             if missing:
                 raise ValueError(f"{file} lacks the columns {missing}; it has {there}")
-            _refuse_bombs(file, opened.metadata)
+            _check_unpacked_size(file, opened.metadata)
             return opened.read(None if columns is None else list(columns))
     except (arrow.ArrowException, OSError) as error:
-        raise ValueError(f"{file} is no complete parquet file ({error}); download or copy it anew") from error
+        raise ValueError(f"{file} is no complete parquet file ({error}); download or copy it again") from error
 
 
-def _refuse_bombs(file: Path, metadata: Any) -> None:
-    """Before anything is unpacked.
+def parquet_names(file: Path) -> list[str]:
+    """Names of the columns of a parquet file; raises as :func:`read_parquet`."""
+    read_parquet(file, [])
+    import pyarrow.parquet as parquet
+
+    return list(parquet.read_schema(file).names)
+
+
+def _check_unpacked_size(file: Path, metadata: Any) -> None:
+    """Raises for decompression bombs, before anything is unpacked.
 
     Raises:
         ValueError: for a small file that announces a huge table.
@@ -51,5 +59,5 @@ def _refuse_bombs(file: Path, metadata: Any) -> None:
     if metadata.num_rows > MOST_ROWS or size > max(MOST_BYTES, MOST_RATIO * file.stat().st_size):
         raise ValueError(
             f"{file} has {file.stat().st_size} bytes and announces {metadata.num_rows} rows of together {size} bytes; "
-            "that much is not unpacked: download or copy it anew"
+            "that much is not unpacked: download or copy it again"
         )

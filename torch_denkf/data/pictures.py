@@ -34,7 +34,7 @@ CURE = "pass cache=FOLDER, or cache=None for memory"
 
 
 def check_size(size: Sequence[int]) -> tuple[int, int]:
-    """(height, width) as whole numbers.
+    """Returns (height, width) as whole numbers.
 
     Raises:
         ValueError: if they are not two, or one is not positive.
@@ -47,12 +47,12 @@ def check_size(size: Sequence[int]) -> tuple[int, int]:
 
 
 def text_of_size(size: Sequence[int]) -> str:
-    """A size (height, width) for a message."""
+    """Returns a size (height, width) for a message."""
     return f"{size[1]} pixels wide and {size[0]} high"
 
 
 def scaled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """``[H, W, 3]`` or grey ``[H, W]`` to ``[C, *size]``: averaged over areas where it shrinks."""
+    """Scales ``[H, W, 3]`` or grey ``[H, W]`` to ``[C, *size]``: averaged over areas where it shrinks."""
     if image.shape[:2] != size:
         shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
         image = np.ascontiguousarray(image)
@@ -61,7 +61,7 @@ def scaled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR) -> np.ndarray | None:
-    """The bytes of a PNG, a JPEG or another file that OpenCV knows, as RGB ``[H, W, 3]``; None if they are damaged.
+    """Decodes a PNG, a JPEG or another file that OpenCV knows to RGB ``[H, W, 3]``; returns None if it is damaged.
 
     By OpenCV's ``flags`` it may be grey, ``[H, W]``.
     """
@@ -73,7 +73,7 @@ def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR) -> np.ndarray | N
 
 
 def picture_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """Images in a folder, in no order, without hidden ones, such as ._1.png, which are a file manager's.
+    """Returns images in a folder, in no order, without hidden ones, such as ._1.png, which are a file manager's.
 
     Raises:
         ValueError: if two of them are of one name, so that a frame would count twice, or one is neither file nor
@@ -94,7 +94,7 @@ def picture_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
 
 
 def is_bomb(data: bytes) -> bool:
-    r"""Whether a PNG's or a JPEG's header announces more than 10^8 pixels, which would be unpacked at once.
+    r"""Returns True if a PNG's or a JPEG's header announces more than 10^8 pixels, which would be unpacked at once.
 
     Examples:
         >>> is_bomb(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (30000).to_bytes(4) + (30000).to_bytes(4))
@@ -113,7 +113,7 @@ def is_bomb(data: bytes) -> bool:
 
 
 def image_store(rows: int, size: tuple[int, int], folder: Path | None) -> np.ndarray:
-    """Zeros, uint8 ``[rows, 3, H, W]``: in memory, or in a file in ``folder`` that goes when they are let go.
+    """Returns zeros, uint8 ``[rows, 3, H, W]``: in memory, or in a file in ``folder`` that goes when they are let go.
 
     Raises:
         OSError: if the folder cannot be written to, or has not enough space.
@@ -128,7 +128,7 @@ def image_store(rows: int, size: tuple[int, int], folder: Path | None) -> np.nda
 
 
 def unnamed_file(folder: Path) -> IO[bytes]:
-    """A file in ``folder`` that goes when it is let go.
+    """Opens a file in ``folder`` that is deleted when it is closed.
 
     Raises:
         OSError: if the folder cannot be written to.
@@ -161,11 +161,11 @@ class JoinedPictures:
 
     @property
     def shape(self) -> torch.Size:
-        """Of all of them together."""
+        """Returns the shape of all of them together."""
         return torch.Size([int(self._ends[-1]), *self.stores[0].shape[1:]])
 
     def __getitem__(self, index: Tensor) -> Tensor:
-        """Pictures by number, int64 ``[m]``."""
+        """Returns pictures by number, int64 ``[m]``."""
         which = torch.searchsorted(self._ends, index, right=True)
         out = self.stores[0].new_empty(len(index), *self.stores[0].shape[1:])
         for number in which.unique().tolist():
@@ -175,7 +175,7 @@ class JoinedPictures:
 
 
 def float_pictures(pictures: Tensor | JoinedPictures, index: Tensor) -> dict[str, Tensor]:
-    """``"pixels"`` of some pictures, float32 in [0, 1]; zeros where the index is negative.
+    """Returns ``"pixels"`` of some pictures, float32 in [0, 1]; zeros where the index is negative.
 
     Args:
         pictures: uint8 ``[N, C, H, W]``.

@@ -18,7 +18,7 @@ from torchrl.envs.transforms import Transform
 
 from torch_denkf.data.episodes import ROW, Episode, check_rows, roles_of, rows_of, select_episodes
 from torch_denkf.data.options import ReplayOptions, check_options
-from torch_denkf.data.slices import choose_sampler, refuse_short_episodes, slices_of
+from torch_denkf.data.slices import check_episode_lengths, choose_sampler, slices_of
 from torch_denkf.data.statistics import mean_and_std
 
 __all__ = ["EpisodeReplay"]
@@ -78,7 +78,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
             * ``slice_len``: rows of a slice. With ``num_slices``, too, ``batch_size`` is their product.
             * ``strict_length``: False lets episodes that are shorter than a slice come as short slices.
             * ``sampler``: by default slices if they are asked for, else single rows at random.
-            * ``writer``: by default one that refuses to write.
+            * ``writer``: by default one that raises.
             * ``collate_fn``: as in torchrl's buffers, like ``pin_memory`` and ``prefetch``.
             * ``pin_memory``: whether samples are pinned.
             * ``prefetch``: samples to prepare in advance, by threads.
@@ -142,7 +142,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
                 "of their names has it; pass split='all', or add episodes"
             )
         stored, self.episodes = select_episodes(rows, chosen, single)
-        refuse_short_episodes(self.episodes, sampler, batch_size)
+        check_episode_lengths(self.episodes, sampler, batch_size)
         self._add_pictures = _AddPictures(pictures)
         writer, transform = options.get("writer"), options.get("transform")
         super().__init__(
@@ -160,7 +160,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
             self.append_transform(transform)
 
     def draw(self, generator: torch.Generator, length: int | None = None) -> TensorDictBase:
-        """A sample whose randomness all comes from a generator: what a :class:`torch_denkf.training.Stage` asks for.
+        """Draws a sample with all randomness from a generator, as a :class:`torch_denkf.training.Stage` asks for.
 
         Args:
             generator: on the CPU; with the same state it draws the same rows.
@@ -192,7 +192,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         rows = (sampler.num_slices or self.batch_size // own) * length
         try:
             sampler.slice_len = None if own is None else length
-            refuse_short_episodes(self.episodes, sampler, rows)
+            check_episode_lengths(self.episodes, sampler, rows)
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "Got conflicting batch_sizes")  # another length is what is wanted
                 return self.sample(rows)
@@ -205,7 +205,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     @property
     def _training_index(self) -> Tensor:
-        """Rows of the training episodes, numbered in the whole data set, ``[n]``."""
+        """Returns rows of the training episodes, numbered in the whole data set, ``[n]``."""
         training = [e for e, role in zip(self._all_episodes, self._roles, strict=True) if role == "train"]
         if not training:
             raise ValueError(f"none of the episodes {self._source} is in the training split; add episodes")
@@ -213,7 +213,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     @cached_property
     def statistics(self) -> TensorDict:
-        """Means and standard deviations over the **training** episodes, whichever split and rows this data set has.
+        """Returns means and standard deviations over the **training** episodes, whatever the split and rows.
 
         They standardise what a network reads and predicts, and tell it nothing about other episodes.
 
@@ -243,7 +243,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         return [key for name in self._numbers for key in (name, f"{name}_observed")]
 
     def _number_statistics(self, rows: TensorDictBase) -> dict[str, Any]:
-        """Statistics of numbers of the training rows."""
+        """Returns statistics of numbers of the training rows."""
         statistics = {}
         for key in self._numbers:
             if key in rows:
@@ -252,7 +252,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         return statistics
 
     def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:
-        """Statistics of the pixels of some rows of the whole data set; None without pictures."""
+        """Returns statistics of the pixels of some rows of the whole data set; None without pictures."""
         return None
 
     def _is_downloaded(self) -> bool:
@@ -260,16 +260,16 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     @property
     def data_path(self) -> Path | None:
-        """The folder that the data set reads; None for one that came from elsewhere."""
+        """Returns the folder that the data set reads; None for one that came from elsewhere."""
         return self.root
 
     @property
     def data_path_root(self) -> Path | None:
-        """The same: splits are no folders."""
+        """Returns the same folder: splits are no folders."""
         return self.root
 
     def delete(self) -> None:
-        """Refuses: what the data set reads is not its own.
+        """Raises: the files of the data set are not its own.
 
         Raises:
             RuntimeError: always.
@@ -289,7 +289,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         super().__setstate__({**state, "_storage": storage})
 
     def preprocess(self, fn: Callable[[TensorDictBase], TensorDictBase], *args, **kwargs) -> TensorStorage:
-        """TorchRL's ``preprocess``: ``fn`` sees rows with their pixels, and what it returns is stored in ``dest``."""
+        """Runs TorchRL's ``preprocess``: ``fn`` gets rows with their pixels, and its result is stored in ``dest``."""
         return super().preprocess(partial(_then, self._add_pictures, fn), *args, **kwargs)
 
 
@@ -309,7 +309,7 @@ class _AddPictures(Transform):
         self.pictures = pictures
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The same rows, with pictures."""
+        """Adds pictures to rows."""
         tensordict = tensordict.copy()  # data[:] hands out the storage itself
         row = tensordict.pop(ROW)
         if self.pictures is not None:

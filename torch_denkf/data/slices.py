@@ -12,11 +12,11 @@ from torchrl.data.replay_buffers.samplers import Sampler
 
 from torch_denkf.data.episodes import Episode
 
-__all__ = ["Slices", "choose_sampler", "refuse_short_episodes", "slices_of"]
+__all__ = ["Slices", "check_episode_lengths", "choose_sampler", "slices_of"]
 
 
 def choose_sampler(options: Mapping[str, Any]) -> tuple[Sampler | None, int | None]:
-    """A sampler of slices of episodes, if a data set's options ask for them, or else theirs; and the batch size.
+    """Returns a sampler, of slices of episodes if a data set's options ask for them, and the batch size.
 
     Raises:
         ValueError: if ``sampler`` comes with ``num_slices`` or ``slice_len``, or these two contradict ``batch_size``.
@@ -63,7 +63,7 @@ class Slices(SampleUnit):
         self._sampler = sampler
 
     def expand(self, index: Any, info: dict[str, Any], storage: Any) -> tuple[Any, dict[str, Any]]:
-        """The same rows, and what the sampler says about each of them, in the shape of slices."""
+        """Reshapes rows to slices, with the sampler's information about each of them."""
         first = index[0] if isinstance(index, tuple) else index
         rows = len(first)
         ends = info.get(self._sampler.truncated_key)  # without replacement, the last sample may have fewer slices
@@ -80,8 +80,8 @@ class Slices(SampleUnit):
         return index, {key: shaped(value) for key, value in info.items()}
 
 
-def refuse_short_episodes(episodes: Sequence[Episode], sampler: Sampler | None, batch_size: int | None) -> None:
-    """TorchRL's samplers leave short episodes out without a word; here, that is a mistake.
+def check_episode_lengths(episodes: Sequence[Episode], sampler: Sampler | None, batch_size: int | None) -> None:
+    """Raises for episodes that are too short; TorchRL's samplers leave them out without a warning.
 
     Raises:
         ValueError: if an episode is shorter than a slice.

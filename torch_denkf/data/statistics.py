@@ -11,7 +11,7 @@ __all__ = ["mean_and_std", "picture_statistics"]
 
 
 def mean_and_std(values: Tensor) -> dict[str, Tensor]:
-    """Of each column of ``[n, ...]``, in double; the standard deviation divides by n.
+    """Returns mean and standard deviation of each column of ``[n, ...]``, in double; the latter divides by n.
 
     Examples:
         >>> mean_and_std(torch.tensor([[1.0], [3.0]]))
@@ -22,7 +22,7 @@ def mean_and_std(values: Tensor) -> dict[str, Tensor]:
 
 
 def picture_statistics(pictures: Tensor | JoinedPictures, index: Tensor, chunk: int = 256) -> dict[str, Tensor]:
-    """Mean and standard deviation of each channel, ``[C, 1, 1]``, of values in [0, 1].
+    """Returns mean and standard deviation of each channel, ``[C, 1, 1]``, of values in [0, 1].
 
     Args:
         pictures: uint8 ``[N, C, H, W]``, maybe memory-mapped.

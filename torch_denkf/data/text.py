@@ -8,7 +8,7 @@ __all__ = ["read_lines", "read_number"]
 
 
 def read_number(text: str) -> float:
-    """The number that a text is; ``1_3`` is none, although Python reads 13.
+    """Returns the number that a text is; ``1_3`` is none, although Python reads 13.
 
     Raises:
         ValueError: if it is none.
@@ -19,7 +19,7 @@ def read_number(text: str) -> float:
 
 
 def read_lines(file: Path) -> list[str]:
-    """The lines of a text file in UTF-8.
+    """Returns the lines of a text file in UTF-8.
 
     Raises:
         ValueError: if it is no such text; the message names the file and the line.
@@ -32,5 +32,5 @@ def read_lines(file: Path) -> list[str]:
         byte = data[error.start]
         raise ValueError(
             f"{file}:{line} is no text in UTF-8 (byte 0x{byte:02x}); is the file compressed or damaged? Download or "
-            "copy it anew, or convert it to UTF-8"
+            "copy it again, or convert it to UTF-8"
         ) from error

@@ -18,7 +18,7 @@ MOST_ROWS = 10**8  # of one recording: eleven days at 100 Hz
 
 
 def sound(times: np.ndarray) -> np.ndarray:
-    """Stamps that are finite and increase, not by next to nothing, and not by more than any clock does, bool ``[N]``.
+    """Masks stamps that are finite and increase, neither by next to nothing nor beyond any clock, bool ``[N]``.
 
     Examples:
         >>> sound(np.array([0.0, np.nan, 2.0, 2.001, 3.0, 1e9, 4.0])).tolist()
@@ -41,7 +41,7 @@ def sound(times: np.ndarray) -> np.ndarray:
 
 
 def filled(times: np.ndarray, good: np.ndarray, step: float) -> np.ndarray:
-    """The times with those that are not sound on straight lines between the others, and beyond these.
+    """Interpolates times that are not sound on straight lines between the others, and extrapolates beyond these.
 
     Args:
         times: ``[N]``, of which one at least is sound.
@@ -61,7 +61,7 @@ def filled(times: np.ndarray, good: np.ndarray, step: float) -> np.ndarray:
 
 
 def increasing(times: np.ndarray) -> np.ndarray:
-    """Which values belong to the longest strictly increasing sub-sequence, bool ``[N]``.
+    """Masks the values of the longest strictly increasing sub-sequence, bool ``[N]``.
 
     One value that is too small, or too large, is the only one left out; a rule that compares with what came before
     would leave out all that follow a value that is too large. Where both leave out as many, it is the later ones,
@@ -94,7 +94,7 @@ def increasing(times: np.ndarray) -> np.ndarray:
 
 
 def row_times(streams: Mapping[str, np.ndarray], clock: str | float, span: Span = "common") -> np.ndarray:
-    """Times of the rows, in s.
+    """Returns times of the rows, in s.
 
     Args:
         streams: times of each stream's readings, s, ascending.
@@ -143,7 +143,7 @@ def _between(begin: float, end: float, streams: Mapping[str, np.ndarray], clock:
 def last_reading(
     times: np.ndarray, rows: np.ndarray, tolerance: float | None, taken: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For each row the last reading that arrived before it, or at it, and whether it arrived since the row before.
+    """Returns for each row the last reading that arrived by then, and whether it arrived since the row before.
 
     Args:
         times: when the readings arrived, s, ascending, ``[m]``.
@@ -167,7 +167,7 @@ def last_reading(
 
 
 def rows_ago(taken: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """By how many rows a reading is late that a row shows: those since the first row at, or after, it was taken.
+    """Returns the latency of the reading in each row: the rows since the first one at, or after, it was taken.
 
     Args:
         taken: s, ``[n]``.
@@ -188,7 +188,7 @@ def rows_ago(taken: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def nearest_reading(times: np.ndarray, rows: np.ndarray, tolerance: float | None) -> tuple[np.ndarray, np.ndarray]:
-    """For each row the reading that is nearest in time, also a later one, and whether the row is its nearest, too.
+    """Returns for each row the nearest reading in time, also a later one, and whether the row is its nearest, too.
 
     Args:
         times: see :func:`last_reading`.
@@ -217,7 +217,7 @@ def nearest_reading(times: np.ndarray, rows: np.ndarray, tolerance: float | None
 def interpolate(
     times: np.ndarray, values: np.ndarray, rows: np.ndarray, tolerance: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Straight lines between the reading before a row and the one after it.
+    """Interpolates on a straight line between the reading before a row and the one after it.
 
     Args:
         times: see :func:`last_reading`.

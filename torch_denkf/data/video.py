@@ -13,13 +13,13 @@ from torch_denkf.deployment.files import name_for_c
 
 EXTRA = "pip install 'torch_denkf[lerobot]'"
 NOT_DECODED = (
-    "no frame of {} can be decoded: it is damaged (download or copy it anew), or in a codec that OpenCV here lacks, "
+    "no frame of {} can be decoded: it is damaged (download or copy it again), or in a codec that OpenCV here lacks, "
     f"such as AV1 ({EXTRA} brings PyAV, which has it)"
 )
 
 
 def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Decode a video once and pair its frames with the times that are asked for.
+    """Decodes a video once and pairs its frames with the times that are asked for.
 
     By time and not by count: a damaged frame, which decoders leave out without a word, must not shift those after it.
 
@@ -56,7 +56,7 @@ def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator
 
 
 def decoded_frames(file: Path) -> Iterator[tuple[float, np.ndarray]]:
-    """All frames that can be decoded, in the order in which they are shown."""
+    """Yields all frames that can be decoded, in the order in which they are shown."""
     capture = cv2.VideoCapture(name_for_c(file), cv2.CAP_FFMPEG)
     try:
         # OpenCV's wheels leave AV1, LeRobot's default, to the hardware.
@@ -90,7 +90,7 @@ def say_if_cut(file: Path, times: Sequence[float]) -> None:
     shown = times[-1] - times[0] + 1 / rate
     if count / rate > shown + 0.6 * step:
         warnings.warn(
-            f"{file} shows {shown:.4g} s, but announces {count / rate:.4g} s: is it cut? Copy it anew, or go on "
+            f"{file} shows {shown:.4g} s, but announces {count / rate:.4g} s: is it cut? Copy it again, or go on "
             "without its end",
             stacklevel=2,
         )

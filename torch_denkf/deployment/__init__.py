@@ -1,23 +1,22 @@
-"""A filter's step as a file that runs without the training code.
+"""A filter's step as a file that runs without the training code, and an analysis that several processes share.
 
-:func:`load_step` needs torch alone. :func:`export_step`, which needs all of torch_denkf, is imported when it is used.
+:func:`load_step` needs torch alone. The others, which need all of torch_denkf, are imported when they are used.
 """
+
+from importlib import import_module
 
 from torch_denkf.deployment.package import load_step
 
 __all__ = [
+    "ShardedEnsembleAnalysis",
     "export_step",
     "load_step",
 ]
 
+_FILES = {"ShardedEnsembleAnalysis": "sharded", "export_step": "export", "PackagedRun": "in_environment"}
+
 
 def __getattr__(name: str):
-    if name == "export_step":
-        from torch_denkf.deployment.export import export_step
-
-        return export_step
-    if name == "PackagedRun":
-        from torch_denkf.deployment.in_environment import PackagedRun
-
-        return PackagedRun
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _FILES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_FILES[name]}"), name)

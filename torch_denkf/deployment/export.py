@@ -13,10 +13,10 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf.compilation import (
+    check_same_numbers,
     clear_damaged_libraries,
     clear_full_cache,
     need_compiler,
-    refuse_other_numbers,
     trace_below_autograd,
 )
 from torch_denkf.deployment.files import write_bytes
@@ -64,7 +64,7 @@ def export_step(
     ``uniform`` of a particle filter, which lies between 0 and 1; bytes are uniform, and booleans are fair coins.
 
     ONNX lacks factors of matrices. Small systems are written out: readings of up to 4 numbers, and covariances of up to
-    6 x 6. What remains is refused by the name of its operator.
+    6 x 6. What remains raises an error that names its operator.
 
     A package cannot raise: after a reading that is not finite its belief is NaN from then on. Put a mask into
     ``example``, and set it to ``False`` for such readings.
@@ -78,7 +78,7 @@ def export_step(
         example: frame entries, and whatever optional ones (mask, action, noise) the step shall read, for one step
             ``[*B]`` with the shapes and dtypes of the real ones. Where the belief is missing, it is initialised.
         path: ends in ``.pt2``, or, for an ONNX model, in ``.onnx``.
-        out_keys: what to return beside the belief, e.g. ``("info", "nis")``.
+        out_keys: what to return besides the belief, e.g. ``("info", "nis")``.
         compiled: compile ahead of time (AOTInductor; needs a C++ compiler here and the same kind of processor there).
             Otherwise the graph is written, which torch runs on any machine, slower. An ONNX model is such a graph.
         format: ``"pt2"`` for a package, ``"onnx"`` for an ONNX model.
@@ -160,7 +160,7 @@ def export_step(
                 _write(program, package, signature, compiled)
                 run, what, maker = _run(package, compiled), "compiled package", "torch's compiler"
                 instead = "the graph, compiled=False, which is slower" if compiled else ""
-            refuse_other_numbers(
+            check_same_numbers(
                 run,
                 step,
                 values,

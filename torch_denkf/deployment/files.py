@@ -87,7 +87,7 @@ def _holds(folder: str, file: Path) -> bool:
 
 @contextmanager
 def replacing(file: str | Path) -> Iterator[Path]:
-    """A path to write to, whose file takes the place of ``file`` when the block ends, synced with the disk.
+    """Yields a path whose file replaces ``file`` when the block ends, synced with the disk.
 
     Where the block or the disk fails, an earlier ``file`` stays as it was, and nothing else is left. What a killed
     process left in the folder goes when the next file is written there.
@@ -96,7 +96,7 @@ def replacing(file: str | Path) -> Iterator[Path]:
         file: result; its folder is made. What is no plain file, such as ``/dev/stdout``, is written to directly.
 
     Yields:
-        The path of an empty file of the same name, in a folder beside it.
+        The path of an empty file of the same name, in a folder next to it.
 
     Raises:
         OSError: if the file cannot be written; names it and the free space.
@@ -177,7 +177,7 @@ def sync(path: Path) -> None:
 
 @contextmanager
 def place_beside(target: Path) -> Iterator[Path]:
-    """A place of the target's name in a folder of its own beside it, on the same disk.
+    """Yields a path of the target's name in a new folder next to it, on the same disk.
 
     What is there at the end goes, or is swept once this process is gone.
 
@@ -200,7 +200,7 @@ def place_beside(target: Path) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> int:
-    """Removes what killed processes left half written beside the files and folders in a folder.
+    """Removes what killed processes left half written next to the files and folders in a folder.
 
     Returns:
         How many places that were.
@@ -246,7 +246,7 @@ def _remove(left: Path, held: int | None) -> None:
 
 
 def _claim(parent: Path) -> tuple[Path, int | None]:
-    """A new folder to write to, and its lock; None on a file system without locks, where its age says if it is dead."""
+    """Creates a folder to write to, and its lock; None on a file system without locks, where its age tells."""
     while True:
         folder = Path(tempfile.mkdtemp(prefix=_WRITING, dir=parent))
         try:

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 import torch_denkf
 from torch_denkf.compilation.lock import locked
 from torch_denkf.deployment.files import sync, write_bytes, write_text
-from torch_denkf.deployment.rebuilt import build_from, refuse_another
+from torch_denkf.deployment.rebuilt import build_from, check_rebuilt
 
 __all__ = ["described", "load_folder", "read_folder_config", "save_folder"]
 
@@ -78,13 +78,13 @@ def save_folder(
     except (TypeError, ValueError) as error:
         raise TypeError(f"settings and training are plain values, as JSON knows them: {error}") from error
     if build is not None:
-        refuse_another(model, builder, build, json.loads(json.dumps(config["settings"])))
-    # Copies: safetensors refuses tensors that share memory.
+        check_rebuilt(model, builder, build, json.loads(json.dumps(config["settings"])))
+    # Copies: safetensors raises for tensors that share memory.
     weights = save({name: value.detach().cpu().clone().contiguous() for name, value in model.state_dict().items()})
     config["sha256"] = hashlib.sha256(weights).hexdigest()
     with locked(folder, ".saving", "is saving to it"):
         _settle(folder)
-        try:  # the new weights lie beside the old ones until one rename, that of the description, changes the model
+        try:  # the new weights lie next to the old ones until one rename, that of the description, changes the model
             write_bytes(_unsettled(folder, config["sha256"]), weights)
             write_text(folder / CONFIG, described(config))
         finally:
@@ -137,7 +137,7 @@ def read_folder_config(folder: str | Path, builders: Mapping[str, object]) -> di
     try:
         config = json.loads(file.read_text())
     except ValueError as error:
-        raise ValueError(f"{file} is not JSON ({error}); restore it from a copy, or train anew") from error
+        raise ValueError(f"{file} is not JSON ({error}); restore it from a copy, or train again") from error
     if not isinstance(config, dict) or config.get("format") != FORMAT or not isinstance(config.get("settings"), dict):
         raise ValueError(f"{file} does not describe a filter (format {FORMAT!r}); pass a folder of `denkf train`")
     if not isinstance(config.get("builder"), str) or config["builder"] not in builders:
@@ -177,28 +177,28 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
     if not _UNSETTLED.fullmatch(file.name) or not file.is_file():
         file = folder / WEIGHTS
     if not file.is_file():
-        raise FileNotFoundError(f"no weights {file}; restore the file from a copy, or train anew")
+        raise FileNotFoundError(f"no weights {file}; restore the file from a copy, or train again")
     if _sha256(file) != config.get("sha256"):
         raise ValueError(
             f"{file} is damaged, or not the file that {CONFIG} describes: its SHA-256 is {_sha256(file)}, expected "
-            f"{config.get('sha256')}; restore both from a copy, install torch_denkf anew, or train anew"
+            f"{config.get('sha256')}; restore both from a copy, install torch_denkf again, or train again"
         )
     try:
         weights = load_file(file)
     except (SafetensorError, ValueError) as error:
-        raise ValueError(f"{file} cannot be read ({error}); restore it from a copy, or train anew") from error
+        raise ValueError(f"{file} cannot be read ({error}); restore it from a copy, or train again") from error
     made = model.state_dict()
     strange = [name for name, value in weights.items() if name in made and not _fits(value, made[name])]
     if strange:
         raise ValueError(
             f"{file} holds NaN, infinity or whole numbers in {strange[:3]}, where {CONFIG} makes none; restore it from "
-            "a copy, or train anew"
+            "a copy, or train again"
         )
     try:
         model.load_state_dict(weights)
     except RuntimeError as error:
         reason = " ".join(str(error).split())
-        raise ValueError(f"{file} does not fit {CONFIG} beside it: {reason}") from error
+        raise ValueError(f"{file} does not fit {CONFIG} next to it: {reason}") from error
     return model.eval()
 
 

@@ -99,7 +99,7 @@ def _refusal(error: BaseException) -> str:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the exporter's remarks on packages that a step does not use, and on its own code."""
+    """Silences the exporter's remarks on packages that a step does not use, and on its own code."""
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir", "onnxscript")]
     before = [logger.level for logger in loggers]
     for logger in loggers:

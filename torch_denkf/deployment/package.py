@@ -178,7 +178,7 @@ def _is_compiled(path: Path) -> bool:
 
 
 def _described(path: Path, text: str, counts: tuple[int, int] | None) -> dict:
-    """The description in a package.
+    """Returns the description in a package.
 
     Args:
         path: for the message.

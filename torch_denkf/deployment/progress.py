@@ -15,7 +15,7 @@ SECONDS = 10.0  # between two lines where there is no terminal; shorter work say
 def progress_bar(
     name: str, total: int | None, done: int = 0, *, unit: str = "it", shown: bool = True, every: float = SECONDS
 ) -> Any:
-    """A bar over ``total`` pieces of work, of which ``done`` are made: tqdm's, and a context manager.
+    """Returns tqdm's bar over ``total`` pieces of work, of which ``done`` are made: a context manager.
 
     In a terminal it is drawn. Elsewhere, in a log file for example, a line is written to stderr every ten seconds,
     or as often as asked for.
@@ -46,11 +46,11 @@ class _Lines:
         self.file = file
 
     def write(self, text: str) -> None:
-        """Write what is not blank."""
+        """Writes what is not blank."""
         text = text.strip()
         if text:
             self.file.write(f"{text}\n")
 
     def flush(self) -> None:
-        """Let readers see it."""
+        """Lets readers see it."""
         self.file.flush()

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import nn
 
-__all__ = ["build_from", "differences", "refuse_another"]
+__all__ = ["build_from", "check_rebuilt", "differences"]
 
 #: Attributes of how a model runs, not of what it is.
 _OF_A_RUN = ("training", "compiled")
@@ -27,7 +27,7 @@ def build_from(builder: Callable[..., nn.Module], settings: Mapping[str, Any]) -
     return builder(**{name: _as_tuples(value) for name, value in settings.items()})
 
 
-def refuse_another(model: nn.Module, name: str, builder: Callable[..., nn.Module], settings: Mapping[str, Any]) -> None:
+def check_rebuilt(model: nn.Module, name: str, builder: Callable[..., nn.Module], settings: Mapping[str, Any]) -> None:
     """Raises a ``ValueError`` where a function of settings builds another model; the message names what differs."""
     with torch.random.fork_rng(devices=[]):
         built = build_from(builder, settings)

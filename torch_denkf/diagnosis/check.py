@@ -127,7 +127,7 @@ class _Case(NamedTuple):
 
     @property
     def matrix(self) -> Tensor:
-        """H, the first O of S components."""
+        """Returns H, the first O of S components."""
         return torch.eye(self.observation_dim, self.state_dim, dtype=self.dtype)
 
     def draw(self, batch: Sequence[int], members: int | None = None) -> TensorDict:
@@ -153,7 +153,7 @@ class _Case(NamedTuple):
         return td.set(self.keys.reading, reading).set(self.keys.variance, variance)
 
     def hide(self, td: TensorDict, observed: Tensor) -> TensorDict:
-        """With a mask, and NaN behind it."""
+        """Adds a mask, and NaN behind it."""
         assert self.keys.observed is not None
         td, shown = td.clone(), observed
         reading = td[self.keys.reading]
@@ -162,7 +162,7 @@ class _Case(NamedTuple):
         return td.set(self.keys.observed, observed)
 
     def exact(self, td: TensorDictBase, reading: Tensor | None = None) -> GaussianUpdate:
-        """The Kalman update of the forecast's sample moments."""
+        """Returns the Kalman update of the forecast's sample moments."""
         reading = td[self.keys.reading] if reading is None else reading
         observed = None if self.keys.observed is None else td.get(self.keys.observed, None)
         mean, cov = td["forecast", "mean"], td["forecast", "cov"]
@@ -202,7 +202,7 @@ def _checks(analysis: TensorDictModuleBase, case: _Case, tolerance: float) -> It
 def _moments(
     where: str, analysis: TensorDictModuleBase, case: _Case, td: TensorDict, tolerance: float
 ) -> Iterator[tuple[str, float, float]]:
-    """Belief and diagnostics against the Kalman update."""
+    """Compares belief and diagnostics with the Kalman update."""
     keys, out, exact = case.keys, analysis(td.clone()), case.exact(td)
     variance = exact.cov.diagonal(dim1=-2, dim2=-1)
     std = variance.sqrt()
@@ -230,16 +230,16 @@ def _moments(
 
 
 def _forecast(where: str, case: _Case, td: TensorDict, out: TensorDictBase) -> Iterator[tuple[str, float, float]]:
-    """The belief against the forecast, member by member."""
+    """Compares the belief with the forecast, member by member."""
     std = td["forecast", "cov"].diagonal(dim1=-2, dim2=-1).sqrt()
     for name, scale in (("mean", std), ("ensemble", std.unsqueeze(-2)), ("log_weight", 1.0)):
         value = out.get((case.keys.belief, name), None)
         if value is not None:
-            yield f"{where}{name}, beside the forecast's", _largest((value - td["forecast", name]) / scale), _ROUNDING
+            yield f"{where}{name}, next to the forecast's", _largest((value - td["forecast", name]) / scale), _ROUNDING
 
 
 def _gain(analysis: TensorDictModuleBase, case: _Case, tolerance: float) -> Iterator[tuple[str, float, float]]:
-    """The derivative of the mean by the reading against the gain; with a mask it must be finite."""
+    """Compares the derivative of the mean by the reading with the gain; with a mask it must be finite."""
     keys, td = case.keys, case.draw((2,))
     reading = td[keys.reading].clone().requires_grad_()
     expected = torch.autograd.grad(case.exact(td, reading).mean.sum(), reading)[0]

@@ -74,7 +74,7 @@ def _causes(members: Tensor | None) -> str:
     causes = [
         "The noise of these readings, or that of the motion, may be too small.",
         "An outlier, or a jump, may have taken the belief away: put a gate around the filter, Gated(filter), which "
-        "believes less of what lies far off, and opens after patience= such readings.",
+        "takes less of outliers, and opens after patience= such readings.",
     ]
     if members is None or members.shape[-2] < _MANY:
         causes.append(

@@ -61,7 +61,7 @@ def _shown(key: NestedKey, value: Tensor) -> str:
 
 
 def missing_entry(reader: str, missing: Iterable[NestedKey], present: Iterable[NestedKey], cure: str = "") -> KeyError:
-    """Returns the error for entries that are read and missing: it names the reader, them, what is there, and the cure.
+    """Returns the error for entries that are read and missing: names reader, missing and given entries, and a cure.
 
     Example:
         >>> print(missing_entry("Blur", ["pixels"], ["image", "action"], "Set in_keys=."))

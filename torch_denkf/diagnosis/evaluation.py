@@ -1,4 +1,4 @@
-"""How good the beliefs of a sequence are: errors, coverage, CRPS and NEES, in the filter's own space."""
+"""Evaluation of the beliefs of a sequence: errors, coverage, CRPS and NEES, in the filter's own space."""
 
 from __future__ import annotations
 

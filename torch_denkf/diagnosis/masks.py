@@ -149,7 +149,7 @@ def _own(key: NestedKey) -> NestedKey:
 
 
 def _unmasked(structure: Structure) -> Iterator[tuple[str, TensorDictModuleBase]]:
-    """The modules of the update that take in a reading, but name no optional entry, as a mask would be.
+    """Yields the modules of the update that take in a reading, but name no optional entry, as a mask would be.
 
     They say what their reading is, or they write the belief and read an entry that no step makes.
     """

@@ -236,7 +236,7 @@ def _no_point(structure: Structure, now: Entries) -> str:
 
 
 def _process_noise(structure: Structure, now: Entries) -> str:
-    """Names the process noise, which is made anew, where it is no covariance."""
+    """Names the process noise, which is made again, where it is no covariance."""
     place, transition = structure.transition
     work = dict(now)
     for kind in structure.kinds:
@@ -293,7 +293,7 @@ def _all_told(values: Mapping[NestedKey, Tensor], keys: list[NestedKey]) -> str:
 
 
 def _told(value: Tensor) -> str:
-    """A few numbers, or the largest of many."""
+    """Returns a few numbers, or the largest of many."""
     value = value.detach()
     if value.numel() <= 4:
         numbers = value.flatten().tolist()

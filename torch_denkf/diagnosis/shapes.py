@@ -54,7 +54,7 @@ class ReadingRanks(Once):
 
 
 def _read_as_they_are(structure: Structure) -> Iterator[NestedKey]:
-    """The observations that come from outside and no sensor changes; their noise may be a matrix."""
+    """Yields the observations that come from outside and no sensor changes; their noise may be a matrix."""
     for _, module in structure.update:
         for part in in_role(module, Update):
             yield from (key for key in map(unravel_key, part.reading_keys[:1]) if key in structure.needed)

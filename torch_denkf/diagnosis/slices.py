@@ -104,7 +104,7 @@ def _refuse(what: str, broken: Tensor, size: int) -> None:
 
 
 def _named(tensordict: TensorDictBase, names: tuple[str, ...]) -> Iterator[tuple[NestedKey, Tensor]]:
-    """Entries ``[N]`` of some last names, outside of the next step's."""
+    """Yields entries ``[N]`` of some last names, outside of the next step's."""
     for key in map(unravel_key, tensordict.keys(True, True)):
         first, last = (key, key) if isinstance(key, str) else (key[0], key[-1])
         if last in names and first not in ("next", "previous"):
@@ -124,7 +124,7 @@ def _breaks(clock: Tensor, inner: Tensor, *, strict: bool) -> Tensor:
 
 
 def _end(following: TensorDictBase, size: int) -> Tensor | None:
-    """The last elements of episodes, ``[N]``; ``None`` where nothing says."""
+    """Returns the last elements of episodes, ``[N]``; ``None`` where nothing says."""
     values = [following.get(name, None) for name in ("done", "truncated")]
     ends = [value.reshape(size, -1).any(-1) for value in values if value is not None]
     return torch.stack(ends).any(0) if ends else None
@@ -158,7 +158,7 @@ def _chain(tensordict: TensorDictBase, following: TensorDictBase, inner: Tensor)
 
 
 def _equal(first: Tensor, second: Tensor) -> Tensor:
-    """Rows that are equal; no number equals no number."""
+    """Masks rows that are equal; NaN equals NaN."""
     same = first == second
     if first.is_floating_point():
         same = same | (first.isnan() & second.isnan())

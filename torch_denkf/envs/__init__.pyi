@@ -1,5 +1,6 @@
 from .disturbances import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 from .hold import HoldReading
+from .late_actions import LateActions
 from .linear import LinearGaussianEnv
 from .missing import MissingFrames
 from .pendulum import NoisyPendulumEnv
@@ -10,6 +11,7 @@ __all__ = [
     "Blur",
     "Brightness",
     "HoldReading",
+    "LateActions",
     "LinearGaussianEnv",
     "MissingFrames",
     "NoisyPendulumEnv",

@@ -1,4 +1,4 @@
-"""What transforms of frames share: keys, chance, resets, data, and pictures by the chunk."""
+"""Base of transforms of frames: keys, chance, resets, data, and pictures by the chunk."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class ImageDisturbance(FrameTransform):
         raise NotImplementedError
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Changes nothing, but refuses entries that can be negative: those are no pictures.
+        """Changes nothing; raises for entries that can be negative: those are no pictures.
 
         Raises:
             ValueError: if an entry's lowest value is negative.
@@ -101,16 +101,16 @@ class ImageDisturbance(FrameTransform):
 
 
 def scale_of(frames: Tensor) -> float:
-    """The value of white: 255 in integer images, 1 in floating ones."""
+    """Returns the value of white: 255 in integer images, 1 in floating ones."""
     return 1.0 if frames.is_floating_point() else 255.0
 
 
 def to_float(frames: Tensor) -> Tensor:
-    """Frames in a dtype to calculate in: float64 stays, all else becomes float32; values keep their scale."""
+    """Returns frames in a dtype to calculate in: float64 stays, all else becomes float32; values keep their scale."""
     return frames if frames.dtype == torch.float64 else frames.to(torch.float32)
 
 
 def to_dtype(values: Tensor, like: Tensor) -> Tensor:
-    """Values back in the dtype of the frames, rounded and held in [0, white]."""
+    """Returns values back in the dtype of the frames, rounded and held in [0, white]."""
     values = values if like.is_floating_point() else values.round()
     return values.clamp(0.0, scale_of(like)).to(like.dtype)

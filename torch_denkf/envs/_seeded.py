@@ -1,4 +1,4 @@
-"""What simulated environments share: randomness of their own, on their device."""
+"""Base of simulated environments: a random generator of their own, on their device."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["SeededEnv"]
 
 
 class SeededEnv(EnvBase):
-    """An environment that draws from a generator of its own, ``rng``, which begins anew where it moves to a device."""
+    """An environment that draws from a generator of its own, ``rng``, which restarts where it moves to a device."""
 
     rng: torch.Generator
 
@@ -17,7 +17,7 @@ class SeededEnv(EnvBase):
         self.rng = torch.Generator().manual_seed(0 if seed is None else seed)
 
     def _source(self, like: torch.Tensor) -> dict:
-        """Returns where to draw numbers beside ``like``, as arguments of ``torch.rand``."""
+        """Returns where to draw numbers next to ``like``, as arguments of ``torch.rand``."""
         if like.is_meta:
             return {"device": like.device}
         if self.rng.device != like.device:

@@ -1,4 +1,4 @@
-"""What happens to a camera's pictures: dead and hot pixels, a lens out of focus, light, blackouts, dirt.
+"""Disturbances of a camera's pictures: dead and hot pixels, defocus, light, blackouts, dirt.
 
 The first two and the box are the robustness tests of the DEnKF paper's KITTI code, as shares of the picture instead of
 pixels of 1242 x 375, so that they fit any size. Pictures are ``[*B, C, H, W]``, uint8 in [0, 255] or floating in
@@ -27,7 +27,7 @@ __all__ = ["BlackFrames", "Blur", "Brightness", "OccludingBox", "SaltAndPepper"]
 class SaltAndPepper(ImageDisturbance):
     """Makes a share of the pixels white and as many others black, in all channels.
 
-    The counts are exact: ``round(fraction * H * W)`` of each, drawn anew for each frame.
+    The counts are exact: ``round(fraction * H * W)`` of each, drawn again for each frame.
 
     Args:
         fraction: share of white pixels, and of black ones; by default 9000 each of 1242 x 375 (the paper's code draws
@@ -261,7 +261,7 @@ class OccludingBox(ImageDisturbance):
         return torch.where(box, to_dtype(inside, frames), frames)
 
     def _side(self, axis: int, frames: Tensor) -> Tensor:
-        """Which rows, or columns, of each frame the box covers, ``[n, H]`` or ``[n, W]``."""
+        """Masks the rows, or columns, of each frame that the box covers, ``[n, H]`` or ``[n, W]``."""
         length, count = frames.shape[axis - 2], len(frames)
         side = round(self.size[axis] * length)
         if self.position is None:

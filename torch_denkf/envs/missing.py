@@ -49,7 +49,7 @@ class MissingFrames(FrameTransform):
 
     @property
     def hidden_by(self) -> dict[NestedKey, NestedKey]:
-        """The mask that this transform writes for each entry that it drops."""
+        """Maps each entry that this transform drops to the mask that it writes."""
         return dict.fromkeys(map(unravel_key, self.in_keys), unravel_key(self.observed_key))
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:

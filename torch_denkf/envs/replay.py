@@ -34,7 +34,7 @@ class RecordedPolicy(TensorDictModuleBase):
     out_keys: ClassVar[list[NestedKey]] = ["action"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The same tensordict, with ``"action"``."""
+        """Adds ``"action"`` to the tensordict."""
         return tensordict.set("action", tensordict.get(_RECORDED).clone())
 
 
@@ -43,11 +43,11 @@ class ReplayEnv(RowsEnv):
 
     Emits, at reset and at each step, a row exactly as ``data[row]`` has it: its readings, ``state``, ``observed``,
     ``step``, ``time``, ``episode`` and what the data set's transform adds. ``is_init`` is True at reset; ``truncated``
-    and ``done`` are True in the last row. Elements may end at different steps; a reset starts anew only those that
+    and ``done`` are True in the last row. Elements may end at different steps; a reset restarts only those that
     ``"_reset"`` marks. Rewards are zero.
 
     Elements take the episodes in turn: with a batch of three, the first reset shows the first three, and each element
-    that ends goes on with the next one that none has had. ``set_seed`` starts this turn and the random starts anew.
+    that ends goes on with the next one that none has had. ``set_seed`` restarts this turn and the random starts.
     Each worker of a SerialEnv or ParallelEnv has a turn of its own: give each its ``episodes``.
 
     **Actions.** A replay goes on as it was recorded, whatever is commanded.
@@ -57,7 +57,7 @@ class ReplayEnv(RowsEnv):
     replays it (``rand_action`` does), and so does the policy ``env.policy``, a :class:`RecordedPolicy`, which
     SerialEnv, ParallelEnv and collectors need: ``env.rollout(n, RecordedPolicy())``. A filter in a
     :class:`~torch_denkf.transforms.DEnKFTransform` reads the ``action`` that the policy wrote, so with this policy it
-    is driven by the recorded commands. With another policy it believes in motions that never happened.
+    is driven by the recorded commands. With another policy it predicts motions that never happened.
 
     Where nothing was commanded, the action has **width zero**, see
     :class:`~torch_denkf.applications.car.KITTIReplayEnv`.

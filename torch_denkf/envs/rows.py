@@ -1,4 +1,4 @@
-"""What replays of recordings share: rows that are shown one after the other, from a first to a last."""
+"""Base of replays of recordings: rows that are shown one after the other, from a first to a last."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class RowsEnv(Checked, EnvBase):
         self._set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
 
     def _rows_at(self, row: Tensor) -> TensorDict:
-        """What rows ``[*B]`` show, batch size ``*B``."""
+        """Returns the entries of rows ``[*B]``, batch size ``*B``."""
         raise NotImplementedError
 
     def _choose(self, starts: Tensor) -> tuple[Tensor, Tensor]:
-        """First and last rows ``[*B]`` of new stretches, for the elements that start one, ``[*B]`` bool."""
+        """Returns first and last rows ``[*B]`` of new stretches, for the elements that start one, ``[*B]`` bool."""
         raise NotImplementedError
 
     def _set_specs(self, row: Tensor, actions: int = 0, **specs: TensorSpec) -> None:

@@ -42,7 +42,7 @@ class DEnKF(Filter):
         analysis: the update; ``EnsembleAnalysis("sensor")`` by default, and ``EnsembleAnalysis("perturbed")`` without a
             sensor.
         initial: the initial belief, which also fixes the number of members.
-        process_noise: Q of the motion, beside the noise of the transition's network: standard deviations ``[S]`` (a
+        process_noise: Q of the motion, besides the noise of the transition's network: standard deviations ``[S]`` (a
             number for all, 0 for none), or a module that writes Q, see :mod:`torch_denkf.modules.process_noise`. An
             ensemble without any process noise collapses. ``None``: the transition's own noise alone.
         **options: ``reading_space``, ``observation_key``, ``observed_key``, for the default ``analysis``,
@@ -103,7 +103,7 @@ class DEnKF(Filter):
         initial: TensorDictModuleBase | None = None,
         **kwargs,
     ) -> DEnKF:
-        """The networks of the paper's Table I, on a standardised state and observation.
+        """Returns the networks of the paper's Table I, on a standardised state and observation.
 
         Args:
             state_dim: S.
@@ -146,7 +146,7 @@ class DEnKF(Filter):
         initial: TensorDictModuleBase | None = None,
         **kwargs,
     ) -> DEnKF:
-        """The layer kinds and widths of the authors' PyTorch code, which differ from Table I.
+        """Returns the layer kinds and widths of the authors' PyTorch code, which differ from Table I.
 
         Flipout layers of widths 64, 512, 256 in a residual transition; an observation model of widths 64, 128, 128,
         64; a sensor of three pooled convolutions, a 512-wide and a 64-wide flipout layer; a noise model of width 32

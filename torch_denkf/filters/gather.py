@@ -11,13 +11,13 @@ from torch import Tensor
 
 from torch_denkf._registered import diagnosis
 from torch_denkf._slices import one_earlier
-from torch_denkf.filters.structure import KNOWN, RESUMES, Structure, previous_key
+from torch_denkf.filters.structure import FROM_STORED, HAS_PREVIOUS, Structure, previous_key
 from torch_denkf.submodel import Call, Entries
 
-__all__ = ["Rows", "controls_of", "gather_rows", "of_one_robot"]
+__all__ = ["StepInputs", "controls_of", "gather_rows", "of_one_robot"]
 
 
-class Rows(NamedTuple):
+class StepInputs(NamedTuple):
     """Inputs of the steps of a sequence.
 
     Attributes:
@@ -38,14 +38,14 @@ class Rows(NamedTuple):
 
     @property
     def fresh(self) -> Tensor:
-        """Elements that are reset, ``[*B, T, 1]``."""
+        """Masks elements that are reset, ``[*B, T, 1]``."""
         if self.begins.shape[-2] == self.size[-1]:
             return self.begins
         return _or_first(None, self.size, self.begins.device)
 
 
 def of_one_robot(name: str, like: Tensor | None, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
-    """A tensordict as it is; of a dictionary a new one, ``[]``, in the precision and on the device of ``like``."""
+    """Returns a tensordict as it is; of a dictionary a new one, ``[]``, in the dtype and on the device of ``like``."""
     if isinstance(tensordict, TensorDictBase):
         return tensordict
     if not isinstance(tensordict, Mapping):
@@ -65,7 +65,7 @@ def gather_rows(
     marks: Tensor | None,
     size: torch.Size,
     start_of: Callable[[Entries, Call], Entries],
-) -> Rows:
+) -> StepInputs:
     """Finds where each element of a sequence starts from, and what its step reads.
 
     Args:
@@ -95,12 +95,12 @@ def gather_rows(
         if not all(previous_key(key) in entries for key in structure.required_controls):
             diagnosis().check_actions(structure, entries)
         first = _or_first(marks, size, device)
-        known = entries.get(KNOWN, torch.ones_like(first))
-        begins, inputs[RESUMES] = ~known, first & known
+        known = entries.get(HAS_PREVIOUS, torch.ones_like(first))
+        begins, inputs[FROM_STORED] = ~known, first & known
         inputs.update({previous_key(key): entries[previous_key(key)] for key in carry})
     inputs.update(controls_of(structure, entries, time))
     before = {key: starts[key].select(time, 0) for key in carry}
-    return Rows(size, inputs, begins, starts, stored, before)
+    return StepInputs(size, inputs, begins, starts, stored, before)
 
 
 def controls_of(structure: Structure, entries: Entries, time: int) -> Entries:

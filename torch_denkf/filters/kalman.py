@@ -111,7 +111,7 @@ class KalmanFilter(Filter):
 
 
 def _covariance(name: str, given: dict[str, torch.Tensor], size: int, shape: str) -> torch.Tensor:
-    """Variances of standard deviations ``name``, or the covariance ``name_cov``."""
+    """Returns variances of standard deviations ``name``, or the covariance ``name_cov``."""
     if (name in given) == (f"{name}_cov" in given):
         raise ValueError(f"Give {name}, standard deviations {shape}, or {name}_cov, a matrix, and not both.")
     if name not in given:

@@ -19,4 +19,5 @@ class FilterOptions(TypedDict, total=False):
     forecast_keys: Mapping[NestedKey, NestedKey] | None
     variance_ceiling: float | None
     check_finite: bool
+    keep_noise: bool
     prefix: str | None

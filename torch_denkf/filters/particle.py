@@ -44,7 +44,7 @@ class ParticleFilter(Filter):
         jitter: regularised particle filter: the copies that resampling makes are moved apart by a Gaussian kernel of
             this many times the usual width. For motions with little noise of their own, or none.
         initial: the initial belief, which also fixes the number of particles; weights are added where it has none.
-        process_noise: Q of the motion, beside the transition's own noise: standard deviations ``[S]`` (a number for
+        process_noise: Q of the motion, besides the transition's own noise: standard deviations ``[S]`` (a number for
             all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
         **options: ``reading_space`` and ``observation_key``, for the default likelihood, ``observed_key``, which
             resampling heeds, too, ``visibility``, for a Gaussian likelihood, ``sensor_error`` and what every filter

@@ -32,14 +32,14 @@ class SensorError(Protocol):
 
 @runtime_checkable
 class Visibility(Protocol):
-    """A head beside a sensor that says whether it sees: :class:`~torch_denkf.imperfect.Visibility`."""
+    """A head next to a sensor that says whether it sees: :class:`~torch_denkf.imperfect.Visibility`."""
 
     def heeded_by(self, analysis):
         """Returns an update that lets a reading count as far as the head says."""
 
 
 class ReadingOptions(FilterOptions, total=False):
-    """The options of filters of one sensor, beside their modules.
+    """The options of filters of one sensor, besides their modules.
 
     They also take ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
     ``check_finite`` and ``prefix`` of :class:`Filter`.
@@ -50,7 +50,7 @@ class ReadingOptions(FilterOptions, total=False):
         observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``; by default the one that the sensor writes.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, by default ``"observed"``; a nonlinear observation model
             may write it.
-        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.imperfect.Visibility`; the
+        visibility: a head next to the sensor that says whether it sees, :class:`~torch_denkf.imperfect.Visibility`; the
             update heeds it, see :class:`~torch_denkf.imperfect.Visible`. ``None`` by default.
         sensor_error: coloured errors of the sensor, such as a :class:`~torch_denkf.imperfect.FadingBias`: they become
             part of the state, behind its S components, of transition, process noise, observation and initial belief.

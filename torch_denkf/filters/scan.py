@@ -12,7 +12,7 @@ from tensordict.utils import expand_as_right
 from torch import Tensor
 
 from torch_denkf._registered import compiler
-from torch_denkf.filters.structure import RESUMES, Placed, Structure, previous_key, takes_reading
+from torch_denkf.filters.structure import FROM_STORED, Placed, Structure, previous_key, takes_reading
 from torch_denkf.functional.kernels.small_system import on_gpu
 from torch_denkf.running import is_sequence, named_modules_of, reads, run_module
 from torch_denkf.submodel import Call, Entries, Transition, Update, role
@@ -140,7 +140,7 @@ class Steps(NamedTuple):
         Args:
             carry: the belief before the first step.
             inputs: what each step reads in addition to the carry, ``[*B, T, ...]``, with what the frames' modules
-                wrote. What stands under ``("previous", ...)`` is where the step begins in rows that :data:`RESUMES`
+                wrote. What stands under ``("previous", ...)`` is where the step begins in rows that :data:`FROM_STORED`
                 marks.
             call: of one step ``[*B]``.
             resets: rows that are reset at each step, ``[*B, T, 1]``; ``[*B, 1, 1]`` where the first step alone has
@@ -161,9 +161,9 @@ class Steps(NamedTuple):
             for t, row in enumerate(rows):
                 if cuts[t]:
                     carry = {key: value.detach() for key, value in carry.items()}
-                if RESUMES in row:
+                if FROM_STORED in row:
                     carry = {
-                        key: where_rows(row[RESUMES], row[previous_key(key)], value) for key, value in carry.items()
+                        key: where_rows(row[FROM_STORED], row[previous_key(key)], value) for key, value in carry.items()
                     }
                 reset, start = (marks[t], begins[t]) if t < len(marks) else (None, None)
                 out = self.step({**row, **carry}, call, frames=False, reset=reset, start=start)
@@ -195,6 +195,9 @@ def _masked(module: Update, entries: Entries, call: Call) -> Entries:
     """Returns the entries with ones in the place of missing observations, and a mask that says so."""
     like = next(entries[key] for key in module.in_keys if key in entries)
     dims = zip(module.reading_keys, module.reading_dims(entries, call), strict=True)
-    ones = {unravel_key(key): like.new_ones(*call.batch_size, dim) for key, dim in dims}
+    ones = {
+        unravel_key(key): like.new_ones(*call.batch_size, *torch.Size([dim] if isinstance(dim, int) else dim))
+        for key, dim in dims
+    }
     mask = torch.zeros(*call.batch_size, 1, dtype=torch.bool, device=like.device)
     return {**ones, **entries, module.observed_key: mask}

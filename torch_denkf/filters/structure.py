@@ -19,15 +19,15 @@ from torch_denkf.running import (
 )
 from torch_denkf.submodel import Entries, Initial, Update, in_role, role
 
-__all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "previous_key"]
+__all__ = ["HAS_PREVIOUS", "FROM_STORED", "Placed", "Structure", "previous_key"]
 
 #: A module and its place in the filter, which names its noise.
 Placed = tuple[str, TensorDictModuleBase]
 
-#: Whether a policy has a belief before this element.
-KNOWN = ("previous", "known")
-#: Whether an element of a sequence begins with the belief that is stored before it.
-RESUMES = ("previous", "resumes")
+#: Key of a flag: a policy has a belief before this element.
+HAS_PREVIOUS = ("previous", "known")
+#: Key of a flag: an element of a sequence begins with the belief that is stored before it.
+FROM_STORED = ("previous", "resumes")
 
 
 def previous_key(key: NestedKey) -> tuple[str, ...]:
@@ -95,18 +95,18 @@ class Structure(NamedTuple):
 
     @property
     def modules(self) -> tuple[Placed, ...]:
-        """All modules, in the order in which they run."""
+        """Returns all modules, in the order in which they run."""
         return (*self.frames, self.transition, *self.update)
 
     def in_keys(self, init_key: NestedKey) -> list[NestedKey]:
-        """All that a filter reads: also stored beliefs, those of a policy, and what marks a beginning."""
-        keys = [*self.needed, *self.controls, *self.carry, *map(previous_key, self.carry), KNOWN]
+        """Returns all that a filter reads: also stored beliefs, those of a policy, and what marks a beginning."""
+        keys = [*self.needed, *self.controls, *self.carry, *map(previous_key, self.carry), HAS_PREVIOUS]
         keys += [*map(previous_key, self.controls), *self.belief, init_key, *self.optional]
         return list(dict.fromkeys(keys))
 
     @property
     def out_keys(self) -> list[NestedKey]:
-        """All that a filter writes."""
+        """Returns all that a filter writes."""
         return [*self.frame_keys, *self.step_keys]
 
     def completed(self, entries: Entries, stored: Entries | None = None) -> Entries:
@@ -189,7 +189,7 @@ def _judge_of(key: NestedKey, kinds: Sequence[Belief]) -> Belief | None:
 def _sorted(
     modules: Sequence[Placed], carry: Sequence[NestedKey], controls: Sequence[NestedKey]
 ) -> tuple[list[Placed], list[Placed]]:
-    """The modules that read frames alone; and the others, the transition first.
+    """Returns the modules that read frames alone; and the others, the transition first.
 
     A module that depends on the action and not on the belief, such as a reading's noise, runs behind the transition. So
     does one that carries entries of its own alone, such as a count.
@@ -269,7 +269,7 @@ def _check_forecasts(forecast_of: Mapping[NestedKey, NestedKey], kinds: Sequence
 
 
 def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequence[NestedKey]) -> list[NestedKey]:
-    """The entries from outside of which the analyses' readings are made, through whatever sensors."""
+    """Returns the entries from outside of which the analyses' readings are made, through whatever sensors."""
     found: dict[NestedKey, None] = {}
     for _, module in update:
         for part in in_role(module, Update):
@@ -309,7 +309,7 @@ def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey
 
 
 def _likelihoods(steps: Sequence[Placed], own_info: Mapping, totals: Mapping) -> list[NestedKey]:
-    """The log-likelihoods that together are that of all readings."""
+    """Returns the log-likelihoods that together are that of all readings."""
     found = []
     for place, module in steps:
         for part in in_sequences(module):

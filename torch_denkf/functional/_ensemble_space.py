@@ -23,7 +23,7 @@ GPU_TILE_ELEMENTS = 2**28
 
 
 def solve_ensemble_space(gram: Tensor, right: Tensor, *, square_root: bool) -> tuple[Tensor, Tensor | None, Tensor]:
-    """Solve with I + YYᵀ, E x E.
+    """Solves with I + YYᵀ, E x E.
 
     YYᵀ maps the vector of ones to zero, and what is solved for is orthogonal to it. So its eigenvalue is
     free: at the mean of the diagonal, c, the matrix keeps its digits when R is tiny.
@@ -82,7 +82,7 @@ def analyse_in_tiles(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Computes :func:`~torch_denkf.functional.analyse` in ensemble space, without gradients, in little memory.
 
-    Beside the arguments and the result it holds a few tiles ``[*B, E, columns]``, rows ``[*B, O]`` and matrices
+    Besides the arguments and the result it holds a few tiles ``[*B, E, columns]``, rows ``[*B, O]`` and matrices
     ``[*B, E, E]``. Arguments and results are those of ``analyse``, checked there.
 
     With ``total`` the columns are a share of all there are, and it adds up sums over columns with those of the other

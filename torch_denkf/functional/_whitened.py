@@ -32,7 +32,7 @@ class Whitened(NamedTuple):
 
 
 def whiten(predicted: Tensor, samples: Tensor, noise: Tensor, observed: Tensor | None) -> Whitened:
-    """The reading's components, all or some of them, in units of their noise.
+    """Returns the reading's components, all or some of them, in units of their noise.
 
     Args:
         predicted: HX, ``[*B, E, O]``.
@@ -68,7 +68,7 @@ def shift(scheme: str, reading: Whitened, observed: Tensor | None, perturbation:
 
 
 def scores(square: Tensor, log_det: Tensor, log_noise: Tensor, count: int | Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """The normalised innovation squared and the log-likelihood of the innovation, ``[*B, 1]``.
+    """Returns the normalised innovation squared and the log-likelihood of the innovation, ``[*B, 1]``.
 
     Args:
         square: mean_shift (I + YᵀY)⁻¹ mean_shiftᵀ.

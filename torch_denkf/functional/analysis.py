@@ -66,7 +66,7 @@ def analyse(
     significance: float | Tensor | None = None,
     space: Space = "auto",
 ) -> Analysis:
-    """Condition a forecast ensemble on an observation.
+    """Conditions a forecast ensemble on an observation.
 
     Members are rows. A are their deviations from the mean, HA those of their predictions, and W = HA R^-1/2 / √(E − 1).
     With the gain K = AᵀHA S⁻¹ / (E − 1) (eq. 11) and d = mean observation − mean prediction:
@@ -97,7 +97,7 @@ def analyse(
             ``[*B, S, O]`` and of the predicted observations ``[*B, O, O]``, before anything is solved (Houtekamer
             & Mitchell 2001). Batch dimensions may be left out. Not for ``"etkf"``; needs observation space.
         significance: localisation by what the members themselves say, see :func:`significant`: how many standard
-            deviations a sample correlation must be away from zero to be believed, such as 3. ``None`` believes all. The
+            deviations a sample correlation must be away from zero to be used, such as 3. ``None`` uses all. The
             components of the reading are then taken in one after the other, each with the correlations that the one
             before left (Whitaker & Hamill 2002; Anderson 2003). Needs observation space.
         space: where to solve: ``"observation"`` costs O(O³ + O E S), ``"ensemble"`` O(E³ + E² (S + O));
@@ -184,7 +184,7 @@ def _in_few_launches(
 def check_analysis_arguments(
     forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, significance, space
 ) -> None:
-    """Refuses arguments of :func:`analyse` that do not fit each other."""
+    """Raises for arguments of :func:`analyse` that do not fit each other."""
     batch, size, dim = forecast.shape[:-2], forecast.shape[-2:-1], predicted.shape[-1:]
     each, single = (*batch, *size, *dim), (*batch, *dim)
     fits = forecast.ndim > 1 and predicted.shape == each and noise.shape == single and size[0] > 1
@@ -249,7 +249,7 @@ def _observation_space(
     square_root: bool,
     taper: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Solve with I + YᵀY, O x O.
+    """Solves with I + YᵀY, O x O.
 
     Returns:
         The increment of each member, ``[*B, E, S]`` or ``[*B, 1, S]``; the square root's anomalies,
@@ -276,7 +276,7 @@ def _one_after_the_other(
     taper: tuple[Tensor, Tensor] | None,
     significance: float | Tensor,
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Take in the components of the reading in their order, each as far as correlations with it are significant.
+    """Takes in the components of the reading in their order, each as far as correlations with it are significant.
 
     A component by itself needs no matrix, and no product of factors with a matrix, which might not be positive
     definite. What the members predict of the components behind it is moved like the state.
@@ -340,7 +340,7 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
         cross: products of the anomalies, ``[*B, O, S]``.
         predicted: anomalies of the predicted observations, ``[*B, E, O]``, in any unit.
         state: anomalies of the state, ``[*B, E, S]``.
-        threshold: :math:`z_0`, positive, one number or ``[S]``; below :math:`\sqrt{E - 1}`, or nothing is believed.
+        threshold: :math:`z_0`, positive, one number or ``[S]``; below :math:`\sqrt{E - 1}`, or nothing is used.
 
     Returns:
         Factors in [0, 1), ``[*B, O, S]``.
@@ -361,7 +361,7 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
 def _ensemble_space(
     reading: Whitened, anomalies: Tensor, acted_on: Tensor, *, square_root: bool
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Solve with I + YYᵀ, E x E; what it returns equals :func:`_observation_space`'s."""
+    """Solves with I + YYᵀ, E x E; what it returns equals :func:`_observation_space`'s."""
     y = reading.normalised
     weights, root, log_det = solve_ensemble_space(y @ y.mT, y @ acted_on.mT, square_root=square_root)
     mean_weights = weights.mean(-2, keepdim=True)

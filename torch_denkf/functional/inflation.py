@@ -12,7 +12,7 @@ from torch_denkf.functional.kernels.small_system import on_gpu
 
 
 def inflate(ensemble: Tensor, factor: float | Tensor) -> Tensor:
-    """Multiplicative inflation about the mean, x̄ + factor A (Anderson & Anderson 1999).
+    """Inflates the ensemble about its mean, x̄ + factor A (Anderson & Anderson 1999).
 
     Args:
         ensemble: X, ``[*B, E, S]``, in the state's units.
@@ -36,7 +36,7 @@ def inflate(ensemble: Tensor, factor: float | Tensor) -> Tensor:
 
 
 def relax_to_prior_spread(analysis: Tensor, forecast: Tensor, relaxation: float | Tensor) -> Tensor:
-    """Relaxation to prior spread (Whitaker & Hamill 2012, Mon. Wea. Rev. 140).
+    """Relaxes the analysis to the prior spread (Whitaker & Hamill 2012, Mon. Wea. Rev. 140).
 
     Each component's anomalies are multiplied by 1 − α + α σ_f / σ_a, so that its standard deviation
     becomes (1 − α) σ_a + α σ_f. A component without analysis spread stays as it is, with finite gradients.
@@ -74,7 +74,7 @@ def random_rotation(
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Random orthogonal matrices that keep the vector of ones, for the members of a square-root filter.
+    """Draws random orthogonal matrices that keep the vector of ones, for the members of a square-root filter.
 
     They change the members but neither their mean nor their covariance, and so undo the outliers that a
     deterministic filter collects in nonlinear systems (Sakov & Oke 2008, Mon. Wea. Rev. 136). Uniform

@@ -11,7 +11,7 @@ from torch_denkf.functional.kernels.small_system import LARGEST_FACTOR, WrittenO
 
 
 def cholesky(matrix: Tensor) -> Tensor:
-    """The lower Cholesky factor L of a symmetric positive definite matrix, NaN where there is none.
+    """Returns the lower Cholesky factor L of a symmetric positive definite matrix, NaN where there is none.
 
     ``torch.linalg.cholesky`` raises and so waits for the device; ``torch.linalg.cholesky_ex`` returns a
     half-finished factor. Here a failure shows: that matrix of the batch, and only that, becomes NaN.
@@ -37,7 +37,7 @@ def cholesky(matrix: Tensor) -> Tensor:
 
 
 def semidefinite_root(cov: Tensor) -> Tensor:
-    """A root A of a covariance, A Aᵀ = P, also of a singular one.
+    """Returns a root A of a covariance, A Aᵀ = P, also of a singular one.
 
     It is the Cholesky factor of the correlations, with the standard deviations put back. The correlations' ridge is
     relative, so that metres and milliradians are treated alike, and as large as round-off makes the eigenvalues of a
@@ -69,7 +69,7 @@ def whitened(rows: Tensor, cov: Tensor) -> Tensor:
 
 
 def semidefinite_solve(cov: Tensor, right: Tensor) -> Tensor:
-    """Solve P X = Y for a covariance P, also a singular one; X then is one of the solutions.
+    """Solves P X = Y for a covariance P, also a singular one; X then is one of the solutions.
 
     It is solved in correlations with a relative ridge, see :func:`semidefinite_root`. Components without any variance
     get zero, and their row of ``right`` should be zero.
@@ -205,7 +205,7 @@ def is_covariance(cov: Tensor) -> Tensor:
     variance, rounding = cov.diagonal(dim1=-2, dim2=-1), 100 * cov.shape[-1] * torch.finfo(cov.dtype).eps
     largest = rounding**2 * (variance.unsqueeze(-1) * variance.unsqueeze(-2))
     symmetric = ((cov - cov.mT).square() <= largest).flatten(-2).all(-1)
-    # A variance of zero is one, but beside a covariance, which the factor's next row divides by it.
+    # A variance of zero is one, but next to a covariance, which the factor's next row divides by it.
     ridge = rounding * variance + torch.finfo(cov.dtype).tiny
     return symmetric & cholesky(cov + ridge.diag_embed())[..., -1, -1].isfinite()
 
@@ -232,14 +232,14 @@ def as_covariance(noise: Tensor, mean: Tensor) -> Tensor:
 
 
 def _correlation(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Correlations with a ridge, standard deviations, and their inverses, 0 where there is no variance."""
+    """Returns correlations with a ridge, standard deviations, and their inverses, 0 where there is no variance."""
     dim = cov.shape[-1]
     variance = cov.diagonal(dim1=-2, dim2=-1).detach()
     std = variance.clamp(min=0).sqrt()
     inverse = torch.where(std > 0, 1 / torch.where(std > 0, std, 1), 0)
     ridge = 10 * dim * torch.finfo(cov.dtype).eps
     diagonal = ((std <= 0).to(std) + ridge).diag_embed()
-    # A variance of less than zero is not taken for one of zero, unless it is round-off beside the largest.
+    # A variance of less than zero is not taken for one of zero, unless it is round-off next to the largest.
     negative = (variance < -ridge * variance.abs().amax(-1, keepdim=True)).any(-1, keepdim=True)
     std, inverse = torch.where(negative, torch.nan, std), torch.where(negative, torch.nan, inverse)
     correlation = (cov * inverse.unsqueeze(-1) * inverse.unsqueeze(-2) + diagonal) / (1 + ridge)
@@ -247,7 +247,7 @@ def _correlation(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def inverse_square_root(matrix: Tensor) -> Tensor:
-    """(I + M)^-1/2 of a symmetric positive semi-definite M, differentiable at repeated eigenvalues.
+    """Returns (I + M)^-1/2 of a symmetric positive semi-definite M, differentiable at repeated eigenvalues.
 
     The symmetric square root is the one that moves the members least (Ott et al. 2004; Hunt et al. 2007).
 
@@ -271,7 +271,7 @@ def inverse_square_root(matrix: Tensor) -> Tensor:
 
 
 def inverse_square_root_difference(matrix: Tensor) -> Tensor:
-    """g(M) = M⁻¹ ((I + M)^-1/2 − I), also for singular M, differentiable at repeated eigenvalues.
+    """Returns g(M) = M⁻¹ ((I + M)^-1/2 − I), also for singular M, differentiable at repeated eigenvalues.
 
     With M = YᵀY it gives the symmetric square root of the larger system from the smaller one:
     (I + YYᵀ)^-1/2 = I + Y g(YᵀY) Yᵀ. It is computed as −1/(r (1 + r)) with r = sqrt(1 + m), which never
@@ -346,7 +346,7 @@ class _SymmetricFunction(torch.autograd.Function):
 
 
 def product_of_known(matrix: Tensor, vector: Tensor) -> Tensor:
-    """H x, where what is NaN in x is so in those rows alone that have a coefficient for it.
+    """Returns H x, where what is NaN in x is so in those rows alone that have a coefficient for it.
 
     Args:
         matrix: H, ``[O, S]``.

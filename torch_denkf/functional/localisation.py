@@ -21,7 +21,7 @@ from torch_denkf.functional.linalg import inverse_square_root, solve
 
 
 def gaspari_cohn(distance: Tensor, radius: float) -> Tensor:
-    r"""The taper of Gaspari & Cohn: like a Gaussian near zero, and exactly zero from :math:`2 c` on.
+    r"""Returns the taper of Gaspari & Cohn: like a Gaussian near zero, and exactly zero from :math:`2 c` on.
 
     It is a correlation function (positive definite in up to three dimensions), so that the element-wise product of a
     covariance matrix with it is a covariance matrix.
@@ -118,7 +118,7 @@ def neighbours(
 
 
 def neighbours_of_taper(taper: Tensor, *, tile: int = 4096) -> Neighbours:
-    """The observations that a taper lets count, for each component of a state.
+    """Returns the observations that a taper lets count, for each component of a state.
 
     Args:
         taper: factors in [0, 1], ``[S, O]``; 0 where an observation is not to count. They need not come from a
@@ -142,7 +142,7 @@ def neighbours_of_taper(taper: Tensor, *, tile: int = 4096) -> Neighbours:
 
 
 def _largest(tapers: Iterable[tuple[Tensor, Tensor]]) -> Neighbours:
-    """The entries above zero of each row, of matrices that lie below one another, with the numbers of their columns."""
+    """Returns the entries above zero of each row, of matrices below one another, and the numbers of their columns."""
     rows = []
     for taper, columns in tapers:
         values, places = taper.topk(max(int((taper > 0).sum(-1).max()), 1), dim=-1)
@@ -163,7 +163,7 @@ def letkf(
     significance: float | Tensor | None = None,
     tile: int = 4096,
 ) -> Tensor:
-    r"""Local ensemble transform: an analysis for each component of the state, from the observations near it.
+    r"""Runs the local ensemble transform: an analysis of each component of the state, from the observations near it.
 
     With :math:`Y_s = \rho_s^{1/2} R^{-1/2} HA / \sqrt{E - 1}` of the observations near component s, its members are
     :math:`\bar x_s + A_s (w + (I + Y_s Y_s^T)^{-1/2})`, where :math:`w = (I + Y_s Y_s^T)^{-1} Y_s d` moves the mean.
@@ -176,7 +176,7 @@ def letkf(
         noise: variances R, ``[*B, O]``, positive.
         near: which observations count where, see :func:`neighbours`.
         observed: boolean, ``[*B, 1]`` or ``[*B, O]``; what is False counts nowhere, and may be NaN.
-        significance: also weigh each observation by how far its correlation with the component is to be believed, see
+        significance: also weigh each observation by how far its correlation with the component is significant, see
             :func:`~torch_denkf.functional.analysis.significant`: one number, such as 1.5. ``None`` for no such weights.
         tile: components to analyse in one go; memory is ``E * L * tile`` for each element of the batch.
 

@@ -9,7 +9,7 @@ from torch_denkf.functional.kernels.small_system import on_gpu
 
 
 def ensemble_mean(ensemble: Tensor) -> Tensor:
-    """The ensemble mean x̄ = 1/E Σ xⁱ, the filter's point estimate (Section III-C of the paper).
+    """Returns the ensemble mean x̄ = 1/E Σ xⁱ, the filter's point estimate (Section III-C of the paper).
 
     Args:
         ensemble: X, ``[*B, E, S]``, in the state's units.
@@ -31,7 +31,7 @@ def ensemble_mean(ensemble: Tensor) -> Tensor:
 
 
 def ensemble_anomalies(ensemble: Tensor) -> Tensor:
-    """The members' deviations from their mean, A = X − x̄ (eqs. 7 and 10 of the paper).
+    """Returns the members' deviations from their mean, A = X − x̄ (eqs. 7 and 10 of the paper).
 
     Args:
         ensemble: X, ``[*B, E, S]``, in the state's units.
@@ -53,7 +53,7 @@ def ensemble_anomalies(ensemble: Tensor) -> Tensor:
 
 
 def ensemble_var(ensemble: Tensor, mean: Tensor | None = None) -> Tensor:
-    """The unbiased sample variance of each component, Σ (xⁱ − x̄)² / (E − 1).
+    """Returns the unbiased sample variance of each component, Σ (xⁱ − x̄)² / (E − 1).
 
     Args:
         ensemble: X, ``[*B, E, S]``, in the state's units.
@@ -80,7 +80,7 @@ def ensemble_var(ensemble: Tensor, mean: Tensor | None = None) -> Tensor:
 
 
 def ensemble_cov(ensemble: Tensor) -> Tensor:
-    """The unbiased sample covariance AᵀA / (E − 1), for looking at: the analysis never forms it.
+    """Returns the unbiased sample covariance AᵀA / (E − 1), for looking at: the analysis never forms it.
 
     Args:
         ensemble: X, ``[*B, E, S]``, in the state's units.

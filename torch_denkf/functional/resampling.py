@@ -20,7 +20,7 @@ from torch_denkf.functional.weighted import check_particles
 
 
 def effective_sample_size(log_weights: Tensor) -> Tensor:
-    """The effective number of particles, 1 / Σ w² (Kong et al. 1994): E for equal weights, 1 for a single one.
+    """Returns the effective number of particles, 1 / Σ w² (Kong et al. 1994): E for equal weights, 1 for a single one.
 
     Args:
         log_weights: log wⁱ, normalised, ``[*B, E]``.
@@ -37,7 +37,7 @@ def effective_sample_size(log_weights: Tensor) -> Tensor:
 
 
 def systematic_resample(particles: Tensor, log_weights: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
-    """Hard resampling, through which no gradient flows, neither to the weights nor to the particles.
+    """Resamples without gradients, neither to the weights nor to the particles.
 
     As in the first differentiable particle filter, whose gradient ends at the step (Jonschkowski et al. 2018,
     arXiv:1805.11122).
@@ -70,7 +70,7 @@ def systematic_resample(particles: Tensor, log_weights: Tensor, uniform: Tensor)
 def soft_resample(
     particles: Tensor, log_weights: Tensor, uniform: Tensor, alpha: float = 0.05
 ) -> tuple[Tensor, Tensor]:
-    r"""Resampling from a mixture with the uniform distribution, whose weights carry the gradient.
+    r"""Resamples from a mixture with the uniform distribution, whose weights carry the gradient.
 
     Particles are picked with probability :math:`q^i = (1 - \alpha) w^i + \alpha / E` and get the importance weight
     :math:`w^i / q^i`, normalised, a differentiable function of :math:`w^i` (Karkus, Hsu & Lee 2018, "Particle filter
@@ -158,7 +158,7 @@ def jitter_copies(
 
 
 def _pick(probability: Tensor, uniform: Tensor) -> Tensor:
-    """Indices ``[*B, E]`` at the positions (i + u) / E of the cumulative probability."""
+    """Returns indices ``[*B, E]`` at the positions (i + u) / E of the cumulative probability."""
     size = probability.shape[-1]
     if uniform.shape not in (probability.shape, (*probability.shape[:-1], 1)):
         raise ValueError(

@@ -75,7 +75,7 @@ def crps_gaussian(mean: Tensor, variance: Tensor, target: Tensor) -> Tensor:
 
 
 def energy_score(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Tensor:
-    """Energy score of the whole vector, E‖x − y‖ − 1/2 E‖x − x'‖: the CRPS in more than one dimension.
+    """Returns the energy score of the whole vector, E‖x − y‖ − 1/2 E‖x − x'‖: the CRPS in more than one dimension.
 
     It costs O(E² S) time and O(E²) memory. Components of different units should be scaled first.
 

@@ -39,7 +39,7 @@ def unscented_weights(
     dtype: torch.dtype | None = None,
     device: torch.device | None = None,
 ) -> UnscentedWeights:
-    r"""Weights of the sigma points of a Gaussian (Särkkä 2013, eq. 5.77), with :math:`c = \alpha^2 (S + \kappa)`.
+    r"""Returns sigma points' weights for a Gaussian (Särkkä 2013, eq. 5.77), with :math:`c = \alpha^2 (S + \kappa)`.
 
     Moments up to the third are exact for any values. With ``alpha=1, kappa=2-S, beta=1`` the covariance of a sum of
     squares is exact, too. With ``alpha=1, beta=0`` (default) all weights are positive where ``kappa`` is, and
@@ -68,7 +68,7 @@ def unscented_weights(
 
 
 def sigma_points(mean: Tensor, cov: Tensor, *, alpha: float = 1.0, kappa: float = 0.5) -> Tensor:
-    r"""The mean, and :math:`m \pm \sqrt{c}` times the columns of a root of P (Särkkä 2013, eq. 5.74).
+    r"""Returns the mean, and :math:`m \pm \sqrt{c}` times the columns of a root of P (Särkkä 2013, eq. 5.74).
 
     The covariance may be singular: dimensions without variance stay where they are, exactly, and fully correlated
     ones are told apart by 10 S times the machine precision of their correlation. Variances are kept to rounding.
@@ -100,7 +100,7 @@ def sigma_points(mean: Tensor, cov: Tensor, *, alpha: float = 1.0, kappa: float 
 def unscented_moments(
     points: Tensor, weights: UnscentedWeights, *, space: Space | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Mean and covariance of sigma points after a function (Särkkä 2013, eq. 5.75).
+    """Returns mean and covariance of sigma points after a function (Särkkä 2013, eq. 5.75).
 
     Args:
         points: ``[*B, 2 S + 1, N]``.
@@ -159,7 +159,7 @@ def unscented_update(
     observed: Tensor | None = None,
     space: Space | None = None,
 ) -> GaussianUpdate:
-    r"""Condition a Gaussian on an observation, by its sigma points (Särkkä 2013, eqs. 5.86 and 5.87).
+    r"""Conditions a Gaussian on an observation, by its sigma points (Särkkä 2013, eqs. 5.86 and 5.87).
 
     The covariance is :math:`\sum_i w_i (\delta x_i - K \delta y_i)(\cdot)^T + K R K^T`, Joseph's form in points: where
     no weight is negative, round-off leaves it positive.
@@ -225,7 +225,7 @@ def _spread(dim: int, alpha: float, kappa: float) -> float:
 
 
 def _deviations(points: Tensor, weights: UnscentedWeights, space: Space | None) -> tuple[Tensor, Tensor]:
-    """Weighted mean ``[*B, N]`` and deviations from it ``[*B, 2 S + 1, N]``; differences first, for the digits."""
+    """Returns weighted mean ``[*B, N]`` and deviations ``[*B, 2 S + 1, N]``; differences first, for the digits."""
     check_ensemble("points", points)
     if points.shape[-2] != len(weights.mean):
         raise ValueError(

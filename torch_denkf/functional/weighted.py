@@ -10,7 +10,7 @@ from torch_denkf.functional.gaussian import solve_for_gain
 
 
 def weighted_mean(particles: Tensor, log_weights: Tensor) -> Tensor:
-    """The mean of weighted particles, Σ wⁱ xⁱ.
+    """Returns the mean of weighted particles, Σ wⁱ xⁱ.
 
     Args:
         particles: X, ``[*B, E, S]``, in the state's units.
@@ -32,7 +32,7 @@ def weighted_mean(particles: Tensor, log_weights: Tensor) -> Tensor:
 
 
 def weighted_var(particles: Tensor, log_weights: Tensor) -> Tensor:
-    """The variance of weighted particles, E / (E − 1) Σ wⁱ (xⁱ − x̄)².
+    """Returns the variance of weighted particles, E / (E − 1) Σ wⁱ (xⁱ − x̄)².
 
     The factor makes it :func:`ensemble_var` for equal weights. It does not follow the effective number of particles:
     1 / (1 − Σ w²) instead would blow up where one particle has nearly all the weight.
@@ -59,7 +59,7 @@ def weighted_var(particles: Tensor, log_weights: Tensor) -> Tensor:
 
 
 def weighted_median(particles: Tensor, log_weights: Tensor) -> Tensor:
-    """The weighted median of each component: half of the weight is at or below it, as far as particles can share it.
+    """Returns the weighted median of each component: half of the weight is at or below it, as far as possible.
 
     Unlike the mean it stays where most of the weight is when a few particles run away, however far.
 
@@ -159,7 +159,7 @@ def crps_weighted(particles: Tensor, log_weights: Tensor, target: Tensor) -> Ten
 
 
 def check_particles(particles: Tensor, log_weights: Tensor, min_size: int = 1) -> None:
-    """Raise ``ValueError`` unless these are particles ``[*B, E, S]`` and their log-weights ``[*B, E]``."""
+    """Raises ``ValueError`` unless these are particles ``[*B, E, S]`` and their log-weights ``[*B, E]``."""
     check_ensemble("particles", particles, min_size)
     check_shape("log_weights", log_weights, particles.shape[:-1], "[*B, E]")
     check_one_dtype(particles=particles, log_weights=log_weights)

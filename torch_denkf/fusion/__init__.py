@@ -1,5 +1,6 @@
 """Several sensors in one filter: each with its own rate, noise, mask and delay."""
 
+from torch_denkf.fusion.ahead import BeliefAhead
 from torch_denkf.fusion.filter import FusedFilter
 from torch_denkf.fusion.messages import message_rows
 from torch_denkf.fusion.refiltering import Refiltering
@@ -7,6 +8,7 @@ from torch_denkf.fusion.sensor import FusedSensor
 from torch_denkf.fusion.sensor_weights import SensorAttention
 
 __all__ = [
+    "BeliefAhead",
     "FusedFilter",
     "FusedSensor",
     "Refiltering",

@@ -42,7 +42,7 @@ class Updates:
         self.gaussian, self.lag, self.size, self.analysis, self.space = gaussian, lag, size, analysis, space
 
     def in_turn(self, prefix, last, sensors, wired):
-        """An update for each sensor."""
+        """Returns an update for each sensor."""
         modules, names = {}, list(sensors)
         for name, sensor in sensors.items():
             to = last if name == names[-1] else f"after_{name}"
@@ -56,7 +56,7 @@ class Updates:
         return modules
 
     def joint(self, prefix, last, sensors, wired):
-        """One update for all sensors."""
+        """Returns one update for all sensors."""
         own = [name for name, sensor in sensors.items() if sensor.analysis is not None]
         if own:
             raise ValueError(f"A joint update is one for all sensors, and {own} have an analysis of their own.")
@@ -83,7 +83,7 @@ class Updates:
         return {"readings": join, **self._update("analysis", model, prefix, last, told, None, **keys)}
 
     def weighted(self, prefix, sensors, wired, weights):
-        """The sensors' weights, and their noise after them."""
+        """Returns the sensors' weights, and their noise after them."""
         if self.gaussian and self.space is not None:
             raise ValueError(f"weights= takes no mean and covariance of points of {self.space}: leave weights= away.")
         models = {name: self._model(prefix, name, sensor, wired[name]) for name, sensor in sensors.items()}
@@ -106,7 +106,7 @@ class Updates:
         return modules
 
     def _spaces(self, reading_space: Space | None) -> dict[str, Space]:
-        """The spaces that an update is told: none of plain numbers."""
+        """Returns the spaces that an update is told: none of plain numbers."""
         spaces = {"space": self.space, "reading_space": reading_space}
         return {name: space for name, space in spaces.items() if space is not None}
 
@@ -148,7 +148,7 @@ class Updates:
 
 
 def _flat_spaces(sensors: Mapping[str, FusedSensor]) -> dict[str, Space | None]:
-    """The spaces of the readings, all of numbers and angles."""
+    """Returns the spaces of the readings, all of numbers and angles."""
     others = [name for name, sensor in sensors.items() if not is_flat(sensor.reading_space)]
     if others:
         raise ValueError(f"weights= takes readings of numbers and angles, and {others} read points: leave it away.")
@@ -156,7 +156,7 @@ def _flat_spaces(sensors: Mapping[str, FusedSensor]) -> dict[str, Space | None]:
 
 
 def _side_by_side(spaces: Mapping[str, Space | None], sizes: Sequence[int | None]) -> Space | None:
-    """The space of all readings side by side; ``None`` where none has one."""
+    """Returns the space of all readings side by side; ``None`` where none has one."""
     if not any(spaces.values()):
         return None
     parts: list[Space] = []

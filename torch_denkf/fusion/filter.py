@@ -48,7 +48,7 @@ class FusedFilter(Filter):
     after the other, or all in one update. For linear Gaussian systems both give the same. The first takes less where
     sensors are many, and lets each linearise at the belief that the sensors before it left.
 
-    Readings that come late need the last L states beside the belief, L the largest delay. An ensemble carries them as
+    Readings that come late need the last L states next to the belief, L the largest delay. An ensemble carries them as
     :class:`~torch_denkf.smoothers.FixedLag` does; a mean and a covariance as one joint Gaussian, which for linear
     systems gives what readings in their order give. With process noise and few members, the sample covariances of an
     ensemble make a difference between late and in order, which falls with more members; with :class:`Refiltering` there
@@ -57,7 +57,7 @@ class FusedFilter(Filter):
 
     An analysis' inflation and relaxation spread the belief of the present, once in each update that observes anything.
     A late reading would have to spread a belief of the past, of which the updates since did not know: with a delay both
-    are refused, and so they are with the lag of a mean and a covariance. :class:`Refiltering` and
+    raise, and so they do with the lag of a mean and a covariance. :class:`Refiltering` and
     :class:`~torch_denkf.smoothers.FixedLag` take them.
 
     Diagnostics of the sensors stand under ``("info", NAME, ...)``, their sums under ``("info", "nis")`` and
@@ -84,7 +84,7 @@ class FusedFilter(Filter):
 
     Raises:
         ValueError: if there is no sensor, a delay is negative or beyond the lag, process noise is missing or given
-            twice, an analysis inflates or relaxes where that is refused or names a ``reading_space``, or a sensor has
+            twice, an analysis inflates or relaxes where it must not or names a ``reading_space``, or a sensor has
             errors that last and its readings live on a space.
         TypeError: for particles, sensors that are no dict, an analysis in the place of what makes it, or one that
             cannot correct earlier states.
@@ -153,7 +153,7 @@ class FusedFilter(Filter):
             modules.update(build.weighted(prefix, sensors, wired, weights))
         last = "fused" if gaussian and lag else "belief"
         updates = (build.joint if joint else build.in_turn)(prefix, last, sensors, wired)
-        _refuse_inflation(updates, any(sensor.delay for sensor in sensors.values()), gaussian and lag > 0)
+        _check_inflation(updates, any(sensor.delay for sensor in sensors.values()), gaussian and lag > 0)
         modules.update(updates)
         if lag:
             modules["smoothed"] = PresentOfJoint(lag + 1, last) if gaussian else LaggedBelief(space=space)
@@ -168,13 +168,13 @@ def _is_gaussian(initial: TensorDictModuleBase) -> bool:
     return ("belief", "ensemble") not in written
 
 
-def _refuse_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, joint_past: bool) -> None:
+def _check_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, joint_past: bool) -> None:
     """Raises where an update would spread other states than the present one that is read."""
     if late:
         why = "belongs to the step at which a reading is taken, and with delay= others have been made since"
         cure = "Leave delay= out and let Refiltering make them again"
     elif joint_past:
-        why = "would spread the past anew with each reading: with lag= it is one Gaussian with the present"
+        why = "would spread the past again with each reading: with lag= it is one Gaussian with the present"
         cure = "Leave lag= out and put FixedLag(filter, lag) around the filter"
     else:
         return
@@ -189,7 +189,7 @@ def _refuse_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, j
 
 
 def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:
-    """L: what is given, or the largest delay."""
+    """Returns L: what is given, or the largest delay."""
     for name, sensor in sensors.items():
         check_count(f"delay of {name!r}", sensor.delay, least=0)
         if sensor.late_key is not None and sensor.delay < 1:
@@ -201,7 +201,7 @@ def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:
 
 
 def _with_errors(transition, process_noise, initial, sensors):
-    """Transition, process noise, initial belief and sensors of the state with the sensors' lasting errors behind it."""
+    """Augments the state of transition, process noise, initial belief and sensors by the sensors' biases."""
     given = [sensor.sensor_error for sensor in sensors.values() if sensor.sensor_error is not None]
     for error in given:
         check_kind("sensor_error", error)
@@ -246,7 +246,7 @@ def _check_motion(transition, process_noise, initial, gaussian):
 
 
 def _moving(transition, process_noise, initial, gaussian):
-    """The transition with its process noise."""
+    """Returns the transition with its process noise."""
     if process_noise is None:
         return transition
     noise, space = as_process_noise(process_noise, initial), role(initial, Initial).space

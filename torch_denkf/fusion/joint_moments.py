@@ -32,7 +32,7 @@ def _present_and_oldest(
 
 
 def _ends(mean: torch.Tensor, cov: torch.Tensor, count: int) -> tuple[torch.Tensor, ...]:
-    """Mean, covariance and variance of the first and of the last of ``count`` states in a joint one."""
+    """Returns mean, covariance and variance of the first and of the last of ``count`` states in a joint one."""
     out: list[torch.Tensor] = []
     points, tangents = mean.shape[-1] // count, cov.shape[-1] // count
     for own, at in ((slice(points), slice(tangents)), (slice(-points, None), slice(-tangents, None))):
@@ -41,8 +41,8 @@ def _ends(mean: torch.Tensor, cov: torch.Tensor, count: int) -> tuple[torch.Tens
 
 
 def joint_space(space: Space | None, lag: int) -> Space | None:
-    """That of the present and the last L states; ``None`` for plain numbers."""
-    return None if space is None else check_space("space", Repeated(space, lag + 1))
+    """Returns the space of the present and the last L states; ``None`` for plain numbers."""
+    return space if space is None or not lag else check_space("space", Repeated(space, lag + 1))
 
 
 _MOMENTS = ("mean", "cov", "var")
@@ -64,7 +64,7 @@ class JointForecast(SubModel):
         super().__init__(nn.Identity(), in_keys, [("joint", "mean"), ("joint", "cov")])
 
     def compute(self, mean, cov, cross, joint_mean, joint_cov, age):
-        """Mean and covariance of the joint state."""
+        """Returns mean and covariance of the joint state."""
         # At the start of an episode, before its own frame, no step has been made.
         return joint_forecast(mean, cov, cross, joint_mean, joint_cov, unmoved=age < 0)
 
@@ -84,6 +84,6 @@ class PresentOfJoint(SubModel):
         self.count = count
 
     def compute(self, mean, cov, age):
-        """The beliefs."""
+        """Returns the beliefs."""
         ends = _ends(mean, cov, self.count)
         return *ends[:3], mean, cov, *ends[3:], (age + 1).clamp(max=self.count - 1)

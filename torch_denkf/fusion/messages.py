@@ -22,13 +22,14 @@ def message_rows(
     messages: Iterable[Sequence[Any]],
     *,
     driving: Sequence[str] = (),
+    rows_of: Sequence[str] | None = None,
     delays: Mapping[str, float] | None = None,
     start: float | None = None,
     unit: Unit = "s",
     origin: Mapping[str, Any] | None = None,
     dtype: torch.dtype | None = None,
 ) -> TensorDict:
-    """Rows ``[T]`` of a log in which sensors of different rates write when they like.
+    """Returns rows ``[T]`` of a log in which sensors of different rates write when they like.
 
     Each time at which a sensor has read is a row, and ``"dt"`` ``[T, 1]`` holds the seconds since the row before: the
     motion must read it. The first row is the start of the filter; no message stands there. A sensor that says two
@@ -46,6 +47,8 @@ def message_rows(
             row before, on straight lines between the messages, each of which counts for the moment of its stamp; before
             the first and behind the last it stays as it is there; a warning says where that, or a silence between two
             messages, is longer than twenty of its usual steps. Messages of them that are not finite are left out.
+        rows_of: sensors whose times are rows: all that do not drive, and of those that do the ones whose every message
+            is to be a step; by default all. A fast one that is left out is a mean over each longer step.
         delays: by how many seconds a sensor's stamps are later than what it saw, by name.
         start: time of the first row, in seconds; by default that of the first reading. What was read before is left
             out.
@@ -81,7 +84,8 @@ def message_rows(
     if unit not in SECONDS:
         raise ValueError(f"unit is one of {', '.join(map(repr, SECONDS))}, got {unit!r}")
     streams = _by_sensor(messages, unit)
-    for what, names in (("driving", driving), ("delays", delays or {}), ("origin", origin or {})):
+    given = {"driving": driving, "delays": delays or {}, "origin": origin or {}, "rows_of": rows_of or ()}
+    for what, names in given.items():
         unknown = [name for name in names if name not in streams]
         if unknown:
             raise KeyError(f"{what} names {unknown}, of which there is no message; there is {', '.join(streams)}.")
@@ -103,11 +107,14 @@ def message_rows(
     if start is not None and first > (last := max(stream.times[-1] for stream in streams.values())):
         raise ValueError(f"start={start!r} is behind the last message, {last:.15g} s: pass an earlier one, or unit=.")
     drives = {name: streams.pop(name).once(name) for name in dict.fromkeys(driving)}
+    if rows_of is not None and (silent := [name for name in streams if name not in rows_of]):
+        raise ValueError(f"rows_of={list(rows_of)} leaves out {silent}, which do not drive the motion: name them, too.")
     heard = {name: stream.since(first) for name, stream in streams.items()}
     _look_at_gaps({**heard, **drives}, unit)
     for name, drive in drives.items():
         _look_at_silence(name, drive.times, np.concatenate([[], *(stream.times for stream in heard.values())]))
-    events = [each.events() for each in (*heard.values(), *(drive.since(first) for drive in drives.values()))]
+    stepping = [drive.since(first) for name, drive in drives.items() if rows_of is None or name in rows_of]
+    events = [each.events() for each in (*heard.values(), *stepping)]
     moments, place = np.unique(np.concatenate(events), axis=0, return_inverse=True)
     times = np.concatenate([[first], moments[:, 0]])
     rows = {"stamp": times[:, None], "dt": np.diff(times, prepend=first)[:, None]}
@@ -124,29 +131,29 @@ def message_rows(
 
 @dataclass(frozen=True)
 class _Stream:
-    """What a sensor said, in the order of its times ``[m]``: values ``[m, O]``, and noise of each, if it says so."""
+    """Messages of a sensor by time ``[m]``: values ``[m, O]``, and noise of each, if it reports one."""
 
     times: np.ndarray
     values: np.ndarray
     noise: np.ndarray | None
 
     def kept(self, which: np.ndarray) -> _Stream:
-        """The messages at some places."""
+        """Returns the messages at some places."""
         return _Stream(self.times[which], self.values[which], None if self.noise is None else self.noise[which])
 
     def since(self, first: float) -> _Stream:
-        """The messages from a time on."""
+        """Returns the messages from a time on."""
         return self.kept(self.times >= first)
 
     def once(self, name: str) -> _Stream:
-        """The last message of each time, without those that are not finite."""
+        """Returns the last message of each time, without those that are not finite."""
         finite = self.kept(np.isfinite(self.values).all(1))
         if not len(finite.times):
             raise ValueError(f"{name!r} drives the motion and has no message that is finite.")
         return finite.kept(np.append(np.diff(finite.times) > 0, True))
 
     def events(self) -> np.ndarray:
-        """Of each message its time, and how many of the same sensor and time stand before it, ``[m, 2]``."""
+        """Returns, for each message, its time and the number of earlier ones of its sensor and time, ``[m, 2]``."""
         before = np.arange(len(self.times)) - np.searchsorted(self.times, self.times)
         return np.stack([self.times, before.astype(float)], 1)
 
@@ -163,12 +170,12 @@ class _Stream:
         return found
 
     def means(self, times: np.ndarray) -> np.ndarray:
-        """Means between each of the ``times`` and the one before, on straight lines between the messages ``[T, O]``."""
+        """Returns means from each of the ``times`` before to the next, interpolating messages linearly ``[T, O]``."""
         now = np.stack([np.interp(times, self.times, column) for column in self.values.T], 1)
         knots = np.unique(np.concatenate([times, self.times]))
         on = np.stack([np.interp(knots, self.times, column) for column in self.values.T], 1)
         area = np.append(np.diff(knots)[:, None] * (on[1:] + on[:-1]) / 2, np.zeros_like(on[:1]), 0)
-        # Each row sums its own pieces: one reading that is absurd must not spoil the rows that follow.
+        # Each row sums its own pieces: one outlier must not spoil the rows that follow.
         total, step = np.add.reduceat(area, np.searchsorted(knots, times), 0)[:-1], np.diff(times)[:, None]
         now[1:] = np.where(step > 0, total / np.where(step > 0, step, 1.0), now[1:])
         return now
@@ -216,7 +223,7 @@ def _look_at_silence(name: str, times: np.ndarray, others: np.ndarray) -> None:
 
 
 def _by_sensor(messages: Iterable[Sequence[Any]], unit: str) -> dict[str, _Stream]:
-    """The messages of each sensor, in the order of their stamps, s.
+    """Returns the messages of each sensor, in the order of their stamps, s.
 
     Raises:
         ValueError: see :func:`message_rows`.
@@ -229,7 +236,7 @@ def _by_sensor(messages: Iterable[Sequence[Any]], unit: str) -> dict[str, _Strea
             )
         name, source = message[1], f"Message {number}, of {message[1]!r},"
         if any(np.ma.is_masked(part) for part in message):
-            raise ValueError(f"{source} has masked elements: leave it out, or give what is there a sensor of its own.")
+            raise ValueError(f"{source} has masked elements: leave it out, or give the others a sensor of their own.")
         stamp = float(_floats(f"{source} has a stamp", message[0], 0)) * SECONDS[unit]
         value = np.atleast_1d(_floats(f"{source} has a value", message[2]))
         if not np.isfinite(stamp) or value.ndim != 1:

@@ -33,7 +33,7 @@ class RefilteringWindow(NamedTuple):
 
     @property
     def belief(self) -> TensorDictBase:
-        """What the last step wrote."""
+        """Returns the belief of the last step."""
         return self.beliefs[-1]
 
 
@@ -89,7 +89,7 @@ class Refiltering(Checked):
         self.late = {unravel_key(key): _read_with(key, keys, filter) for key, keys in late.items()}
 
     def start(self, row: TensorDictBase | Mapping[str, Any]) -> RefilteringWindow:
-        """The window at the start of an episode: no steps yet, and the initial belief.
+        """Returns the window at the start of an episode: no steps yet, and the initial belief.
 
         Args:
             row: what :meth:`Filter.initialise` reads, ``[*B]``.
@@ -100,11 +100,11 @@ class Refiltering(Checked):
         return RefilteringWindow((), (self.filter.initialise(self.filter.of_one_robot(row).copy()),))
 
     def step(self, window: RefilteringWindow, row: TensorDictBase | Mapping[str, Any]) -> RefilteringWindow:
-        """One step.
+        """Runs one step.
 
         Args:
             window: the last steps; it is not changed.
-            row: what :meth:`Filter.step` reads, ``[*B]``, beside the belief.
+            row: what :meth:`Filter.step` reads, ``[*B]``, besides the belief.
 
         Returns:
             The window with this step, whose ``belief`` is that of t.
@@ -150,7 +150,7 @@ class Refiltering(Checked):
         return tensordict
 
     def _with_noise(self, row: TensorDictBase, belief: TensorDictBase) -> TensorDictBase:
-        """The row and all noise of its step."""
+        """Returns the row and all noise of its step."""
         row = row.copy()
         carry = {key: belief[key] for key in self.filter.carry_keys}
         entries = {**self.filter.entries_of(row, one_step=True), **carry}
@@ -177,7 +177,7 @@ class Refiltering(Checked):
 
 
 def _read_with(key: NestedKey, keys: Sequence[NestedKey], filter: Filter) -> tuple[NestedKey, ...]:
-    """The keys of a reading and of its mask, which the filter must read."""
+    """Returns the keys of a reading and of its mask, which the filter must read."""
     if isinstance(keys, str) or len(keys) < 2:
         raise ValueError(f"late[{key!r}] is the keys of a reading and, last, of its mask; got {keys!r}.")
     found = tuple(map(unravel_key, keys))

@@ -75,7 +75,7 @@ class Wired:
 
 
 def noise_key_of(sensor: FusedSensor) -> NestedKey | None:
-    """The key under which the data have the noise of each reading; ``None`` where they do not."""
+    """Returns the key under which the data have the noise of each reading; ``None`` where they do not."""
     noise = sensor.noise
     named = isinstance(noise, str) or (isinstance(noise, tuple) and all(isinstance(part, str) for part in noise))
     return unravel_key(noise) if named else None

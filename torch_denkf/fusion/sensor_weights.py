@@ -14,7 +14,7 @@ from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import StateObservation
-from torch_denkf.modules.spaces import told
+from torch_denkf.modules.spaces import narrowed_mask
 from torch_denkf.modules.tensors import mean_of_members
 from torch_denkf.running import reads
 from torch_denkf.submodel import Sensor
@@ -48,7 +48,7 @@ class SensorAttention(nn.Module):
         features: number of features of each sensor that has any.
         size: D, of a token.
         floor: :math:`w_0`, the smallest weight. It keeps a way back: a sensor that was distrusted still corrects
-            the belief a little. A thousand readings of weight 0.001 count as one that is believed: where a sensor reads
+            the belief a little. A thousand readings of weight 0.001 count as one of full weight: where a sensor reads
             much more often than the others, or is much more exact, take a smaller one.
         slope: a, before training; 0 leaves the term out. A filter that has followed a sensor finds nothing wrong with
             it any more, and a loss does not tell how it could have known. With a slope of 2 a reading three standard
@@ -102,7 +102,7 @@ class SensorAttention(nn.Module):
         self.score = nn.Sequential(first, nn.ELU(), last)
 
     def forward(self, innovations: Mapping[str, Tensor], observed: Tensor, features: Mapping[str, Tensor]) -> Tensor:
-        """The weights.
+        """Returns the weights.
 
         Args:
             innovations: of each sensor in standard deviations, ``[*B, O]``; 0 where not observed.
@@ -183,7 +183,7 @@ class SensorWeights(Sensor):
         self.spaces, self.moments, self.state_key = dict(spaces), moments, unravel_key(state_key)
 
     def on_entries(self, entries, call):
-        """The weights."""
+        """Returns the weights."""
         if self.moments is not None:
             mean, cov = (self.required(entries, (self.moments, name)) for name in ("mean", "cov"))
             size = next((model.state_dim for model in self.module["models"].values()), None)
@@ -196,7 +196,7 @@ class SensorWeights(Sensor):
             variance = noise if noise.ndim == size + 1 else noise.diagonal(dim1=-2, dim2=-1)
             predicted, observed = model.seen(entries, call._replace(sample=False).part(name))
             if (space := self.spaces[name]) is not None:
-                observed = told(space, observed)
+                observed = narrowed_mask(space, observed)
                 predicted, reading = space.align(predicted, reading, observed)
             reading, mean = mean_of_members(reading, call.batch_size), ensemble_mean(predicted)
             observed = (
@@ -232,12 +232,12 @@ class WeightedNoise(Sensor):
         self.observation_dim = observation_dim
 
     def compute(self, variance, weight):
-        """The larger noise."""
+        """Returns the larger noise."""
         return variance / (weight if variance.ndim == weight.ndim else weight.unsqueeze(-1))
 
 
 def _points(mean: Tensor, cov: Tensor, size: int) -> Tensor:
-    """Members ``[*B, 2 S, N S]`` of that mean, in which each of N states has its sample covariance.
+    """Returns members ``[*B, 2 S, N S]`` of that mean, in which each of N states has its sample covariance.
 
     How the states belong together is left out: each sensor observes one of them, and the covariance of all may be as
     good as singular.

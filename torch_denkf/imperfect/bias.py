@@ -1,7 +1,7 @@
 r"""A sensor's slow errors as part of the state: biases that fade, in any filter.
 
 A sensor that reads wrongly often reads wrongly in the next frame, too. A filter that takes such errors for white noise
-believes them more with each frame, and its intervals become too narrow. Here the state is :math:`(x, b)`: S numbers of
+averages them out with each frame, and its intervals become too narrow. Here the state is :math:`(x, b)`: S numbers of
 the system, then K biases of the sensor, each an Ornstein-Uhlenbeck process with its own standard deviation and its own
 time; the reading is :math:`h(x) + b`. With several times for each component of the reading the errors may be slow and
 slower.
@@ -34,7 +34,7 @@ from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.modules.around import AroundInitial, Wrapper
 from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.modules.tensors import as_floating, as_standard_deviations
-from torch_denkf.running import check_module
+from torch_denkf.running import check_module, linearise
 from torch_denkf.submodel import Initial, Transition, role
 
 __all__ = ["BiasedBelief", "BiasedNoise", "BiasedObservation", "BiasedTransition", "FadingBias"]
@@ -85,7 +85,7 @@ class FadingBias(nn.Module):
     def from_residuals(
         cls, residuals: Tensor, *, trainable: bool = True, per_run: bool = False
     ) -> tuple[FadingBias, Tensor]:
-        r"""The biases that explain how long a sensor's errors last, and what is left: white noise.
+        r"""Returns the biases that explain how long a sensor's errors last, and what is left: white noise.
 
         The autocovariance of :math:`b + w` at lag k is :math:`\sigma^2 e^{-k / \tau}`, and at lag 0 it is more by the
         white variance. Size and time are those of the least squares over lags of one step and more, each lag counted
@@ -135,7 +135,7 @@ class FadingBias(nn.Module):
 
     @property
     def std(self) -> Tensor:
-        """Standard deviations in the long run ``[K]``: of the biases in an initial belief."""
+        """Returns standard deviations in the long run ``[K]``: of the biases in an initial belief."""
         return self.log_std.exp()
 
     @property
@@ -145,7 +145,7 @@ class FadingBias(nn.Module):
 
     @property
     def variance(self) -> Tensor:
-        """Variance of what is new in a step, ``[K]``: with it the biases stay as large as they are."""
+        """Returns the variance of what is new in a step, ``[K]``: with it the biases stay as large as they are."""
         return (2 * self.log_std).exp() * -torch.expm1(-2 * (-self.log_time).exp())
 
     def augmented(
@@ -247,11 +247,24 @@ class BiasedTransition(Wrapper, Transition):
         self.bias = bias
 
     def on_entries(self, entries, call):
-        """The forecast of both, and whatever else the transition writes."""
+        """Returns the forecast of both, and whatever else the transition writes."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, slow = _split(self.required(entries, key), self.bias, self)
         written = self.run_inside({**entries, key: state}, call)
         return {**written, out_key: torch.cat([written[out_key], self.bias.decay * slow], -1)}
+
+    def linearised(self, entries, call):
+        """Returns the Jacobian of the transition, and behind it the decay."""
+        key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
+        state, slow = _split(self.required(entries, key), self.bias, self)
+        found = linearise(self.module, {**entries, key: state}, call.part(self.place))
+        if found is None or not is_flat(*found[2] or ()):
+            return None
+        (written, matrix, _), count = found, len(self.bias)
+        decay = self.bias.decay.diag_embed().expand(*matrix.shape[:-2], count, count)
+        rows = nn.functional.pad(matrix, (0, count)), nn.functional.pad(decay, (matrix.shape[-1], 0))
+        moved = torch.cat([written[out_key], self.bias.decay * slow], -1)
+        return {**written, out_key: moved}, torch.cat(rows, -2), None
 
 
 class BiasedNoise(Wrapper):
@@ -277,7 +290,7 @@ class BiasedNoise(Wrapper):
         self.bias = bias
 
     def on_entries(self, entries, call):
-        """Q of both."""
+        """Returns Q of both."""
         out, key = self.run_inside(entries, call), unravel_key(self.out_keys[0])
         of_state, slow = out[key], self.bias.variance.to(out[key].dtype)
         if of_state.ndim == len(call.batch_size) + 1:
@@ -321,21 +334,40 @@ class BiasedObservation(Wrapper):
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
 
     def on_entries(self, entries, call):
-        """The predicted observations."""
+        """Returns the predicted observations."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, slow = _split(self.required(entries, key), self.bias, self)
         written = self.run_inside({**entries, key: state}, call)
-        read = written[out_key]
+        read, own = written[out_key], self._own(slow, written[out_key])
+        return {**written, out_key: read * (1 + own) if self.bias.factor else read + own}
+
+    def linearised(self, entries, call):
+        """Returns the Jacobian of the model, and behind it that by the biases."""
+        key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
+        state, slow = _split(self.required(entries, key), self.bias, self)
+        found = linearise(self.module, {**entries, key: state}, call.part(self.place))
+        if found is None or not is_flat(*found[2] or ()):
+            return None
+        (written, matrix, _), count = found, len(self.bias)
+        read, own = written[out_key], self._own(slow, written[out_key])
+        by_bias = self._own(torch.eye(count, dtype=read.dtype, device=read.device), read).mT
+        if self.bias.factor:
+            matrix, by_bias = (1 + own).unsqueeze(-1) * matrix, read.unsqueeze(-1) * by_bias
+        by_bias = by_bias.expand(*matrix.shape[:-1], count)
+        read = read * (1 + own) if self.bias.factor else read + own
+        return {**written, out_key: read}, torch.cat([matrix, by_bias], -1), None
+
+    def _own(self, slow: Tensor, read: Tensor) -> Tensor:
+        """Sums up the biases ``[*, K]`` of each component of the reading, ``[*, O]``."""
+        size = read.shape[-1]
         if self.dims is not None:
-            slow = torch.zeros_like(read).index_add(-1, self.dims, slow)
-            return {**written, out_key: read * (1 + slow) if self.bias.factor else read + slow}
-        if len(self.bias) % read.shape[-1]:
+            return slow.new_zeros(*slow.shape[:-1], size).index_add(-1, self.dims, slow)
+        if len(self.bias) % size:
             raise ValueError(
-                f"{len(self.bias)} biases are not as many for each of the {read.shape[-1]} components of the reading; "
+                f"{len(self.bias)} biases are not as many for each of the {size} components of the reading; "
                 "say in dims which component each belongs to"
             )
-        slow = slow.unflatten(-1, (-1, read.shape[-1])).sum(-2)
-        return {**written, out_key: read * (1 + slow) if self.bias.factor else read + slow}
+        return slow.unflatten(-1, (-1, size)).sum(-2)
 
 
 class BiasedBelief(AroundInitial):
@@ -366,7 +398,7 @@ class BiasedBelief(AroundInitial):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """The draws of an ensemble's biases."""
+        """Names the draws of an ensemble's biases."""
         return ("",) if any(map(is_samples, self.out_keys)) else ()
 
     def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
@@ -377,11 +409,11 @@ class BiasedBelief(AroundInitial):
         return torch.randn((*batch_size, members, len(self.bias)), device=device, dtype=dtype, generator=generator)
 
     def noise_sizes(self, ensemble, *_):
-        """E, from the ensemble of the state."""
+        """Returns E, from the ensemble of the state."""
         return {"members": ensemble.shape[-2]}
 
     def on_entries(self, entries, call):
-        """The belief of both."""
+        """Returns the belief of both."""
         written = dict(self.run_inside(entries, call))
         names = {key[-1]: key for key in map(unravel_key, self.out_keys)}
         std, size = self.bias.std, call.batch_size
@@ -405,7 +437,7 @@ class BiasedBelief(AroundInitial):
 
 
 def _autocovariance(values: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-    """Means of products of values ``[N, T]`` that lie 0, 1, ... steps apart, and how many there are."""
+    """Returns means of products of values ``[N, T]`` that lie 0, 1, ... steps apart, and how many there are."""
     values, steps = torch.where(known, values, 0), values.shape[1]
     products, counts = [], []
     for lag in range(min(steps, 1000)):
@@ -417,7 +449,7 @@ def _autocovariance(values: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _fit(covariance: Tensor, count: Tensor, component: int, per_run: bool) -> tuple[float, float, float, float]:
-    """Standard deviation and time of the fading part, standard deviations of the white and of a run's part."""
+    """Fits standard deviation and time of the fading part, standard deviations of the white and of a run's part."""
     if count[1] < 100:
         raise ValueError(f"component {component} has {int(count[1])} pairs of neighbouring residuals; it takes 100")
     longest = len(covariance)
@@ -447,7 +479,7 @@ def _fit(covariance: Tensor, count: Tensor, component: int, per_run: bool) -> tu
 
 
 def _split(state: Tensor, bias: FadingBias, module: nn.Module) -> tuple[Tensor, Tensor]:
-    """The system's part of a state, and the biases."""
+    """Returns the system's part of a state, and the biases."""
     count = len(bias)
     if state.shape[-1] <= count:
         raise ValueError(

@@ -25,7 +25,7 @@ _RIDGE = 1e-12
 
 
 def responsibility(probability: Tensor, log_own: Tensor, log_other: Tensor) -> Tensor:
-    """The probability that the reading was about the state, now that it is known.
+    """Returns the probability that the reading was about the state, now that it is known.
 
     Args:
         probability: p, before the reading is known, in [0, 1].
@@ -45,7 +45,7 @@ def responsibility(probability: Tensor, log_own: Tensor, log_other: Tensor) -> T
 
 
 def log_mixture(probability: Tensor, log_own: Tensor, log_other: Tensor) -> Tensor:
-    """The log-density of the mixture, ``log (p N(y) + (1 - p) b(y))``; arguments as of :func:`responsibility`.
+    """Returns the log-density of the mixture, ``log (p N(y) + (1 - p) b(y))``; arguments as of :func:`responsibility`.
 
     Examples:
         >>> log_mixture(torch.tensor(0.5), torch.tensor(0.3).log(), torch.tensor(0.1).log()).exp()
@@ -57,13 +57,13 @@ def log_mixture(probability: Tensor, log_own: Tensor, log_other: Tensor) -> Tens
 
 
 def _open(probability: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The probability, one half where it is 0 or 1; and where it is 1, and 0."""
+    """Returns the probability, one half where it is 0 or 1; and where it is 1, and 0."""
     sure, never = probability >= 1, probability <= 0
     return torch.where(sure | never, 0.5, probability), sure, never
 
 
 def mix_moments(share: Tensor, mean: Tensor, cov: Tensor, other_mean: Tensor, other_cov: Tensor) -> tuple[Tensor, ...]:
-    r"""Mean and covariance of a mixture of two, :math:`q P_1 + (1 - q) P_2 + q (1 - q) d d^T`.
+    r"""Returns mean and covariance of a mixture of two, :math:`q P_1 + (1 - q) P_2 + q (1 - q) d d^T`.
 
     Args:
         share: q, of the first, ``[*B, 1]``.
@@ -86,7 +86,7 @@ def mix_moments(share: Tensor, mean: Tensor, cov: Tensor, other_mean: Tensor, ot
 
 
 def mix_members(share: Tensor, members: Tensor, other: Tensor) -> Tensor:
-    r"""An ensemble with the mean and the sample covariance of a mixture of two ensembles of the same members.
+    r"""Returns an ensemble with the mean and the sample covariance of a mixture of two ensembles of the same members.
 
     Each member first goes the share q of its way from the other place to its own. What that lacks of the mixture's
     covariance is the doubt where on its way a member is, :math:`q (1 - q) \Delta^T \Delta / (E - 1)` with

@@ -31,7 +31,7 @@ def spread_skill_ratio(
     *,
     space: Space | None = None,
 ):
-    r"""Spread over skill, :math:`\sqrt{\frac{E+1}{E}\,\overline{s^2}} / \mathrm{RMSE}`: one for a calibrated ensemble.
+    r"""Returns spread over skill, :math:`\sqrt{\frac{E+1}{E}\,\overline{s^2}} / \mathrm{RMSE}`: one if calibrated.
 
     The truth of a calibrated ensemble is one more draw from its distribution; its squared distance from the mean of E
     members is then (E+1)/E times their variance, on average.
@@ -75,7 +75,7 @@ def interval_coverage(
     level: float = 0.9,
     space: Space | None = None,
 ) -> Tensor:
-    """Share of the truth inside the central interval of a Gaussian, ``mean ± z sqrt(variance)``.
+    """Returns the share of the truth inside the central interval of a Gaussian, ``mean ± z sqrt(variance)``.
 
     It is ``level`` for a calibrated belief, less for an overconfident one. Without ``space`` variances of points are of
     other axes than their differences: :func:`torch_denkf.diagnosis.evaluate` takes the space from a filter.
@@ -112,7 +112,7 @@ def ensemble_interval_coverage(
     level: float = 0.9,
     space: Space | None = None,
 ) -> Tensor:
-    """Share of the truth inside the central interval of the members: ``level`` if calibrated, Gaussian or not.
+    """Returns the share of the truth inside the members' central interval: ``level`` if calibrated, Gaussian or not.
 
     The truth of a calibrated ensemble is as likely to fall into any of the E+1 gaps between and beyond the sorted
     members. The interval therefore ends at rank p (E+1), p = (1 - level)/2, between two members where that is no whole
@@ -145,7 +145,7 @@ def ensemble_interval_coverage(
 
 
 def ensemble_interval(ensemble: Tensor, *, level: float = 0.9) -> tuple[Tensor, Tensor]:
-    """Central interval of the members, which holds the truth of a calibrated ensemble with probability ``level``.
+    """Returns the members' central interval, which contains the truth with probability ``level`` if calibrated.
 
     It ends at rank p (E+1) of the sorted members, p = (1 - level)/2, between two members where that is no whole number.
 
@@ -182,7 +182,7 @@ def ensemble_interval(ensemble: Tensor, *, level: float = 0.9) -> tuple[Tensor, 
 
 
 def pit(mean: Tensor, variance: Tensor, truth: Tensor, *, space: Space | None = None) -> Tensor:
-    r"""Probability integral transform of the truth, :math:`\Phi((x - \bar x) / \sqrt{s^2})`.
+    r"""Returns the probability integral transform of the truth, :math:`\Phi((x - \bar x) / \sqrt{s^2})`.
 
     It is uniform in [0, 1] for a calibrated Gaussian belief. An overconfident one gathers it at both ends, a timid one
     in the middle, and a biased one at one end.
@@ -216,7 +216,7 @@ def pit(mean: Tensor, variance: Tensor, truth: Tensor, *, space: Space | None = 
 def around_mean(
     ensemble: Tensor, truth: Tensor, space: Space | None, count: Tensor | float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """Members and truth relative to the members' mean: ``[*B, E, S]`` and ``[*B, S]``.
+    """Returns members and truth relative to the members' mean: ``[*B, E, S]`` and ``[*B, S]``.
 
     Of points of a space they are tangents: members and truth that are drawn alike are so in these axes, too.
     """
@@ -250,6 +250,6 @@ def check_variance(variance: Tensor, error: Tensor) -> None:
 
 
 def _share(margin: Tensor, truth: Tensor) -> Tensor:
-    """The share of margins ``[*B, S]`` that are not negative; NaN where one is NaN."""
+    """Returns the share of margins ``[*B, S]`` that are not negative; NaN where one is NaN."""
     inside = (margin >= 0).to(torch.get_default_dtype())
     return mean_of_known(inside.where(~margin.isnan(), torch.nan), truth)

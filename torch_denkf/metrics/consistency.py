@@ -38,7 +38,7 @@ def nees(
     level: float = 0.95,
     dim: int | None = None,
 ) -> NEES:
-    r"""Normalised estimation error squared :math:`e^\top P^{-1} e`, its mean, and where that should lie.
+    r"""Returns the normalised estimation error squared :math:`e^\top P^{-1} e`, its mean, and where that should lie.
 
     The sum over N independent errors that fit their covariance is chi-square distributed with N S degrees of freedom,
     so that the mean lies between ``lower`` and ``upper`` with probability ``level``. The errors of one run at
@@ -93,7 +93,7 @@ def nees(
 
 
 def _scale(error: Tensor, covariance: Tensor) -> Tensor:
-    """Standard deviations ``[*B, S]``, or the Cholesky factor ``[*B, S, S]``."""
+    """Returns standard deviations ``[*B, S]``, or the Cholesky factor ``[*B, S, S]``."""
     if covariance.shape == error.shape:
         if not bool((covariance > 0).all()):
             raise ValueError(f"variances must be positive; the least is {covariance.min().item():.3g}")
@@ -113,7 +113,7 @@ def _scale(error: Tensor, covariance: Tensor) -> Tensor:
 
 
 def _chi_square_quantile(p: float, freedom: int) -> float:
-    """By bisection of the distribution function, the regularised lower incomplete gamma function."""
+    """Inverts the distribution function, the regularised lower incomplete gamma function, by bisection."""
     half = torch.tensor(freedom / 2, dtype=torch.float64)
     low, high = 0.0, freedom + 20.0 * (2 * freedom) ** 0.5 + 100.0  # beyond 1 - 1e-15 for any freedom
     for _ in range(100):

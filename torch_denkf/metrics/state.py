@@ -34,7 +34,7 @@ class StateErrors(NamedTuple):
 
 
 def state_difference(estimated: Tensor, truth: Tensor, *, space: Space | None = None) -> Tensor:
-    """Estimate minus truth, where headings that differ by whole turns are the same.
+    """Subtracts the truth from the estimate; headings that differ by whole turns are the same.
 
     From the truth to the estimate and back leads a tangent and its negative: it is the error at either.
 
@@ -67,7 +67,7 @@ def state_difference(estimated: Tensor, truth: Tensor, *, space: Space | None = 
 
 
 def state_errors(estimated: Tensor, truth: Tensor, *, space: Space | None = None) -> StateErrors:
-    """Root mean square and mean absolute error of each dimension, over all batch dims.
+    """Returns root mean square and mean absolute error of each dimension, over all batch dims.
 
     Dimensions are kept apart: a mean over metres, radians and metres per second, as the reference script of the DEnKF
     paper prints it, is ruled by whichever unit has the largest numbers.
@@ -100,7 +100,7 @@ def state_errors(estimated: Tensor, truth: Tensor, *, space: Space | None = None
 
 
 def rotation_error(estimated: Tensor, truth: Tensor, *, space: Space) -> Tensor:
-    """The angle between an estimated and a true orientation, in degrees.
+    """Returns the angle between an estimated and a true orientation, in degrees.
 
     It is the length of the shortest turn from one to the other, the geodesic distance.
 
@@ -144,7 +144,7 @@ def known_tangents(truth: Tensor, space: Space | None) -> Tensor:
 
 
 def mean_of_known(values: Tensor, truth: Tensor) -> Tensor:
-    """The mean of values ``[*B, S]`` over all batch dims, where the truth ``[*B, S]`` is not NaN, ``[S]``.
+    """Returns the mean of values ``[*B, S]`` over all batch dims, where the truth ``[*B, S]`` is not NaN, ``[S]``.
 
     Examples:
         >>> mean_of_known(torch.tensor([[1.0], [3.0], [9.0]]), torch.tensor([[0.0], [0.0], [torch.nan]]))

@@ -6,7 +6,6 @@ Import from here: ``from torch_denkf.modules import EnsembleAnalysis, ImageSenso
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.around import Around
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
-from torch_denkf.modules.continuous import ContinuousMotion, ContinuousNoise, NoisePerSecond
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules.keypoints import KeypointTrunk
@@ -17,7 +16,6 @@ from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise, ScaledNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
 from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise, as_process_noise
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
-from torch_denkf.modules.sharded_analysis import ShardedEnsembleAnalysis
 from torch_denkf.modules.stochastic import StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
@@ -32,9 +30,6 @@ __all__ = [
     "StochasticMLP",
     "deterministic",
     "LearnedTransition",
-    "ContinuousMotion",
-    "ContinuousNoise",
-    "NoisePerSecond",
     "LearnedObservation",
     "LinearObservation",
     "Select",
@@ -50,7 +45,6 @@ __all__ = [
     "FromSensor",
     "EnsembleAnalysis",
     "LocalEnsembleAnalysis",
-    "ShardedEnsembleAnalysis",
     "MomentPrior",
     "LinearTransition",
     "KalmanAnalysis",

@@ -18,7 +18,7 @@ _BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm
 
 
 def _tensors(values: Any) -> Iterator[Tensor]:
-    """The tensors in nested tuples, lists and dictionaries."""
+    """Yields the tensors in nested tuples, lists and dictionaries."""
     if isinstance(values, Tensor):
         yield values
     elif isinstance(values, dict):
@@ -29,7 +29,7 @@ def _tensors(values: Any) -> Iterator[Tensor]:
 
 
 class _Allocations(TorchDispatchMode):
-    """Adds up the bytes of all storages that operations return anew."""
+    """Adds up the bytes of all new storages that operations return."""
 
     def __init__(self):
         super().__init__()
@@ -62,7 +62,7 @@ def couples_frames(trunk: nn.Module) -> bool:
 
 
 def reduced_precision(dtype: torch.dtype | None, device: torch.device) -> AbstractContextManager:
-    """Autocast to ``dtype``; nothing for ``None``."""
+    """Autocasts to ``dtype``; does nothing for ``None``."""
     return nullcontext() if dtype is None else torch.autocast(device.type, dtype)
 
 

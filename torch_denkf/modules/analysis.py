@@ -28,18 +28,18 @@ class EnsembleAnalysis(EnsembleUpdate):
             plus N(0, R)), ``"etkf"`` (symmetric square root) or ``"sakov"`` (Sakov & Oke's deterministic update).
         inflation: factor on the analysis anomalies, where anything is observed; 1 for none.
         inflated: components of the state that the inflation multiplies; ``None`` for all. Where nothing observes a
-            component, or where it is the past, which is not forecast anew, factors pile up in it.
+            component, or where it is the past, which is not forecast again, factors pile up in it.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         rotate: random mean-preserving rotation of the anomalies (``"etkf"`` only).
         taper: localisation: factors on the covariances of state and observation ``[S, O]`` and of the observations
             ``[O, O]``, see :func:`~torch_denkf.functional.analyse`; ``None`` for none. Where one observation can say
             nothing about a component of the state but what E members happen to show, the factor is 0.
-        localisation: ``"significance"`` believes a covariance of state and observation as far as E members can tell it
-            from chance, see :func:`~torch_denkf.functional.analysis.significant`. It keeps 32 to 64 members honest
-            where fast sensors make thousands of updates. ``None`` believes all.
+        localisation: ``"significance"`` uses a covariance of state and observation as far as E members can tell it
+            from chance, see :func:`~torch_denkf.functional.analysis.significant`. It keeps members honest that are too
+            few for exact draws, where fast sensors make thousands of updates. ``None`` uses all.
         threshold: of ``"significance"``, in standard deviations: one number or ``[S]``; a ``Parameter`` is trained. The
             more updates a component sees between two readings about it, the larger. One that is trained beyond
-            sqrt(E - 1) believes nothing, and has no gradient that would bring it back.
+            sqrt(E - 1) ignores all, and has no gradient that would bring it back.
         space: in which the state lives, such as ``Product(SO3(), Euclidean(3))``: members are points, the update is
             made with the tangents at the forecast's mean, and ``var`` is of the tangents at the belief's. See
             :mod:`torch_denkf.functional.manifolds`.
@@ -99,7 +99,7 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Perturbations or rotations, where the scheme needs any."""
+        """Returns perturbations or rotations, where the scheme needs any."""
         return ("",) if self.rotate or self.scheme == "perturbed" else ()
 
     def draw_noise(self, batch_size, *, members=None, observation_dim=None, generator=None, **where):
@@ -128,12 +128,17 @@ class EnsembleAnalysis(EnsembleUpdate):
         return exact_draws(noise, predicted, forecast) * ((size - 1) / size) ** 0.5
 
     def noise_sizes(self, forecast, predicted, *_):
-        """E and O, from the ensemble and its predicted observations."""
+        """Returns E and O, from the ensemble and its predicted observations."""
         size = predicted.shape[-1] if self.reading_space is None else self.reading_space.tangent_dim
         return {**super().noise_sizes(forecast), "observation_dim": size}
 
+    def reading_dims(self, entries, call):
+        """Returns how many numbers the reading has; of samples, ``(E, O)``."""
+        (dim, *others), forecast = super().reading_dims(entries, call), entries.get(self.in_keys[0])
+        return [dim if self.scheme != "sensor" or forecast is None else (forecast.shape[-2], dim), *others]
+
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         center = None
         if self.space is not None:
             center = self.space.near(forecast).unsqueeze(-2)
@@ -172,7 +177,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         return factor
 
     def move_past(self, past, predicted, observation, variance, observed=None, *, noise=None):
-        """See :meth:`Update.move_past`; neither inflation nor relaxation touches the past."""
+        """Overrides :meth:`Update.move_past`; neither inflation nor relaxation touches the past."""
         center = None
         if self.space is not None:
             center = self.space.near(past.movedim(-3, -2)).unsqueeze(-3)  # of each time

@@ -39,7 +39,7 @@ class Wrapper(SubModel):
         in_keys: of the wrapper; those of the module by default.
         out_keys: likewise.
         optional_keys: likewise.
-        further_keys: what the wrapper reads beside ``in_keys``.
+        further_keys: what the wrapper reads besides ``in_keys``.
 
     Attributes:
         place: name of the module inside, where its noise has a place inside of the wrapper's, ``("noise",

@@ -56,7 +56,7 @@ class _InitialEnsemble(Initial):
         return torch.randn(shape, device=device, dtype=dtype, generator=generator)
 
     def _members(self, center: torch.Tensor, std: torch.Tensor, noise: torch.Tensor | None, batch_size):
-        """Ensemble, mean and variance."""
+        """Returns ensemble, mean and variance."""
         if noise is None:
             noise = self.draw_noise(batch_size, device=center.device, dtype=center.dtype)
         noise = noise.to(center.dtype)
@@ -107,7 +107,7 @@ class GaussianPrior(_InitialEnsemble):
         self.register_buffer("mean", mean)
 
     def compute(self, *, noise, batch_size):
-        """The belief."""
+        """Returns the belief."""
         return self._members(self.mean.expand(*batch_size, -1), self.std, noise, batch_size)
 
 
@@ -147,7 +147,7 @@ class AroundState(_InitialEnsemble):
             self.input_dim = space.point_dim
 
     def compute(self, state, *, noise, batch_size):
-        """The belief."""
+        """Returns the belief."""
         return self._members(state.to(self.std.dtype), self.std, noise, batch_size)
 
 
@@ -201,7 +201,7 @@ class FromSensor(_InitialEnsemble):
         self.input_dim, self.observed_key = len(self.dims), unravel_key(observed_key)
 
     def compute(self, reading, variance, observed=None, *, noise, batch_size):
-        """The belief."""
+        """Returns the belief."""
         reading, std = mean_of_members(reading, batch_size), variance.sqrt()
         mean, prior_std = (part.expand(*reading.shape[:-1], -1) for part in (self.mean, self.std))
         if observed is not None:

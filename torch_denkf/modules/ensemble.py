@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_choice, check_number, check_values
 from torch_denkf.functional.inflation import random_rotation
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.modules.spaces import told
+from torch_denkf.modules.spaces import narrowed_mask
 from torch_denkf.submodel import Call, Entries, Update
 
 __all__ = ["EnsembleAnalysisKeys", "EnsembleOptions", "EnsembleUpdate", "Rotated"]
@@ -45,7 +45,7 @@ class EnsembleAnalysisKeys(TypedDict, total=False):
 
 
 class EnsembleOptions(EnsembleAnalysisKeys, total=False):
-    """What every update of an ensemble takes beside its keys.
+    """Arguments of every ensemble update besides its keys.
 
     Attributes:
         inflation: factor on the analysis anomalies, where anything is observed; 1, by default, for none.
@@ -53,7 +53,7 @@ class EnsembleOptions(EnsembleAnalysisKeys, total=False):
         rotate: random mean-preserving rotation of the anomalies.
         reading_space: of the reading; ``None`` for plain numbers.
         localisation: ``"significance"`` or ``None``.
-        threshold: of ``"significance"``, in standard deviations; 3 by default.
+        threshold: of ``"significance"``, in standard deviations; 1.5 by default.
     """
 
     inflation: float
@@ -75,7 +75,7 @@ class Rotated(Update):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Rotations, where wanted."""
+        """Returns rotations, where wanted."""
         return ("",) if self.rotate else ()
 
     def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
@@ -85,7 +85,7 @@ class Rotated(Update):
         return random_rotation(members, tuple(batch_size), device=device, dtype=dtype, generator=generator)
 
     def noise_sizes(self, ensemble, *_):
-        """E, from the ensemble."""
+        """Returns E, from the ensemble."""
         return {"members": ensemble.shape[-2]}
 
     def rotated(self, ensemble: Tensor, rotation: Tensor | None) -> Tensor:
@@ -119,7 +119,7 @@ class EnsembleUpdate(Rotated):
         reading_space: Space | None = None,
         covariance: bool = False,
         localisation: Literal["significance"] | None = None,
-        threshold: float | Tensor = 3.0,
+        threshold: float | Tensor = 1.5,
         forecast_key: NestedKey = ("forecast", "ensemble"),
         predicted_key: NestedKey = ("forecast", "observation"),
         observation_key: NestedKey = ("sensor", "ensemble"),
@@ -156,11 +156,11 @@ class EnsembleUpdate(Rotated):
 
     @property
     def significance(self) -> float | Tensor | None:
-        """The threshold of the localisation by significance; ``None`` without one."""
+        """Returns the threshold of the localisation by significance; ``None`` without one."""
         return None if self.localisation is None else self.threshold
 
     def on_entries(self, entries, call):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         return super().on_entries(entries if self.reading_space is None else self.aligned(entries), call)
 
     def aligned(self, entries: Entries) -> Entries:
@@ -172,11 +172,11 @@ class EnsembleUpdate(Rotated):
         """
         if self.reading_space is None:
             return entries
-        keys, observed = self.in_keys[1:3], told(self.reading_space, entries.get(self.observed_key))
+        keys, observed = self.in_keys[1:3], narrowed_mask(self.reading_space, entries.get(self.observed_key))
         predicted, reading = (self.required(entries, key) for key in keys)
         aligned = dict(zip(keys, self.reading_space.align(predicted, reading, observed), strict=True))
         return {**entries, **aligned, **({} if observed is None else {self.observed_key: observed})}
 
     def on_aligned(self, entries: Entries, call: Call) -> Entries:
-        """The belief and the diagnostics of entries as :meth:`aligned` gives them."""
+        """Returns the belief and the diagnostics of entries as :meth:`aligned` gives them."""
         return super().on_entries(entries, call)

@@ -11,10 +11,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_number
-from torch_denkf.functional.gaussian import GaussianUpdate
+from torch_denkf.functional.gaussian import GaussianUpdate, sandwich
 from torch_denkf.functional.linalg import as_covariance
 from torch_denkf.functional.manifolds import Space, check_space, is_flat
-from torch_denkf.modules.spaces import mean_reading, told
+from torch_denkf.modules.spaces import mean_reading, narrowed_mask
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.running import check_module, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, SubModel, Transition, Update
@@ -68,7 +68,7 @@ class GaussianTransition(Transition):
     ):
         check_module("transition", transition)
         check_module("process_noise", process_noise)
-        refuse_random_layers(transition, type(self).__name__)
+        check_no_random_layers(transition, type(self).__name__)
         in_keys, out_keys = ([(key, name) for name in ("mean", "cov")] for key in (belief_prefix, forecast_prefix))
         self_made = [unravel_key(ensemble_key), *out_keys]
         further, optional = further_keys((transition, process_noise), [*in_keys, *self_made])
@@ -77,11 +77,11 @@ class GaussianTransition(Transition):
         self.ensemble_key, self.forecast_ensemble_key = map(unravel_key, (ensemble_key, forecast_ensemble_key))
 
     def parts(self):
-        """The process noise; the transition is deterministic."""
+        """Returns the process noise; the transition is deterministic."""
         return {"process_noise": self.process_noise}
 
     def on_entries(self, entries, call):
-        """The forecast."""
+        """Returns the forecast."""
         return self.with_link(entries, call, wanted=False)[0]
 
     def with_link(self, entries: Entries, call: Call, *, wanted: bool = True) -> tuple[Entries, Sequence[torch.Tensor]]:
@@ -96,14 +96,17 @@ class GaussianTransition(Transition):
         noise = as_covariance(written[unravel_key(self.process_noise.out_keys[0])], mean)
         return {self.out_keys[0]: mean, self.out_keys[1]: cov + noise}, (*(link or ()), noise)
 
+    def mask_of(self, entries: Entries, written: Entries) -> None:
+        """Returns that a forecast has no mask."""
+
     def _forecast(
         self, entries: Entries, mean, cov, call: Call, wanted: bool
     ) -> tuple[torch.Tensor, torch.Tensor, Sequence[torch.Tensor] | None]:
-        """Mean and covariance before the process noise is added, and where wanted A, M and B."""
+        """Returns mean and covariance before the process noise is added, and where wanted A, M and B."""
         raise NotImplementedError
 
     def _move(self, entries: Entries, states: torch.Tensor, call: Call) -> torch.Tensor:
-        """The transition of an ensemble ``[*B, E, S]``."""
+        """Returns the transition of an ensemble ``[*B, E, S]``."""
         with deterministic(self.module):  # also of networks that do not know about calls
             return run_module(self.module, {**entries, self.ensemble_key: states}, call)[self.forecast_ensemble_key]
 
@@ -175,7 +178,7 @@ class GaussianAnalysis(Update):
         predicted_key: NestedKey = ("forecast", "observation"),
     ):
         check_module("observation", observation)
-        refuse_random_layers(observation, type(self).__name__)
+        check_no_random_layers(observation, type(self).__name__)
         in_keys = [(forecast_prefix, "mean"), (forecast_prefix, "cov"), observation_key, noise_variance_key]
         further, optional = further_keys([observation], [*in_keys, ensemble_key])
         out_keys = [(belief_prefix, name) for name in ("mean", "cov", "var")]
@@ -188,7 +191,7 @@ class GaussianAnalysis(Update):
         self.reading_keys, self.observed_key = self.in_keys[2:4], unravel_key(observed_key)
 
     def on_entries(self, entries, call):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         mean, cov, observation, noise = (self.required(entries, key) for key in self.in_keys[:4])
         if observation.ndim > mean.ndim:
             observation = mean_reading(self.reading_space, observation, entries.get(self.observed_key))
@@ -204,18 +207,17 @@ class GaussianAnalysis(Update):
         return observation - predicted if space is None else space.innovation(observation, predicted, observed)
 
     def _moved(self, mean: torch.Tensor, update: GaussianUpdate) -> GaussianUpdate:
-        """An update of the tangents at ``mean``, as a point and the covariance of the tangents there."""
+        """Returns an update of the tangents at ``mean``, as a point and the covariance of the tangents there."""
         if self.space is None:
             return update._replace(mean=mean + update.mean)
-        cov = update.cov
-        if not is_flat(self.space):
-            turn = self.space.right_jacobian(update.mean)
-            cov = turn @ cov @ turn.mT
-            cov = (cov + cov.mT) / 2
-        return update._replace(mean=self.space.plus(mean, update.mean), cov=cov)
+        if is_flat(self.space):
+            return update._replace(mean=self.space.plus(mean, update.mean))
+        move, turn = self.space.exp_and_jacobian(update.mean)
+        cov = sandwich(turn, update.cov)
+        return update._replace(mean=self.space.compose(mean, move), cov=(cov + cov.mT) / 2)
 
     def reading_dims(self, entries, call):
-        """O, as the model predicts it."""
+        """Returns O, as the model predicts it."""
         mean = self.required(entries, self.in_keys[0])
         size = self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[0].shape[-1]
         return [size, size if self.reading_space is None else self.reading_space.tangent_dim]
@@ -231,16 +233,19 @@ class GaussianAnalysis(Update):
     def _update(
         self, entries: Entries, mean, cov, observation, noise, call: Call
     ) -> tuple[GaussianUpdate, torch.Tensor | None]:
-        """The update, and the mask that it used."""
+        """Returns the update, and the mask that it used."""
         raise NotImplementedError
 
     def _observe(self, entries: Entries, states: torch.Tensor, call: Call) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Predicted observations ``[*B, E, O]`` of an ensemble, and the mask after the model ran."""
+        """Returns the predicted observations ``[*B, E, O]`` of an ensemble, and the mask after the model ran."""
         with deterministic(self.module):
             written = run_module(self.module, {**entries, self.ensemble_key: states}, call)
+        return written[self.predicted_key], self.mask_of(entries, written)
+
+    def mask_of(self, entries: Entries, written: Entries) -> torch.Tensor | None:
+        """Returns the mask of what the observation model was given, and of what it wrote."""
         given, made = entries.get(self.observed_key), written.get(self.observed_key)
-        mask = given if made is None else made if given is None else made & given
-        return written[self.predicted_key], told(self.reading_space, mask)
+        return narrowed_mask(self.reading_space, given if made is None else made if given is None else made & given)
 
 
 def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: float = 1.0) -> tuple[torch.Tensor, ...]:
@@ -265,7 +270,7 @@ def further_keys(
     return list(dict.fromkeys(needed)), list(dict.fromkeys(optional))
 
 
-def refuse_random_layers(module: nn.Module, owner: str) -> None:
+def check_no_random_layers(module: nn.Module, owner: str) -> None:
     """Raises where a module would stay random although its stochastic networks run their deterministic forward.
 
     Raises:

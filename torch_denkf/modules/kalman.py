@@ -56,7 +56,7 @@ class MomentPrior(Initial):
         check_covariance("cov", self.cov, self.state_dim)
 
     def compute(self, *, batch_size):
-        """The belief."""
+        """Returns the belief."""
         values = (self.mean, self.cov, self.cov.diagonal())
         return tuple(value.expand(*batch_size, *value.shape) for value in values)
 
@@ -101,7 +101,7 @@ class GaussianAround(Initial):
             self.input_dim = space.point_dim
 
     def compute(self, state):
-        """The belief."""
+        """Returns the belief."""
         mean = state.to(self.std.dtype)
         variance = self.std.square().expand(*mean.shape[:-1], -1) if self.space else self.std.square().expand_as(mean)
         return mean, variance.diag_embed(), variance
@@ -163,7 +163,7 @@ class LinearTransition(Transition):
             check_covariance("noise", self.noise, len(self.matrix))
 
     def parts(self):
-        """The noise, if it is a module."""
+        """Returns the noise, if it is a module."""
         return {"noise": self.noise} if isinstance(self.noise, nn.Module) else {}
 
     def on_entries(self, entries, call):
@@ -266,11 +266,11 @@ class KalmanAnalysis(Update):
         return product_of_known(self.matrix, state)
 
     def reading_dims(self, entries, call):
-        """O, the rows of H."""
+        """Returns O, the rows of H."""
         return [len(self.matrix)] * len(self.reading_keys)
 
     def compute(self, mean, cov, observation, *rest):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         *noise, observed = rest
         noise = noise[0] if noise else self.noise.expand(*mean.shape[:-1], *self.noise.shape)
         if observation.ndim > mean.ndim:

@@ -37,7 +37,7 @@ class SpatialSoftArgmax(nn.Module):
         self.log_sharpness = nn.Parameter(torch.zeros(channels, 1))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Mean places."""
+        """Returns mean places."""
         height, width = features.shape[-2:]
         place = (features.flatten(-2) * self.log_sharpness.exp()).softmax(-1).unflatten(-1, (height, width))
         columns, rows = (torch.linspace(-1, 1, n, device=place.device, dtype=place.dtype) for n in (width, height))
@@ -55,7 +55,7 @@ class KeypointTrunk(nn.Module):
         channels: of the convolutions, of stride 2 each; group normalisation and ReLU behind each.
         keypoints: channels whose places are read.
         features: width of the output.
-        pooled: the last map is averaged over a grid of so many rows and columns beside the keypoints.
+        pooled: the last map is averaged over a grid of so many rows and columns besides the keypoints.
 
     Shape:
         ``[N, C, H, W]`` to ``[N, features]``, for any H and W from ``2 ** (len(channels) - 1)`` on.
@@ -94,7 +94,7 @@ class KeypointTrunk(nn.Module):
         self.mix = nn.Sequential(nn.Linear(2 * keypoints + widths[-1] * pooled**2, features), nn.ReLU())
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        """Features of images."""
+        """Returns features of images."""
         height, width = images.shape[-2:]
         rows = torch.linspace(-1, 1, height, device=images.device, dtype=images.dtype)
         columns = torch.linspace(-1, 1, width, device=images.device, dtype=images.dtype)

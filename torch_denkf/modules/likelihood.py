@@ -12,7 +12,7 @@ from torch import nn
 
 from torch_denkf._checks import check_choice, check_count
 from torch_denkf.functional.manifolds import Space, check_space
-from torch_denkf.modules.spaces import mean_reading, told
+from torch_denkf.modules.spaces import mean_reading, narrowed_mask
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import as_vector, mean_of_members
 from torch_denkf.submodel import Update
@@ -72,13 +72,13 @@ class GaussianLikelihood(Update):
         self.predicted_key = self.in_keys[0]
 
     def compute(self, predicted, reading, variance, observed=None, *, batch_size):
-        """The log-likelihoods."""
+        """Returns the log-likelihoods."""
         if variance.ndim > len(batch_size) + 1:
             raise ValueError(
                 f"GaussianLikelihood takes variances [*B, O]; {self.in_keys[2]!r} has shape {list(variance.shape)}. "
                 "Use DiagonalNoise or ConstantNoise."
             )
-        observed = told(self.reading_space, observed)
+        observed = narrowed_mask(self.reading_space, observed)
         if reading.ndim > len(batch_size) + 1:
             reading = mean_reading(self.reading_space, reading, observed)
         reading = reading.unsqueeze(-2)
@@ -203,7 +203,7 @@ class LearnedLikelihood(Update):
         return [self.encoding_dim, self.observation_dim][: len(self.reading_keys)]
 
     def compute(self, encoding, predicted, *rest, batch_size):
-        """The log-likelihoods."""
+        """Returns the log-likelihoods."""
         *readings, observed = rest
         encoding = mean_of_members(encoding, batch_size)
         if readings:

@@ -12,7 +12,7 @@ from torch_denkf.functional import ensemble_mean, ensemble_var, letkf, neighbour
 from torch_denkf.functional.inflation import relax_to_prior_spread
 from torch_denkf.functional.localisation import Neighbours, neighbours_of_taper
 from torch_denkf.modules.ensemble import EnsembleOptions, EnsembleUpdate
-from torch_denkf.modules.tensors import mean_of_members, refuse_trained
+from torch_denkf.modules.tensors import check_untrained, mean_of_members
 
 __all__ = ["LocalEnsembleAnalysis"]
 
@@ -84,7 +84,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         if isinstance(near, torch.Tensor):
             near = neighbours_of_taper(near, tile=tile)
         check_values("near's taper", near.taper, least=0)
-        refuse_trained("near", near.taper, _CHOSEN_ONCE)
+        check_untrained("near", near.taper, _CHOSEN_ONCE)
         self.register_buffer("index", near.index, persistent=False)
         self.register_buffer("taper", near.taper, persistent=False)
         self.tile = tile
@@ -99,7 +99,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         period: torch.Tensor | list[float] | None = None,
         **kwargs,
     ) -> LocalEnsembleAnalysis:
-        """From places, with Gaspari & Cohn's taper.
+        """Builds the analysis from places, with Gaspari & Cohn's taper.
 
         Args:
             states: places of the components, ``[S, D]``, in any unit.
@@ -112,12 +112,12 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         Raises:
             ValueError: if the radius is not positive, or asks for a gradient.
         """
-        refuse_trained("radius", radius, _CHOSEN_ONCE)
+        check_untrained("radius", radius, _CHOSEN_ONCE)
         period = None if period is None else torch.as_tensor(period, dtype=states.dtype)
         return cls(neighbours(states, observations, radius, period=period), **kwargs)
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         observation = mean_of_members(observation, predicted.shape[:-2])
         ensemble = self._analyse(forecast, predicted, observation, variance, observed, noise, 1)
         if self.relaxation:
@@ -144,7 +144,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         return moved.unflatten(-1, past.shape[-2:])
 
     def _analyse(self, ensemble, predicted, observation, variance, observed, noise, copies: int) -> torch.Tensor:
-        """The analysis of ``copies`` states side by side, rotated."""
+        """Returns the analysis of ``copies`` states side by side, rotated."""
         index, taper = self.index, self.taper
         if copies > 1:
             index, taper = index.repeat(copies, 1), taper.repeat(copies, 1)
@@ -162,7 +162,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
 
 
 def _diagnostics(predicted, observation, variance, observed) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Innovation, its normalised square and its log-likelihood, each observation by itself."""
+    """Returns innovation, its normalised square and its log-likelihood, each observation by itself."""
     if observed is not None:  # before anything is computed, so that a NaN behind the mask spoils no gradient
         predicted = torch.where(observed.unsqueeze(-2), predicted, 0)
         observation, variance = torch.where(observed, observation, 0), torch.where(observed, variance, 1)

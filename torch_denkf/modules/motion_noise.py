@@ -105,15 +105,15 @@ class NoisyTransition(Transition):
         return torch.randn(shape, device=device, dtype=dtype, generator=generator)
 
     def noise_sizes(self, ensemble, *_):
-        """E, and the state's size."""
+        """Returns E, and the state's size."""
         return {"members": ensemble.shape[-2], "state_dim": ensemble.shape[-1]}
 
     def parts(self):
-        """The transition and the noise module."""
+        """Returns the transition and the noise module."""
         return dict(self.module.items())
 
     def on_entries(self, entries, call):
-        """The forecast ensemble, and whatever else the transition writes."""
+        """Returns the forecast ensemble, and whatever else the transition writes."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, entries = self.required(entries, key), dict(entries)
         log_weights = entries.get(self.log_weight_key)
@@ -136,7 +136,7 @@ class NoisyTransition(Transition):
         return members.mean(-2) if log_weights is None else weighted_mean(members, log_weights)
 
     def _add(self, ensemble: torch.Tensor, entries: Entries, call: Call) -> torch.Tensor:
-        """The ensemble with process noise."""
+        """Returns the ensemble with process noise."""
         model = self.module["noise"]
         covariance = run_module(model, entries, call.part("noise"))[unravel_key(model.out_keys[0])]
         whole = ensemble.shape[-1] if self.space is None else self.space.tangent_dim

@@ -81,7 +81,7 @@ class DiagonalNoise(Sensor):
         )
 
     def compute(self, features, *, batch_size):
-        """The variances."""
+        """Returns the variances."""
         relative = 1 + self.module((mean_of_members(features, batch_size) - self.loc) / self.scale)
         return self.variance * relative**2 + self.floor
 
@@ -126,7 +126,7 @@ class ConstantNoise(Sensor):
             self.register_buffer("log_variance", log_variance)
 
     def compute(self, like, *, batch_size):
-        """The variances."""
+        """Returns the variances."""
         variance = self.log_variance.exp().to(torch.promote_types(like.dtype, self.log_variance.dtype))
         return variance.expand(*batch_size, -1)
 
@@ -163,6 +163,6 @@ class ScaledNoise(Wrapper, Sensor):
         self.factor = factor
 
     def on_entries(self, entries, call):
-        """The scaled variances or covariance."""
+        """Returns the scaled variances or covariance."""
         out, key = self.run_inside(entries, call), self.out_keys[0]
         return {**out, key: self.factor**2 * out[key]}

@@ -1,6 +1,6 @@
 r"""Weighted particles: their weights, resampling, the update.
 
-Weights are normalised log-weights ``[*B, E]`` beside the ensemble. The order of a step is
+Weights are normalised log-weights ``[*B, E]`` next to the ensemble. The order of a step is
 
     resample -- move -- observe -- weight
 
@@ -28,7 +28,7 @@ from torch_denkf.functional.resampling import effective_sample_size, jitter_copi
 from torch_denkf.functional.weighted import weighted_innovation
 from torch_denkf.modules.around import AugmentedBelief
 from torch_denkf.modules.likelihood import GaussianLikelihood
-from torch_denkf.modules.spaces import told
+from torch_denkf.modules.spaces import narrowed_mask
 from torch_denkf.running import check_module, reads, run_module
 from torch_denkf.submodel import Entries, Transition, Update
 
@@ -41,7 +41,7 @@ def with_weights(
     ensemble_key: NestedKey = ("belief", "ensemble"),
     log_weight_key: NestedKey = ("belief", "log_weight"),
 ) -> AugmentedBelief:
-    """An initial belief whose members are particles of equal weight.
+    """Returns an initial belief whose members are particles of equal weight.
 
     Args:
         initial: writes an ensemble ``[*B, E, S]``, see :mod:`torch_denkf.modules.belief`.
@@ -70,7 +70,7 @@ class ResampledTransition(Transition):
     missing frames particles and weights go on as they are.
 
     A particle that the motion throws out of the numbers (so far that its cube would leave the precision) loses its
-    weight to the others, and goes on beside the heaviest. ``"transport"`` averages particles: one that runs away while
+    weight to the others, and goes on next to the heaviest. ``"transport"`` averages particles: one that runs away while
     it has weight takes the others with it.
 
     Args:
@@ -152,7 +152,7 @@ class ResampledTransition(Transition):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """One uniform number, where the scheme needs it; for a jitter normal ones, too."""
+        """Names one uniform number, where the scheme needs it; for a jitter normal ones, too."""
         if self.scheme not in ("systematic", "soft"):
             return ()
         return ("uniform", "normal") if self.jitter else ("",)
@@ -170,15 +170,15 @@ class ResampledTransition(Transition):
         return {"uniform": uniform, "normal": torch.randn(shape, device=device, dtype=dtype, generator=generator)}
 
     def noise_sizes(self, particles, *_):
-        """E and S, from the particles."""
+        """Returns E and S, from the particles."""
         return {"members": particles.shape[-2], "state_dim": particles.shape[-1]}
 
     def parts(self):
-        """The transition."""
+        """Returns the transition."""
         return {"transition": self.module}
 
     def on_entries(self, entries, call):
-        """The forecast ensemble and its weights."""
+        """Returns the forecast ensemble and its weights."""
         (key, weight_key), out_weight_key = map(unravel_key, self.in_keys[:2]), unravel_key(self.out_keys[1])
         particles, log_weights = self.required(entries, key), self.required(entries, weight_key)
         past = self.required(entries, unravel_key(self.in_keys[2])) if self.has_past else None
@@ -220,7 +220,7 @@ class ResampledTransition(Transition):
         return wanted
 
     def _resample(self, particles, log_weights, past, noise):
-        """The particles, their weights, and the picked past."""
+        """Returns the particles, their weights, and the picked past."""
         if self.scheme is None:
             return particles, log_weights, past
         if self.scheme == "transport":
@@ -321,7 +321,7 @@ class ParticleAnalysis(Update):
             self.observed_key = likelihood.observed_key
 
     def compute(self, particles, prior, log_likelihood, *of_reading):
-        """The belief and the diagnostics."""
+        """Returns the belief and the diagnostics."""
         joint = prior + self.tempering * log_likelihood
         total = torch.logsumexp(joint, -1, keepdim=True)
         # The likelihood of nothing is one: without this, rounding would move weights that nothing has changed. Where no
@@ -339,7 +339,7 @@ class ParticleAnalysis(Update):
 
     def _innovation(self, prior, predicted, reading, variance, observed=None) -> tuple[torch.Tensor, torch.Tensor]:
         if self.reading_space is not None:
-            observed = told(self.reading_space, observed)
+            observed = narrowed_mask(self.reading_space, observed)
             predicted, reading = self.reading_space.align(predicted, reading, observed)
         if reading.ndim == predicted.ndim:
             reading = reading.mean(-2)

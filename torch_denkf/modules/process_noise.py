@@ -36,7 +36,7 @@ _BELIEF_MEAN, _FORECAST_NOISE = ("belief", "mean"), ("forecast", "noise")
 def as_process_noise(
     noise: TensorDictModuleBase | Sequence[float] | torch.Tensor | float, initial: TensorDictModuleBase
 ) -> TensorDictModuleBase:
-    """A module that writes Q: as it is, or made of standard deviations ``[S]`` or one number for all dimensions.
+    """Returns a module that writes Q: the given one, or one of standard deviations ``[S]`` or one for all dimensions.
 
     Args:
         noise: the module, or standard deviations in the state's units; 0 for a dimension without noise.
@@ -133,7 +133,7 @@ class CholeskyNoise(SubModel):
         self.register_buffer("rows", torch.tril_indices(dim, dim), persistent=False)
 
     def compute(self, features, *, batch_size):
-        """The covariance."""
+        """Returns the covariance."""
         if self.constant:
             raw = self.raw.to(torch.promote_types(features.dtype, self.raw.dtype)).expand(*batch_size, -1)
         else:
@@ -153,7 +153,7 @@ class NoiseThrough(Wrapper):
     place = "noise"
 
     def on_entries(self, entries, call):
-        """The covariance."""
+        """Returns the covariance."""
         written, key = self.run_inside(entries, call), self.out_keys[0]
         noise = written[key]
         matrix = self._matrix(entries).to(noise.dtype)
@@ -167,7 +167,7 @@ class NoiseThrough(Wrapper):
         return {**written, key: scaled @ matrix.mT}
 
     def _matrix(self, entries) -> torch.Tensor:
-        """G, ``[S, N]`` or ``[*B, S, N]``."""
+        """Returns G, ``[S, N]`` or ``[*B, S, N]``."""
         raise NotImplementedError
 
 

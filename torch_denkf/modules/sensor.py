@@ -89,7 +89,7 @@ class _Sensor(StochasticSensor):
         return measurement
 
     def _encode(self, measurement: torch.Tensor, seen: torch.Tensor | None) -> torch.Tensor:
-        """Features ``[N, F]`` of measurements ``[N, ...]``, of which ``seen`` ``[N, 1, ...]`` were observed."""
+        """Returns features ``[N, F]`` of measurements ``[N, ...]``, of which ``seen`` ``[N, 1, ...]`` were observed."""
         measurement = self._prepare(measurement)
         if seen is not None:
             # A frame that was not seen may hold NaN, which would poison the gradients even behind a mask.
@@ -100,7 +100,7 @@ class _Sensor(StochasticSensor):
         return self._encode(measurement, seen)
 
     def compute(self, measurement, observed=None, *, noise):
-        """The learned observations of every member, and the encoding if it is asked for."""
+        """Returns the learned observations of every member, and the encoding if it is asked for."""
         batch_ndim = measurement.ndim - self.event_ndim
         batch_size, event_shape = measurement.shape[:batch_ndim], measurement.shape[batch_ndim:]
         seen = None if observed is None else observed.any(-1).reshape(-1, *(1,) * self.event_ndim)

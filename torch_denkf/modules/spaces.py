@@ -7,10 +7,10 @@ from torch import Tensor
 
 from torch_denkf.functional.manifolds import Space
 
-__all__ = ["mean_and_tangents", "mean_reading", "told"]
+__all__ = ["mean_and_tangents", "mean_reading", "narrowed_mask"]
 
 
-def told(space: Space | None, observed: Tensor | None) -> Tensor | None:
+def narrowed_mask(space: Space | None, observed: Tensor | None) -> Tensor | None:
     """Narrows the mask of a reading to whole rotations and vectors, see :meth:`Space.told`."""
     return observed if space is None or observed is None else space.told(observed)[1]
 
@@ -25,7 +25,7 @@ def mean_reading(space: Space | None, samples: Tensor, observed: Tensor | None) 
 
 
 def mean_and_tangents(space: Space, ensemble: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-    """The mean ``[*B, P]`` of members, and the tangents ``[*B, E, D]`` to them, by two steps from a point near it.
+    """Returns the mean ``[*B, P]`` of members and the tangents ``[*B, E, D]`` to them, by two steps from nearby.
 
     For members that an update has just placed about ``start`` ``[*B, P]``; wide ones need more, see :meth:`Space.mean`.
     """

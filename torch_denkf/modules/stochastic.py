@@ -24,6 +24,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from torch_denkf._checks import check_choice, check_count, check_number
+from torch_denkf.functional.jacobians import jacobian_of_layers
 from torch_denkf.functional.kernels.dropped_relu import dropped_relu
 from torch_denkf.functional.kernels.random_bits import (
     balanced_bytes,
@@ -80,7 +81,7 @@ class FlipoutLinear(nn.Module):
 
     @property
     def perturbation_size(self) -> int:
-        """Number of standard-normal values in one perturbation of the weights."""
+        """Returns the number of standard-normal values in one perturbation of the weights."""
         return self.weight.numel() + self.bias.numel()
 
     def forward(self, x: torch.Tensor, signs=None, perturbation=None, *, sample: bool = True) -> torch.Tensor:
@@ -102,7 +103,7 @@ class FlipoutLinear(nn.Module):
         return mean + change * sign_out
 
     def kl(self) -> torch.Tensor:
-        """KL divergence of the weights' posterior from the prior, in nats, a scalar."""
+        """Returns the KL divergence of the weights' posterior from the prior, in nats, a scalar."""
         total = self.weight.new_zeros(())
         for mean, rho in ((self.weight, self.weight_rho), (self.bias, self.bias_rho)):
             std = F.softplus(rho) / self.prior_std
@@ -192,7 +193,7 @@ class StochasticMLP(nn.Module):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """The tensors that one call needs, see :class:`torch_denkf.modules.SubModel`."""
+        """Names the tensors that one call needs, see :class:`torch_denkf.modules.SubModel`."""
         if not self.noise_size or not self.sample:
             return ()
         return ("",) if self.layer == "dropout" else ("signs", "perturbation")
@@ -262,6 +263,15 @@ class StochasticMLP(nn.Module):
         out = run[-1][0](hidden)
         return (out, hidden) if with_hidden else out
 
+    def jacobian(self, x: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Returns the mean network's output and its Jacobian by the first ``size`` inputs, ``[*, out_features, size]``.
+
+        ``None`` where the activation's derivative is not known, see
+        :func:`~torch_denkf.functional.jacobians.jacobian_of_network`.
+        """
+        layers = [part for layer in self.layers for part in (layer, self.activation)][:-1]
+        return jacobian_of_layers(layers, x, size, (nn.Linear, FlipoutLinear))
+
     def _perturbation_sizes(self) -> list[int]:
         """Numbers of perturbed weights and biases; those of flipout's layers."""
         return [layer.perturbation_size for layer in self.layers if isinstance(layer, FlipoutLinear)]
@@ -281,7 +291,7 @@ class StochasticMLP(nn.Module):
         ]
 
     def kl(self) -> torch.Tensor:
-        """KL divergence of the weights from their prior, in nats; zero where the layers have none."""
+        """Returns the KL divergence of the weights from their prior, in nats; zero where the layers have none."""
         zero = next(self.layers.parameters()).new_zeros(())
         return sum((layer.kl() for layer in self.layers if isinstance(layer, FlipoutLinear)), zero)
 

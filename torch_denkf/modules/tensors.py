@@ -18,7 +18,7 @@ __all__ = [
     "check_dims",
     "mask_of",
     "mean_of_members",
-    "refuse_trained",
+    "check_untrained",
     "register_constant",
     "register_matrix",
     "register_location_and_scale",
@@ -27,7 +27,7 @@ __all__ = [
 
 
 def as_floating(value: Any, name: str = "the constant") -> Tensor:
-    """A floating tensor in memory of its own: a tensor keeps its precision, everything else gets torch's default one.
+    """Copies a value to a floating tensor: a tensor keeps its dtype, everything else gets torch's default one.
 
     Raises:
         TypeError: if it is neither a tensor nor numbers, or complex; ``name`` is the argument's.
@@ -43,7 +43,7 @@ def as_floating(value: Any, name: str = "the constant") -> Tensor:
         raise TypeError(f"{name} must be numbers, in a tensor or in lists of one length; got {value!r}") from error
     if tensor.is_complex():
         raise TypeError(f"{name} must be real; got {tensor.dtype}. Real and imaginary parts are two components each")
-    refuse_trained(name, tensor, "it is copied into a constant")
+    check_untrained(name, tensor, "it is copied into a constant")
     keeps = isinstance(value, Tensor) and tensor.is_floating_point()
     return tensor.detach().to(tensor.dtype if keeps else torch.get_default_dtype(), copy=True)
 
@@ -75,7 +75,7 @@ def register_matrix(
     check_values(name, matrix)
 
 
-def refuse_trained(name: str, value: Any, why: str) -> None:
+def check_untrained(name: str, value: Any, why: str) -> None:
     """Raises where what is kept as a constant asks for a gradient: it would be accepted and never trained.
 
     Raises:
@@ -109,7 +109,7 @@ def register_location_and_scale(
 
 
 def as_standard_deviations(name: str, value: Any) -> Tensor:
-    """Standard deviations ``[N]``, zero where there is none.
+    """Returns standard deviations ``[N]``, zero where there is none.
 
     Raises:
         ValueError: if they have another shape, or one is negative or not finite.
@@ -122,7 +122,7 @@ def as_standard_deviations(name: str, value: Any) -> Tensor:
 
 
 def as_vector(name: str, value: Any, size: int, *, above: float | None = None) -> Tensor:
-    """Finite numbers ``[size]``, of one number for all or one for each.
+    """Returns finite numbers ``[size]``, of one number for all or one for each.
 
     Raises:
         TypeError: if they are no numbers.
@@ -173,7 +173,7 @@ def variance_and_floor(
 
 
 def mask_of(observed_key: NestedKey, out_key: NestedKey) -> dict[NestedKey, NestedKey]:
-    """A mask that a module makes, and that of which it makes it, unravelled.
+    """Maps a mask that a module derives to the mask that it derives it from, unravelled.
 
     Raises:
         ValueError: if both have one key: what a step wrote would be taken for what was observed in the next.
@@ -187,5 +187,5 @@ def mask_of(observed_key: NestedKey, out_key: NestedKey) -> dict[NestedKey, Nest
 
 
 def mean_of_members(value: Tensor, batch_size: Sequence[int]) -> Tensor:
-    """The mean of ``[*B, E, N]`` over the members; ``[*B, N]`` as it is."""
+    """Returns the mean of ``[*B, E, N]`` over the members; ``[*B, N]`` as it is."""
     return value.mean(-2) if value.ndim > len(batch_size) + 1 else value

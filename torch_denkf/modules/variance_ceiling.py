@@ -56,7 +56,7 @@ class VarianceCeiling(SubModel):
         self.reached = False
 
     def on_entries(self, entries, call):
-        """The entries that change."""
+        """Returns the entries that change."""
         out = {}
         for key, kind in self.kinds:
             variance = entries.get(key)

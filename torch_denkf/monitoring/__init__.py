@@ -1,4 +1,4 @@
-"""Gates, monitors and signs: what a filter believes of a reading, and which sensor is not to be believed."""
+"""Gating of outliers, monitors of innovations and signs of sensor faults."""
 
 from torch_denkf.monitoring.black import BlackIsMissing
 from torch_denkf.monitoring.chi_square import detectable_bias as detectable_bias

@@ -15,25 +15,25 @@ IDENTITY = torch.arange(len(_LEVELS) + 2.0).repeat(2, 1)
 
 
 def check_observation_dim(expected: int, innovation: Tensor, name: str) -> None:
-    """Raise unless the innovations ``[*B, O]`` have as many components as ``name`` was told.
+    """Raises unless the innovations ``[*B, O]`` have the number of components that ``name`` was given.
 
     Raises:
         ValueError: if they have not.
     """
     if innovation.shape[-1] != expected:
         raise ValueError(
-            f"{name} was told observation_dim={expected}, and the reading has {innovation.shape[-1]} components; "
+            f"{name} was given observation_dim={expected}, and the reading has {innovation.shape[-1]} components; "
             f"pass observation_dim={innovation.shape[-1]}."
         )
 
 
 def empirical_quantile(values: Tensor, levels: Tensor) -> Tensor:
-    """Order statistics of ``[M]`` at ``levels``; ``torch.quantile`` takes no more than 16 million."""
+    """Returns order statistics of ``[M]`` at ``levels``; ``torch.quantile`` takes no more than 16 million."""
     return values.sort().values[(levels * (len(values) - 1)).round().long()]
 
 
 def chi_square_table(nis: Tensor, freedom: int) -> Tensor:
-    """Knots and heights ``[2, N]`` from ``nis`` ``[M]`` of clean data to chi-square values; beyond, the ratio stays."""
+    """Returns knots and heights ``[2, N]`` from ``nis`` ``[M]`` of clean data to chi-square; linear beyond."""
     levels = _levels(len(nis))
     measured = _rising(empirical_quantile(nis, levels).clamp_min(1e-9))
     expected = torch.tensor([chi_square_quantile(1 - level, freedom) for level in levels.tolist()])
@@ -42,7 +42,7 @@ def chi_square_table(nis: Tensor, freedom: int) -> Tensor:
 
 
 def score_table(values: Tensor) -> Tensor:
-    """Knots and heights ``[2, N]`` that map ``values`` ``[M]`` of clean data to standard normal scores.
+    """Returns knots and heights ``[2, N]`` that map ``values`` ``[M]`` of clean data to standard normal scores.
 
     Beyond the largest a standard deviation of the data is a score of one.
     """
@@ -67,12 +67,12 @@ def sign_limits(values: Tensor, rate: float, floor: Tensor, margin: float) -> Te
 
 
 def _levels(count: int) -> Tensor:
-    """Those that so many values can tell, rising."""
+    """Returns the levels that a sample of this size resolves, ascending."""
     levels = torch.tensor(_LEVELS, dtype=torch.float64)
     return levels.clamp(max=1 - 1 / (count + 1)) + 1e-9 * torch.arange(len(levels))
 
 
 def _rising(values: Tensor) -> Tensor:
-    """With steps between equal ones that float32 can tell."""
+    """Separates equal values by steps that float32 can tell."""
     step = 1e-5 * values.abs().max().clamp_min(1e-9)
     return values.cummax(0).values + step * torch.arange(len(values))

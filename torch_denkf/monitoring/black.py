@@ -15,7 +15,7 @@ __all__ = ["BlackIsMissing"]
 class BlackIsMissing(Sensor):
     """Marks pictures that are black all over as not observed: no scene is.
 
-    A sensor reads something in a black picture, too, and a filter believes it. Put this module in front of the sensor,
+    A sensor reads something in a black picture, too, and a filter uses it. Put this module in front of the sensor,
     ``TensorDictSequential(BlackIsMissing(), sensor)``, and let the filter read its mask, ``observed_key="seen"``. The
     filter then goes by its motion until the camera is back, and its spread grows.
 
@@ -49,7 +49,7 @@ class BlackIsMissing(Sensor):
         self.threshold, self.marks = threshold, mask_of(observed_key, out_key)
 
     def compute(self, pixels: Tensor, before: Tensor | None = None) -> Tensor:
-        """The mask ``[*B, 1]``."""
+        """Returns the mask ``[*B, 1]``."""
         white = 1.0 if pixels.is_floating_point() else 255
         seen = (pixels.flatten(-3).amax(-1, keepdim=True) / white) > self.threshold
         return seen if before is None else seen & before

@@ -14,7 +14,7 @@ _LONGEST = 20.0  # largest threshold that is looked for
 
 
 def normal_score(p_value: Tensor, largest: float = 4.0) -> Tensor:
-    """The standard normal number that is exceeded with probability ``p_value``.
+    """Returns the standard normal number that is exceeded with probability ``p_value``.
 
     Args:
         p_value: in [0, 1], any shape.
@@ -30,7 +30,7 @@ def normal_score(p_value: Tensor, largest: float = 4.0) -> Tensor:
 
 
 def cusum_step(total: Tensor, score: Tensor, reference: float) -> Tensor:
-    """One step of a one-sided cumulative sum, ``max(0, total + score - reference)`` (Page 1954).
+    """Runs one step of a one-sided cumulative sum, ``max(0, total + score - reference)`` (Page 1954).
 
     Args:
         total: of the steps before, any shape; 0 at the beginning.
@@ -45,7 +45,7 @@ def cusum_step(total: Tensor, score: Tensor, reference: float) -> Tensor:
 
 
 def cusum_run_length(threshold: float, reference: float = 0.5, shift: float = 0.0) -> float:
-    """Average steps until a one-sided cumulative sum of N(shift, 1) scores exceeds its threshold.
+    """Returns the average steps until a one-sided cumulative sum of N(shift, 1) scores exceeds its threshold.
 
     The sum is taken for a Markov chain on a fine grid (Brook & Evans 1972, Biometrika 59), which is exact in the limit.
 
@@ -69,7 +69,7 @@ def cusum_run_length(threshold: float, reference: float = 0.5, shift: float = 0.
 
 
 def cusum_threshold(run_length: float, reference: float = 0.5) -> float:
-    """The threshold with which a cumulative sum gives a false alarm in ``run_length`` steps on average.
+    """Returns the threshold with which a cumulative sum gives a false alarm in ``run_length`` steps on average.
 
     Raises:
         ValueError: if ``run_length`` is not larger than 2, or beyond what a threshold of 20 gives.

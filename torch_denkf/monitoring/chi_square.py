@@ -14,7 +14,7 @@ __all__ = ["chi_square_p_value", "chi_square_quantile", "detectable_bias", "nonc
 
 
 def chi_square_p_value(value: Tensor, freedom: float | Tensor) -> Tensor:
-    """Probability that a chi-square variable is larger than ``value``.
+    """Returns the probability that a chi-square variable is larger than ``value``.
 
     Args:
         value: not negative, any shape: for example a normalised innovation squared.
@@ -37,7 +37,7 @@ def chi_square_p_value(value: Tensor, freedom: float | Tensor) -> Tensor:
 
 
 def chi_square_quantile(p_value: float, freedom: float) -> float:
-    """The value that a chi-square variable exceeds with probability ``p_value``.
+    """Returns the value that a chi-square variable exceeds with probability ``p_value``.
 
     Raises:
         ValueError: if ``p_value`` is not in (0, 1), or ``freedom`` is not positive.
@@ -52,7 +52,7 @@ def chi_square_quantile(p_value: float, freedom: float) -> float:
 
 
 def noncentral_p_value(value: float, freedom: float, noncentrality: float) -> float:
-    """Probability that a non-central chi-square variable is larger than ``value``.
+    """Returns the probability that a non-central chi-square variable is larger than ``value``.
 
     It is a Poisson mixture of chi-square variables, with two more degrees of freedom for each count.
 
@@ -76,7 +76,7 @@ def noncentral_p_value(value: float, freedom: float, noncentrality: float) -> fl
 
 
 def detectable_bias(freedom: float, false_alarm_rate: float, *, power: float = 0.9, window: int = 1) -> float:
-    """The smallest constant bias of innovations that a windowed chi-square test notices.
+    """Returns the smallest constant bias of innovations that a windowed chi-square test notices.
 
     The sum of the normalised innovations squared over ``window`` steps has ``window * freedom`` degrees of freedom; a
     bias b in each makes it non-central by ``window * b^T S^-1 b``.
@@ -110,7 +110,7 @@ def _double(value: float) -> Tensor:
 
 
 def _root(rises: Callable[[float], float]) -> float:
-    """Where a function that rises from below zero crosses it, for positive arguments."""
+    """Finds the root of a function that rises from below zero, for positive arguments."""
     low, high = 0.0, 1.0
     while rises(high) < 0:
         low, high = high, 2 * high

@@ -23,7 +23,7 @@ __all__ = ["Gated", "Monitored"]
 
 
 class Monitored(Filter):
-    """A filter with a monitor behind its analyses: beside the belief it writes an alarm, and what speaks for it.
+    """A filter with a monitor behind its analyses: next to the belief it writes an alarm, and what speaks for it.
 
     It is a :class:`Filter` itself: steps, sequences, masks, resets, policies, transforms, replay buffers and compiled
     steps work as with any other. The belief is that of the filter, bit for bit. The modules are the filter's own, not
@@ -76,7 +76,7 @@ class Monitored(Filter):
 
     @property
     def monitor(self) -> InnovationMonitor:
-        """What watches."""
+        """Returns the monitor."""
         return self[self._place]
 
     def calibrate(self, clean: Sequence[TensorDictBase], **options) -> Monitored:
@@ -169,7 +169,7 @@ class Gated(Filter):
 
     @property
     def gates(self) -> list[GatedAnalysis]:
-        """The gated analyses, in order."""
+        """Returns the gated analyses, in order."""
         return [module for module in self.modules() if isinstance(module, GatedAnalysis)]
 
     def calibrate(self, clean: Sequence[TensorDictBase], **options) -> Gated:
@@ -190,7 +190,7 @@ class Gated(Filter):
 
 
 def _with_past(part: torch.nn.Module) -> bool:
-    """Whether a module observes states of the past, or present and past as one."""
+    """Returns True if a module observes states of the past, or present and past as one."""
     return isinstance(part, StateObservation) and part.state_dim is not None
 
 
@@ -203,26 +203,27 @@ def _check_filter(name: str, filter: object) -> None:
 
 
 def _analyses(module: TensorDictModuleBase) -> Iterator[Update]:
-    """The analyses of a module of a filter that can be gated."""
+    """Yields the analyses of a module of a filter that can be gated."""
     yield from filter(can_be_gated, in_sequences(module))
 
 
 def _with(module: TensorDictModuleBase, old: SubModel, new: SubModel) -> TensorDictModuleBase:
-    """The module, or a plain sequence in which one module is replaced."""
+    """Returns the module, or a plain sequence in which one module is replaced."""
     if not is_sequence(module):
         return new if module is old else module
     return TensorDictSequential(OrderedDict((name, _with(part, old, new)) for name, part in named_modules_of(module)))
 
 
 def _dim(filter: Filter, analysis: Update) -> int:
-    """How many components an analysis' reading has."""
+    """Returns the size of an analysis' reading."""
     noise = set(map(unravel_key, analysis.reading_keys[1:]))
     for part in (part for _, module in filter.structure.modules for part in in_sequences(module)):
         dim = role(part, Sensor).observation_dim
         if dim is not None and not noise.isdisjoint(writes(part)):
             return dim
     try:
-        return analysis.reading_dims({}, Call(torch.Size()))[0]
+        found = analysis.reading_dims({}, Call(torch.Size()))[0]
+        return found if isinstance(found, int) else found[-1]
     except KeyError:
         raise ValueError(
             f"how many components the reading of {type(analysis).__name__} has is not known; pass observation_dim"
@@ -230,7 +231,7 @@ def _dim(filter: Filter, analysis: Update) -> int:
 
 
 def _with_state(initial: TensorDictModuleBase, owners: Sequence[InnovationMonitor | GatedAnalysis]) -> AugmentedBelief:
-    """An initial belief, and the entries that other modules carry on.
+    """Returns an initial belief, and the entries that other modules carry on.
 
     Args:
         initial: the initial belief.

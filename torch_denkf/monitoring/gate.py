@@ -1,4 +1,4 @@
-"""An analysis that believes a reading as far as its last innovations deserve it."""
+"""An analysis with gating: outliers are rejected, or their variances enlarged."""
 
 from __future__ import annotations
 
@@ -7,20 +7,19 @@ from collections.abc import Sequence
 from typing import Literal, TypedDict, TypeGuard
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import TensorDictBase, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.imperfect import Visible
+from torch_denkf.imperfect.mixed import wider_forecast, wider_past, with_draws, with_noise_from
 from torch_denkf.modules.around import Around
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.monitoring._calibration import IDENTITY, check_observation_dim, chi_square_table, empirical_quantile
 from torch_denkf.monitoring.chi_square import chi_square_quantile
-from torch_denkf.monitoring.gating import adapt, disbelief, spread_about_mean
+from torch_denkf.monitoring.gating import adapt, disbelief
 from torch_denkf.monitoring.innovation_tests import interpolate
-from torch_denkf.running import random_parts
-from torch_denkf.smoothers.past import LaggedAnalysis
-from torch_denkf.submodel import Call, Entries, SubModel, Update, flat_noise
+from torch_denkf.submodel import Call, Entries, Update
 
 __all__ = ["GateOptions", "GatedAnalysis"]
 
@@ -29,17 +28,17 @@ _LARGEST_FACTOR = 1e6  # on variances, up or down: what adaptation may reach
 
 
 class GateOptions(TypedDict, total=False):
-    """What :class:`GatedAnalysis` takes beside the analysis.
+    """Arguments of :class:`GatedAnalysis` besides the analysis.
 
     Attributes:
-        response: what happens to a reading that is not believed: ``"reject"`` takes it out, ``"student"`` and
+        response: what happens to an outlier: ``"reject"`` takes it out, ``"student"`` and
             ``"huber"`` enlarge its variances, see :func:`~torch_denkf.monitoring.gating.disbelief`; ``"student"`` by
             default. ``"reject"`` may take surprising motions for faults, and the belief then runs away.
         window: observed steps whose normalised innovations squared are summed up; 3 by default.
         rate: probability that the sum of a sound sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
             acts.
         freedom: of Student's t; 4 by default.
-        patience: after so many steps in a row at which a reading was not believed the gate opens: the forecast, and the
+        patience: after so many steps in a row at which a reading was rejected the gate opens: the forecast, and the
             past states that are carried next to it, are spread until they reach the reading, and the window is emptied.
             Set more than the longest fault has readings; 50 by default.
         by_component: whether each component of the reading is judged by itself; for ensembles alone, False by default.
@@ -63,7 +62,7 @@ class GateOptions(TypedDict, total=False):
 
 
 def can_be_gated(analysis: nn.Module) -> TypeGuard[Update]:
-    """Whether a module is an analysis that says where its forecast, its reading and its diagnostics are."""
+    """Returns True for an analysis with keys of forecast, reading and diagnostics."""
     if isinstance(analysis, Visible):
         return analysis.kind != "particles" and can_be_gated(analysis.module)
     wrapped = isinstance(analysis, Around) and not analysis.updates_ensemble
@@ -81,14 +80,14 @@ class GatedAnalysis(Around):
     The analysis runs twice: as it would, to see the innovation, and then with the variances, mask and spread that
     follow. With ``rate=0`` and no adaptation the second gives bit for bit what the analysis gives.
 
-    What is written beside the belief, K being the number of components with ``by_component`` and else 1:
+    What is written next to the belief, K being the number of components with ``by_component`` and else 1:
 
     ========================= ============ ============================================================================
     entry                     shape        content
     ========================= ============ ============================================================================
     (key, ``terms``)          ``[W,K,2]``  normalised innovations squared of the last observed steps, the latest first,
                                            and their degrees of freedom
-    (key, ``shut``)           ``[K]``      steps in a row at which a reading was not believed
+    (key, ``shut``)           ``[K]``      steps in a row at which a reading was rejected
     (key, ``log_noise``)      ``[K]``      logarithm of the adapted factor on the variances
     (key, ``log_inflation``)  ``[1]``      logarithm of the adapted factor on the forecast's variances
     (key, ``factor``)         ``[K]``      factor on the variances by which the gate answered; infinite where rejected
@@ -97,7 +96,7 @@ class GatedAnalysis(Around):
     (key, ``part_nis``)       ``[K]``      of each component by itself
     ========================= ============ ============================================================================
 
-    A reading that was rejected is believed again when the sum falls to what one in twenty exceeds.
+    Hysteresis: after a rejection, readings are accepted again when the sum falls to what one in twenty exceeds.
 
     The diagnostics of the analysis, such as ``("info", "nis")``, are those of the second run. A filter needs the state
     to begin somewhere: :class:`~torch_denkf.monitoring.Gated` sees to that.
@@ -106,7 +105,7 @@ class GatedAnalysis(Around):
         analysis: :class:`EnsembleAnalysis`, :class:`LocalEnsembleAnalysis`, :class:`KalmanAnalysis`,
             :class:`EKFAnalysis` or :class:`UKFAnalysis`; :class:`~torch_denkf.imperfect.Visible` of one of these, whose
             readings the gate does not count while their probability of being about the state is below one half; or a
-            :class:`LaggedAnalysis`, whose past a reading then corrects as far as it is believed. Its keys and its noise
+            :class:`LaggedAnalysis`, whose past a reading then corrects likewise. Its keys and its noise
             are kept.
         observation_dim: O, components of the reading.
         **options: see :class:`GateOptions`.
@@ -180,7 +179,7 @@ class GatedAnalysis(Around):
         check_number("adapt_inflation", adapt_inflation, least=0, below=1)
         claimed = None
         if isinstance(inside, KalmanAnalysis) and inside.noise is not None:
-            claimed, read = inside.noise, _with_noise_from((gate_prefix, "claimed"), inside)
+            claimed, read = inside.noise, with_noise_from((gate_prefix, "claimed"), inside)
             analysis = analysis.around(read) if isinstance(analysis, Visible) else read
         state = [(gate_prefix, name) for name in ("terms", "shut", "log_noise", "log_inflation")]
         further = [(gate_prefix, name) for name in ("factor", "nis", "innovation", "part_nis")]
@@ -205,7 +204,7 @@ class GatedAnalysis(Around):
         self.register_buffer("usual", torch.tensor([torch.inf, *usual]))
 
     def initial_state(self, batch_size: Sequence[int], *, device=None, dtype=None) -> list[Tensor]:
-        """The state before anything was observed, in the order of ``state_keys``."""
+        """Returns the state before anything was observed, in the order of ``state_keys``."""
         count = self.parts_count
         sizes = ((self.window, count, 2), (count,), (count,), (1,))
         return [torch.zeros(*batch_size, *size, device=device, dtype=dtype) for size in sizes]
@@ -213,7 +212,7 @@ class GatedAnalysis(Around):
     # ------------------------------------------------------------------------------------------------------ one step
 
     def on_entries(self, entries, call):
-        """The belief, the diagnostics and the state."""
+        """Returns the belief, the diagnostics and the state."""
         terms, shut, log_noise, log_inflation = (self.required(entries, key) for key in self.state_keys)
         plain = self.with_mask(self._with_noise(entries, call), call)
         if self.of_ensemble:
@@ -240,7 +239,7 @@ class GatedAnalysis(Around):
         if self.rate:
             evidence, total = terms.sum(-3).unbind(-1)
             limit = self.limits[total.long()] * self.slack
-            if rejects:  # what was rejected is believed again when it fits well, not when it is just within the limit
+            if rejects:  # hysteresis: accepted again when it fits well, not when it is just within the limit
                 limit = torch.where(shut > 0, self.usual[total.long()], limit)
             limit = limit.to(dtype)
             factor = torch.where(seen, disbelief(evidence, limit, self.response, freedom=self.freedom), 1)
@@ -255,7 +254,8 @@ class GatedAnalysis(Around):
             if rejects:
                 seen = seen & ~doubted  # an outlier is no measure of the noise
                 wider = torch.where(seen.any(-1, keepdim=True), wider, 1)
-            spread = self._with_past(self._wider(plain, wider), reach)
+            inside = self.module.module if isinstance(self.module, Visible) else self.module
+            spread = wider_past(inside, self._wider(plain, wider), reach)
             out = (
                 self._without(spread, call, doubted) if rejects else self._analyse(self._noisier(spread, factor), call)
             )
@@ -277,19 +277,15 @@ class GatedAnalysis(Around):
         return (self.module.on_aligned if self.of_ensemble else self.module.on_entries)(entries, call)
 
     def _with_noise(self, entries: Entries, call: Call) -> Entries:
-        """The entries with the random numbers that both runs share, and the variances that a Kalman analysis holds."""
+        """Returns the entries with the random numbers that both runs share, and variances of a Kalman analysis."""
         entries = dict(entries)
         if self.claimed is not None:
             mean = self.required(entries, self.in_keys[0])
             entries[self.noise_variance_key] = self.claimed.expand(*mean.shape[:-1], *self.claimed.shape)
-        for place, part in random_parts(self.module, call.place) if call.sample else ():
-            values = [self.required(entries, key) for key in part.in_keys]
-            noise = SubModel._noise(part, entries, values, call._replace(place=place))  # as drawn: used twice
-            entries.update(flat_noise(noise, place))
-        return entries
+        return with_draws(self.module, entries, call)
 
     def _parts(self, entries: Entries, nis: Tensor, innovation: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised innovations squared ``[*B, K]``, and how many components were observed in each."""
+        """Returns normalised innovations squared ``[*B, K]``, and how many components were observed in each."""
         mask = entries.get(self.observed_key)
         observed = torch.ones_like(innovation) if mask is None else mask.expand(innovation.shape).to(nis.dtype)
         if isinstance(self.module, Visible):  # what is not about the state says nothing about the sensor
@@ -304,37 +300,18 @@ class GatedAnalysis(Around):
         return torch.where(seen, innovation.square() / spread, 0), observed
 
     def _noisier(self, entries: Entries, factor: Tensor) -> Entries:
-        """The entries with variances ``[*B, O]`` or a covariance ``[*B, O, O]`` times a factor ``[*B, K]``."""
+        """Returns the entries with variances ``[*B, O]`` or a covariance ``[*B, O, O]`` times a factor ``[*B, K]``."""
         noise = self.required(entries, self.noise_variance_key)
         if noise.ndim > factor.ndim:
             factor = factor.unsqueeze(-1)
         return {**entries, self.noise_variance_key: noise * factor}
 
     def _wider(self, entries: Entries, factor: Tensor) -> Entries:
-        """The entries with the forecast's covariance times a factor ``[*B, 1]``."""
-        if not self.of_ensemble:
-            key = self.module.in_keys[1]
-            return {**entries, key: entries[key] * factor.unsqueeze(-1)}
-        keys = self.module.in_keys[:2]  # states, and what is predicted of them, in plain numbers
-        spaces = (self.module.space, None)
-        wider = {key: spread_about_mean(entries[key], factor.sqrt(), on) for key, on in zip(keys, spaces, strict=True)}
-        return {**entries, **wider}
-
-    def _with_past(self, entries: Entries, factor: Tensor) -> Entries:
-        """The entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
-        inside = self.module.module if isinstance(self.module, Visible) else self.module
-        if not isinstance(inside, LaggedAnalysis):
-            return entries
-        key = inside.in_keys[-1]
-        past, space = entries[key], self.module.space
-        if space is not None:
-            of_times = spread_about_mean(past.movedim(-2, -3), factor.sqrt().unsqueeze(-2), space)
-            return {**entries, key: of_times.movedim(-3, -2)}
-        wider = spread_about_mean(past.flatten(-2), factor.sqrt())
-        return {**entries, key: wider.unflatten(-1, past.shape[-2:])}
+        """Returns the entries with the forecast's covariance times a factor ``[*B, 1]``."""
+        return wider_forecast(self.module, entries, factor, members=self.of_ensemble)
 
     def _without(self, entries: Entries, call: Call, rejected: Tensor) -> Entries:
-        """What the analysis writes without what is rejected ``[*B, K]``."""
+        """Runs the analysis without the rejected readings ``[*B, K]``."""
         mask = entries.get(self.observed_key)
         kept = ~rejected if mask is None else mask & ~rejected
         return self._analyse({**entries, self.observed_key: kept}, call)
@@ -374,24 +351,3 @@ class GatedAnalysis(Around):
             found = float(empirical_quantile(ratio[:, part], torch.tensor([1 - self.rate])))
             self.slack[part] = margin * max(1.0, found)
         return self
-
-
-def _with_noise_from(key: NestedKey, analysis: KalmanAnalysis) -> KalmanAnalysis:
-    """A Kalman analysis that shares the matrix of another, and reads the noise that the other holds."""
-    keys = analysis.in_keys
-    changed = KalmanAnalysis(
-        analysis.matrix.detach(),
-        None,
-        inflation=analysis.inflation,
-        reading_space=analysis.reading_space,
-        observation_key=keys[2],
-        noise_variance_key=key,
-        observed_key=analysis.observed_key,
-        forecast_prefix=keys[0][0],
-        belief_prefix=analysis.out_keys[0][0],
-        info_prefix=analysis.info_prefix,
-    )
-    if isinstance(analysis.matrix, nn.Parameter):
-        del changed.matrix
-    changed.matrix = analysis.matrix
-    return changed

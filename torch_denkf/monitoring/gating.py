@@ -1,4 +1,4 @@
-"""How far a reading is believed, from its own and the last innovations."""
+"""Gating of a reading by its own and the last innovations."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from torch_denkf.functional.manifolds import Space
-
-__all__ = ["Response", "adapt", "disbelief", "spread_about_mean"]
+__all__ = ["Response", "adapt", "disbelief"]
 
 Response = Literal["reject", "student", "huber"]
 
 
 def disbelief(evidence: Tensor, limit: Tensor, response: Response, *, freedom: float = 4.0) -> Tensor:
-    r"""Factor on a reading's variances: 1 up to the limit, and from there on the larger, the less it is believed.
+    r"""Returns the factor on a reading's variances: 1 up to the limit, and growing with the evidence from there on.
 
     ============== ===================================== =============================================================
     response       beyond the limit l                    so that an outlier's pull
@@ -48,7 +46,7 @@ def disbelief(evidence: Tensor, limit: Tensor, response: Response, *, freedom: f
 
 
 def adapt(log_factor: Tensor, nis: Tensor, freedom: Tensor, rate: float, *, largest: float = 9.0) -> Tensor:
-    r"""One step of stochastic approximation: a factor on a variance grows while innovations are too large.
+    r"""Runs one step of stochastic approximation: a factor on a variance grows while innovations are too large.
 
     :math:`\log \alpha \leftarrow \log \alpha + \eta (\mathrm{nis} / O - 1)` rests where the normalised innovation
     squared has its expected mean O (Robbins & Monro 1951), which it has with the true variance.
@@ -66,13 +64,3 @@ def adapt(log_factor: Tensor, nis: Tensor, freedom: Tensor, rate: float, *, larg
     """
     ratio = (nis / freedom.clamp_min(1)).clamp_max(largest)
     return torch.where(freedom > 0, log_factor + rate * (ratio - 1), log_factor)
-
-
-def spread_about_mean(members: Tensor, factor: Tensor, space: Space | None = None) -> Tensor:
-    """Members ``[*B, E, N]``, their distances from the mean times ``factor`` ``[*B, 1]``; bit-equal for 1."""
-    factor = factor.unsqueeze(-2)
-    if space is not None:
-        center = space.mean(members).unsqueeze(-2)
-        return torch.where(factor == 1, members, space.plus(center, factor * space.minus(members, center)))
-    mean = members.mean(-2, keepdim=True)
-    return torch.where(factor == 1, members, mean + factor * (members - mean))

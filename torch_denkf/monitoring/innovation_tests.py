@@ -1,4 +1,4 @@
-"""What the past innovations of one sensor say together: their mean size, their drift, their memory."""
+"""Tests of one sensor's past innovations: mean size, drift, autocorrelation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["InnovationTests", "InnovationWindow", "innovation_tests", "interpola
 
 
 class InnovationWindow(NamedTuple):
-    """What is remembered of one sensor's innovations.
+    """Statistics of one sensor's past innovations.
 
     Attributes:
         terms: of the last W observed steps, the latest first, ``[*B, W, 4]``: normalised innovation squared, its
@@ -26,7 +26,7 @@ class InnovationWindow(NamedTuple):
 
 
 class InnovationTests(NamedTuple):
-    """What :func:`innovation_tests` returns, ``[*B, 1]`` each.
+    """Result of :func:`innovation_tests`, ``[*B, 1]`` each.
 
     Attributes:
         p_value: of the mean normalised innovation squared over the window, under its chi-square distribution.
@@ -38,7 +38,7 @@ class InnovationTests(NamedTuple):
 
 
 def interpolate(value: Tensor, knots: Tensor, heights: Tensor) -> Tensor:
-    """Linear between knots, and beyond them as between the two nearest.
+    """Interpolates linearly between knots, and extrapolates beyond them from the two nearest.
 
     Args:
         value: any shape ``[*]``.
@@ -56,14 +56,14 @@ def interpolate(value: Tensor, knots: Tensor, heights: Tensor) -> Tensor:
 
 
 def _at(table: Tensor, index: Tensor) -> Tensor:
-    """Entries of ``[N]`` or ``[K, N]`` at ``[*, 1]`` or ``[*, K, 1]``."""
+    """Returns entries of ``[N]`` or ``[K, N]`` at ``[*, 1]`` or ``[*, K, 1]``."""
     return table.expand(*index.shape[:-1], table.shape[-1]).gather(-1, index).squeeze(-1)
 
 
 def observe(
     window: InnovationWindow, nis: Tensor, innovation: Tensor, freedom: Tensor, scale: Tensor | float = 1.0
 ) -> InnovationWindow:
-    """The window after one more step; as it was where nothing is observed.
+    """Returns the window after one more step; as it was where nothing is observed.
 
     The direction of a normalised innovation is that of the innovation in units of ``scale``, its length is the root of
     ``nis``. With one component that is exact, whatever the scale.
@@ -89,7 +89,7 @@ def observe(
 
 
 def innovation_tests(window: InnovationWindow) -> InnovationTests:
-    """P-values of a window's innovations; 1 where nothing was observed yet.
+    """Returns p-values of a window's innovations; 1 where nothing was observed yet.
 
     Example:
         >>> terms = torch.tensor([[3.0, 2.0, 0.0, 0.0], [5.0, 2.0, 2.8, 2.0]])  # 8 with 4 degrees of freedom

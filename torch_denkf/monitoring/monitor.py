@@ -1,4 +1,4 @@
-"""Watches the innovations of a filter's sensors, and says which of them is not to be believed."""
+"""Watches the innovations of a filter's sensors, and raises an alarm for each that is inconsistent."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _STATE = ("terms", "last", "cusum", "claim", "p_value", "whiteness", "evidence")
 
 
 class MonitoredSensor(NamedTuple):
-    """Where a sensor's innovations are.
+    """Keys of a sensor's innovations.
 
     Attributes:
         info_prefix: prefix of ``innovation`` ``[*B, O]`` and ``nis`` ``[*B, 1]``; where a filter has several analyses,
@@ -175,7 +175,7 @@ class InnovationMonitor(SubModel):
     # ------------------------------------------------------------------------------------------------------ one step
 
     def on_entries(self, entries, call):
-        """State and verdict after one more step."""
+        """Returns state and verdict after one more step."""
         written = {}
         for place, (name, sensor) in enumerate(self.sensors.items()):
             written.update(self._after(place, name, sensor, entries))
@@ -186,7 +186,7 @@ class InnovationMonitor(SubModel):
         return written
 
     def _after(self, place: int, name: str, sensor: MonitoredSensor, entries) -> dict:
-        """The entries of one sensor after one more step."""
+        """Returns the entries of one sensor after one more step."""
         nis, innovation, noise, freedom = self._read(sensor, entries)
         keys = [(self.monitor_prefix, name, entry) for entry in _STATE]
         old = dict(zip(_STATE, (self.required(entries, key) for key in keys), strict=True))
@@ -214,7 +214,7 @@ class InnovationMonitor(SubModel):
         return dict(zip(keys, values, strict=True))
 
     def claim_score(self, name: str, noise: Tensor) -> Tensor:
-        """The standard normal score of what a sensor claims its variances to be ``[*B, O]``, ``[*B, 1]``.
+        """Returns the standard normal score of what a sensor claims its variances to be ``[*B, O]``, ``[*B, 1]``.
 
         It is that of the mean logarithm, among those of the clean data that the monitor was calibrated on.
         """
@@ -222,14 +222,14 @@ class InnovationMonitor(SubModel):
         return interpolate(_claimed(noise), *self.claims[place].to(noise.dtype))
 
     def _signs(self, name: str, sensor: MonitoredSensor, entries) -> list[Tensor]:
-        """The signs as multiples of their limits, if there are any."""
+        """Returns the signs as multiples of their limits, if there are any."""
         signs = None if sensor.sign_key is None else entries.get(unravel_key(sensor.sign_key))
         if signs is None:
             return []
         return [(signs / getattr(self, f"sign_limit_{name}").to(signs.dtype)).nan_to_num(0.0, posinf=0.0)]
 
     def _read(self, sensor: MonitoredSensor, entries) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
-        """Normalised innovation squared, innovation, claimed noise, and how many components were observed."""
+        """Returns normalised innovation squared, innovation, claimed noise, and how many components were observed."""
         info = unravel_key(sensor.info_prefix)
         info = (info,) if isinstance(info, str) else info
         nis, innovation = (self.required(entries, (*info, entry)) for entry in ("nis", "innovation"))
@@ -246,7 +246,7 @@ class InnovationMonitor(SubModel):
         return torch.where(seen, torch.minimum(cusum_step(total, score, self.reference), ceiling), total)
 
     def initial_state(self, batch_size: Sequence[int], *, device=None, dtype=None) -> list[Tensor]:
-        """The entries before anything was observed, in the order of ``state_keys``."""
+        """Returns the entries before anything was observed, in the order of ``state_keys``."""
         make = {"device": device, "dtype": dtype}
         zero, values = torch.zeros(*batch_size, 1, **make), []
         for sensor in self.sensors.values():
@@ -324,7 +324,7 @@ class InnovationMonitor(SubModel):
 
     @torch.no_grad()
     def replay(self, recorded: TensorDictBase) -> TensorDictBase:
-        """The monitor's entries on what a filter has written before, ``[*B, T]``, time last."""
+        """Returns the monitor's entries on what a filter has written before, ``[*B, T]``, time last."""
         batch, entries = recorded.batch_size[:-1], _entries(recorded)
         read = [key for key in (*self.in_keys, *self.optional_keys, "is_init") if key not in self.state_keys]
         rows = recorded.select(*(key for key in read if key in entries)).unbind(-1)
@@ -344,7 +344,7 @@ class InnovationMonitor(SubModel):
         return torch.stack(out, len(batch))
 
     def detectable_bias(self, power: float = 0.9) -> dict[str, float]:
-        """The smallest constant bias of each sensor's innovations that the windowed test finds, at its limit.
+        """Returns the smallest constant bias of each sensor's innovations that the windowed test finds, at its limit.
 
         The filter follows a biased sensor, so that the innovation's bias is smaller than the sensor's. What is smaller
         than this is not noticed within a window, and a gate does nothing against it.
@@ -363,13 +363,13 @@ class InnovationMonitor(SubModel):
 
 
 def _logarithms(p_value: Tensor, limit: Tensor) -> Tensor:
-    """How many times the logarithm of a p-value is that of its limit."""
+    """Returns the ratio of the logarithms of a p-value and its limit."""
     least = torch.finfo(p_value.dtype).tiny
     return p_value.clamp_min(least).log() / limit.clamp_min(least).log()
 
 
 def _claimed(noise: Tensor) -> Tensor:
-    """Mean logarithm of the claimed variances ``[*B, 1]``."""
+    """Returns the mean logarithm of the claimed variances ``[*B, 1]``."""
     return noise.clamp_min(torch.finfo(noise.dtype).tiny).log().mean(-1, keepdim=True)
 
 

@@ -65,7 +65,7 @@ class SignGate(Sensor):
         self.register_buffer("limits", torch.full((count,), torch.inf))
 
     def compute(self, signs: Tensor, before: Tensor | None = None) -> Tensor:
-        """The mask."""
+        """Returns the mask."""
         sound = ~(signs > self.limits.to(signs.dtype)).any(-1, keepdim=True)
         return sound if before is None else sound & before
 

@@ -1,10 +1,12 @@
-"""Known motions on spaces, and what sensors read of their states: inertial sensors, poses, landmarks.
+"""Known motions, and what sensors read of their states: inertial sensors, poses, landmarks.
 
-A state is a point of a space, see :mod:`torch_denkf.functional.manifolds`: orientation first, as a unit quaternion with
-w first, or as an angle in the plane; the world's z points up. Motions draw no noise. ``process_noise`` of a motion says
-how much of it a filter is to add after each step: one standard deviation for each number of a tangent.
+Linear motions in continuous time move plain numbers. Another motion's state is a point of a space, see
+:mod:`torch_denkf.functional.manifolds`: orientation first, as a unit quaternion with w first, or as an angle in the
+plane; the world's z points up. Motions draw no noise. ``process_noise`` of a motion says how much of it a filter is to
+add after each step: one standard deviation for each number of a tangent.
 """
 
+from torch_denkf.motions.continuous import ContinuousMotion, ContinuousNoise, NoisePerSecond
 from torch_denkf.motions.inertial import AttitudeMotion, InertialMotion
 from torch_denkf.motions.planar import PlanarMotion
 from torch_denkf.motions.readings import Gravity, Magnetic, PoseOf, PositionInBody, RangeBearing
@@ -13,9 +15,12 @@ from torch_denkf.motions.twist import ConstantTwist
 __all__ = [
     "AttitudeMotion",
     "ConstantTwist",
+    "ContinuousMotion",
+    "ContinuousNoise",
     "Gravity",
     "InertialMotion",
     "Magnetic",
+    "NoisePerSecond",
     "PlanarMotion",
     "PoseOf",
     "PositionInBody",

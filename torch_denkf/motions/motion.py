@@ -1,4 +1,4 @@
-"""What all known motions share."""
+"""Base of all known motions."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_values
-from torch_denkf.functional.manifolds import Product
+from torch_denkf.functional.manifolds import Product, Space
 from torch_denkf.modules.tensors import as_vector
 from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
 from torch_denkf.submodel import SubModel, Transition
 
-__all__ = ["Motion", "densities", "integrated", "walked"]
+__all__ = ["Motion", "carried", "corner", "densities", "integrated", "walked"]
 
 
 class Motion(Transition):
@@ -44,9 +44,10 @@ class Motion(Transition):
         check_dt(dt)
         super().__init__(nn.Identity(), [in_key, *actions, *keys_of_dt(dt)], [out_key])
         self.space, self.dt, self.actions = space, dt, actions
+        self.tangents_of, self._timed = (space, space), bool(keys_of_dt(dt))
 
     def move(self, *values: Any, **_: Any) -> Tensor:
-        """The states ``[*, P]`` one step later.
+        """Returns the states ``[*, P]`` one step later.
 
         Args:
             *values: the states ``[*, P]``, then the actions ``[*, A]``.
@@ -54,8 +55,16 @@ class Motion(Transition):
         """
         raise NotImplementedError
 
+    def gradient(self, *values: Any, **_: Any) -> Tensor:
+        """Returns the Jacobian ``[*, D, D]`` of :meth:`move`, between tangents, from the same values; optional."""
+        raise NotImplementedError
+
+    def move_and_gradient(self, *values: Any, **dt: Any) -> tuple[Tensor, Tensor]:
+        """Returns both, which may share what they need."""
+        return self.move(*values, **dt), self.gradient(*values, **dt)
+
     def noise_of_step(self, dt: Any) -> list:
-        """The standard deviations ``[D]`` that a step of ``dt`` seconds adds, in the space's tangents.
+        """Returns the standard deviations ``[D]`` that a step of ``dt`` seconds adds, in the space's tangents.
 
         They are numbers, or tensors of the shape of ``dt``, if that is a tensor.
         """
@@ -63,7 +72,7 @@ class Motion(Transition):
 
     @property
     def process_noise(self) -> list[float] | SubModel:
-        """What a step adds, in the space's tangents: the noise to give to a filter.
+        """Returns the process noise of a step, in the space's tangents: the noise to give to a filter.
 
         Standard deviations ``[D]``; where the motion reads the length of each step, a module that writes the variances
         of that step.
@@ -79,8 +88,20 @@ class Motion(Transition):
         return self.noise_of_step(self.dt) if isinstance(self.dt, (int, float)) else NoiseOfStep(self)
 
     def compute(self, ensemble, *others):
-        """The forecast ensemble."""
-        *actions, dt = others if keys_of_dt(self.dt) else (*others, self.dt)
+        """Returns the forecast ensemble."""
+        actions, dt = self._drivers(ensemble, *others)
+        return self.move(ensemble, *actions, dt=dt)
+
+    def jacobian(self, ensemble, *others):
+        """Returns the forecast ensemble, and the Jacobian between tangents."""
+        actions, dt = self._drivers(ensemble, *others)
+        return self.move_and_gradient(ensemble, *actions, dt=dt)
+
+    def _drivers(self, ensemble: Tensor, *others: Tensor) -> tuple[list[Tensor], Any]:
+        """Returns the actions and the length of the step, next to an ensemble."""
+        actions: list[Any]
+        dt: Any
+        *actions, dt = others if self._timed else (*others, self.dt)
         self.space.check(point=ensemble)
         for (key, size), action in zip(self.actions.items(), actions, strict=True):
             if action.shape[-1:] != (size,):
@@ -89,8 +110,7 @@ class Motion(Transition):
             if dt.shape[-1:] != (1,):
                 raise ValueError(f"{self.dt!r} of {type(self).__name__} is [*B, 1]; got {list(dt.shape)}.")
             dt = dt.to(ensemble.dtype)
-        actions = [action.to(ensemble.dtype).unsqueeze(-2) for action in actions]
-        return self.move(ensemble, *actions, dt=for_members(dt))
+        return [action.to(ensemble.dtype).unsqueeze(-2) for action in actions], for_members(dt)
 
 
 class NoiseOfStep(SubModel):
@@ -105,13 +125,32 @@ class NoiseOfStep(SubModel):
         super().__init__(motion, [("belief", "mean"), *keys_of_dt(motion.dt)], [out_key])
 
     def compute(self, mean, dt):
-        """The variances of the step."""
+        """Returns the variances of the step."""
         dt = dt.to(mean.dtype).squeeze(-1)
         return torch.stack([torch.zeros_like(dt) + each for each in self.module.noise_of_step(dt)], -1).square()
 
 
+def carried(space: Space, twist: Tensor, dt: Any) -> tuple[Tensor, Tensor]:
+    r"""Returns the Jacobians of :math:`x \exp(d)` by x, and by the rate r with :math:`d = r \Delta t`: ``[*, D, D]``.
+
+    Args:
+        space: of x.
+        twist: :math:`d`, ``[*, D]``.
+        dt: seconds, a number or ``[*, 1]``.
+    """
+    rate = space.right_jacobian(twist)
+    rate = rate * (dt.unsqueeze(-1) if isinstance(dt, Tensor) else dt)
+    return space.adjoint(space.exp(-twist)), rate
+
+
+def corner(above: Tensor, below: Tensor) -> Tensor:
+    """Returns rows ``[*, N, D]``, and below them those of numbers that a motion does not mix, ``[*, D - N, D - N]``."""
+    padded = nn.functional.pad(below, (above.shape[-2], 0))
+    return torch.cat([above, padded.expand(*above.shape[:-2], *padded.shape[-2:])], -2)
+
+
 def densities(name: str, value: float | Sequence[float] | Tensor, size: int) -> list[float]:
-    """Noise densities, one for each of ``size`` numbers, of one for all or of one for each.
+    """Returns noise densities, one for each of ``size`` numbers, of one for all or of one for each.
 
     Raises:
         TypeError: if they are no numbers.
@@ -123,12 +162,12 @@ def densities(name: str, value: float | Sequence[float] | Tensor, size: int) -> 
 
 
 def walked(density: Sequence[float], dt: Any) -> list:
-    """The standard deviations of a random walk after ``dt`` seconds."""
+    """Returns the standard deviations of a random walk after ``dt`` seconds."""
     return [each * dt**0.5 for each in density]
 
 
 def integrated(density: Sequence[float], dt: Any) -> list:
-    """The standard deviations of a random walk's integral after ``dt`` seconds.
+    """Returns the standard deviations of a random walk's integral after ``dt`` seconds.
 
     They are correlated with those of the walk by .87. In a filter, where the next step moves by what this one has
     drawn, all but the last step's correlation is there.

@@ -11,7 +11,7 @@ __all__ = ["check_dt", "for_members", "keys_of_dt"]
 
 
 def keys_of_dt(dt: float | NestedKey) -> list[NestedKey]:
-    """The key of the time step, if it is no number."""
+    """Returns the key of the time step, if it is no number."""
     return [] if isinstance(dt, (int, float)) else [dt]
 
 
@@ -31,5 +31,5 @@ def check_dt(dt: float | NestedKey) -> None:
 
 
 def for_members(dt: float | Tensor) -> float | Tensor:
-    """A time step ``[*B, 1]`` as ``[*B, 1, 1]``, beside ensembles ``[*B, E, S]``."""
+    """Returns a time step ``[*B, 1]`` as ``[*B, 1, 1]``, next to ensembles ``[*B, E, S]``."""
     return dt.unsqueeze(-2) if isinstance(dt, Tensor) else dt

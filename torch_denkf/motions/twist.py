@@ -9,7 +9,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf.functional.manifolds import SE2, SE3, Euclidean, Product
-from torch_denkf.motions.motion import Motion, densities, integrated, walked
+from torch_denkf.motions.motion import Motion, carried, corner, densities, integrated, walked
 
 __all__ = ["ConstantTwist"]
 
@@ -56,10 +56,16 @@ class ConstantTwist(Motion):
         self.twist_noise = densities("twist_noise", twist_noise, space.tangent_dim)
 
     def move(self, state, *, dt):
-        """The pose moved by its twist."""
+        """Returns the pose moved by its twist."""
         pose, twist = self.space.points(state)
         return torch.cat([self.pose_space.plus(pose, twist * dt), twist], -1)
 
+    def gradient(self, state, *, dt):
+        """Returns the Jacobian of the pose by itself and by its twist; the twist stays."""
+        twist = self.space.points(state)[1]
+        by_pose, by_rate = carried(self.pose_space, twist * dt, dt)
+        return corner(torch.cat([by_pose, by_rate], -1), torch.eye(self.pose_space.tangent_dim).to(state))
+
     def noise_of_step(self, dt):
-        """Of the pose, then of the twist."""
+        """Returns the noise of the pose, then of the twist."""
         return integrated(self.twist_noise, dt) + walked(self.twist_noise, dt)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from torch_denkf.filters import Filter
     from torch_denkf.objectives.filter_loss import FilterLoss
 
-__all__ = ["Keys", "Labels", "Reading", "Truth", "check_row_mask", "mean_of"]
+__all__ = ["Keys", "Labels", "Reading", "Targets", "check_row_mask", "mean_of"]
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Keys:
         observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``; by default the one that the sensor's update reads.
         sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``, or the name of one sensor of several; by
             default those that the filter's one sensor writes.
-        visible: probability that the reading is about the state, ``[*B, 1]``, as a head beside the sensor says.
+        visible: probability that the reading is about the state, ``[*B, 1]``, as a head next to the sensor says.
         target_visible: whether it is, ``[*B, 1]``, bool or 0 and 1; NaN where that is not known.
         visible_observed: where it is known, ``[*B, 1]``, bool; by default its name and ``_observed``.
     """
@@ -122,7 +122,7 @@ class Labels(NamedTuple):
         return self.mask.any(-1)
 
     def errors(self, estimate: Tensor, weights: Tensor | None = None, *, each: bool = False) -> Tensor:
-        """Scaled errors of an estimate ``[*B, N]``, or of members ``[*B, E, N]``; zero where there is no label.
+        """Returns scaled errors of an estimate ``[*B, N]``, or of members ``[*B, E, N]``; zero where there is no label.
 
         In a space they are tangents. Those of members and of the truth are taken at the members' mean, and subtracted:
         members that are drawn like the truth then have tangents that are distributed like the truth's, and their score
@@ -148,11 +148,11 @@ class Labels(NamedTuple):
         return torch.where(mask, errors if self.scale is None else errors / self.scale, 0)
 
     def mean(self, scores: Tensor) -> Tensor:
-        """The mean of scores ``[*B, N]`` over the components that have a label, ``[*B]``."""
+        """Returns the mean of scores ``[*B, N]`` over the components that have a label, ``[*B]``."""
         return mean_of(scores, self.mask)
 
     def in_all_components(self, name: str, value: Tensor) -> Tensor:
-        """One number for each of the N components, 1 where none is given.
+        """Returns one number for each of the N components, 1 where none is given.
 
         Args:
             name: its own, for the message.
@@ -173,7 +173,7 @@ class Labels(NamedTuple):
         return out
 
     def scaled(self, name: str, scale: Tensor | None) -> Labels:
-        """With a scale, see :meth:`in_all_components`; where that is infinite, a component is no label."""
+        """Sets a scale, see :meth:`in_all_components`; where that is infinite, a component is no label."""
         if scale is None:
             return self
         scale = self.in_all_components(name, scale)
@@ -183,7 +183,7 @@ class Labels(NamedTuple):
         return self._replace(values=values, mask=mask, scale=scale)
 
 
-class Truth:
+class Targets:
     """Holds the labels of a batch that terms are scored against, and what the filter wrote.
 
     Args:
@@ -196,7 +196,7 @@ class Truth:
         self.loss, self.keys, self.data, self.out = loss, loss.tensor_keys, data, out
 
     def entry(self, key: NestedKey, cure: str = "", *, given: bool = False) -> Tensor:
-        """An entry that the filter wrote, or that is ``given`` in the batch.
+        """Returns an entry that the filter wrote, or that is ``given`` in the batch.
 
         Raises:
             KeyError: if it is missing; the message ends with the ``cure``.
@@ -214,12 +214,12 @@ class Truth:
         return self.loss._counts(self.data)
 
     def state(self, size: int) -> Labels:
-        """The true state as far as it counts, against an estimate of ``size`` components."""
+        """Returns the true state as far as it counts, against an estimate of ``size`` components."""
         labels = self._labels("state", self.entry(self.keys.state, given=True), size, self.loss.dims)
         return labels.scaled("state_scale", self.loss.state_scale)
 
     def observation(self, target: Tensor, size: int) -> Labels:
-        """True observations ``target``, as far as they count, against readings of ``size`` components."""
+        """Returns true observations ``target``, as far as they count, against readings of ``size`` components."""
         return self._labels("target", target, size).scaled("observation_scale", self.loss.observation_scale)
 
     def visible(self) -> Labels:
@@ -230,7 +230,7 @@ class Truth:
         return labels if mask is None else labels._replace(mask=labels.mask & mask.any(-1, keepdim=True))
 
     def whole_state(self) -> Labels:
-        """The true state for what reads all of it; ``mask`` ``[*B, 1]`` says where that is known.
+        """Returns the true state for what reads all of it; ``mask`` ``[*B, 1]`` says where that is known.
 
         Raises:
             ValueError: if the labels lack dimensions.
@@ -254,7 +254,7 @@ class Truth:
         return observe(self._known("state", values, size, dims))
 
     def state_size(self) -> int | None:
-        """S, of the belief where there is one, P of a space; ``None`` where nobody says."""
+        """Returns S, of the belief where there is one, P of a space; ``None`` where nobody says."""
         filter = self.loss.filter
         if self.loss.space is not None:
             return self.loss.space.point_dim
@@ -279,7 +279,7 @@ class Truth:
         return Labels(points if flat else on.normalise(points), mask & counting, dims, space=space)
 
     def _known(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None) -> Tensor:
-        """Labels ``[*B, N]`` in the places of their components, ``[*B, size]``, NaN where there is none.
+        """Returns labels ``[*B, N]`` in the places of their components, ``[*B, size]``, NaN where there is none.
 
         They are of the leading N components; or of ``dims``, in their order, where that is N components of which the
         last are beyond the first N.
@@ -325,7 +325,7 @@ class Truth:
 
 
 def check_row_mask(key: NestedKey, mask: Tensor, values: Tensor) -> None:
-    """Raise unless a mask is ``[*B, 1]`` or ``[*B, N]``, bool, for values ``[*B, N]``."""
+    """Raises unless a mask is ``[*B, 1]`` or ``[*B, N]``, bool, for values ``[*B, N]``."""
     check_mask(repr(key), mask)
     batch, count = list(values.shape[:-1]), values.shape[-1]
     if list(mask.shape) not in ([*batch, 1], [*batch, count]):
@@ -335,7 +335,7 @@ def check_row_mask(key: NestedKey, mask: Tensor, values: Tensor) -> None:
 
 
 def mask_of(key: NestedKey) -> NestedKey:
-    """The mask that data sets write beside an entry.
+    """Returns the mask that data sets write next to an entry.
 
     Example:
         >>> mask_of("state"), mask_of(("truth", "x"))
@@ -346,7 +346,7 @@ def mask_of(key: NestedKey) -> NestedKey:
 
 
 def mean_of(values: Tensor, mask: Tensor) -> Tensor:
-    """The mean over the last dimension of what a mask leaves in, ``[*]``; zero of nothing.
+    """Returns the mean over the last dimension of what a mask leaves in, ``[*]``; zero of nothing.
 
     Example:
         >>> mean_of(torch.tensor([1.0, 5.0]), torch.tensor([False, True]))

@@ -17,7 +17,7 @@ from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.functional.linalg import as_covariance
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules import StochasticMLP
-from torch_denkf.objectives._labels import Labels, Truth, check_row_mask, mean_of
+from torch_denkf.objectives._labels import Labels, Targets, check_row_mask, mean_of
 from torch_denkf.objectives.filter_loss import FilterLoss, Term
 
 MEMBER_SCORES = ("crps", "energy", "mse")
@@ -37,7 +37,7 @@ class OfBelief(Term):
         self.name, self.key = name, key
         super().__init__(weight)
 
-    def place(self, truth: Truth) -> NestedKey:
+    def place(self, truth: Targets) -> NestedKey:
         """Returns its key."""
         return getattr(truth.keys, self.key)
 
@@ -72,8 +72,8 @@ class Particles(OfBelief):
         std = labels.in_all_components("component_std", truth.loss.component_std)
         return score_mixture(errors, labels.mask, log_weights, truth.loss.score, std, labels.scale), labels.rows
 
-    def errors(self, truth: Truth) -> tuple[Tensor, Tensor, Labels]:
-        """Errors of the particles ``[*B, T, E, S]``, their log-weights ``[*B, T, E]`` and the labels."""
+    def errors(self, truth: Targets) -> tuple[Tensor, Tensor, Labels]:
+        """Returns errors of the particles ``[*B, T, E, S]``, their log-weights ``[*B, T, E]`` and the labels."""
         place = self.place(truth)
         particles = truth.entry((place, "ensemble"), BELIEFS)
         log_weights = truth.out.get((place, "log_weight"), None)
@@ -82,7 +82,7 @@ class Particles(OfBelief):
         labels = truth.state(particles.shape[-1])
         return labels.errors(particles, log_weights.softmax(-1), each=self.each(truth)), log_weights, labels
 
-    def each(self, truth: Truth) -> bool:
+    def each(self, truth: Targets) -> bool:
         """Tells whether the score has a tangent space at each particle: the width around it is in that."""
         return truth.loss.score == "mixture"
 
@@ -96,7 +96,7 @@ class Mean(Particles):
         return labels.mean(weighted_mean(errors, log_weights).square()), labels.rows
 
     def each(self, truth):
-        """Never."""
+        """Returns False."""
         return False
 
 
@@ -113,7 +113,7 @@ class Sensor(Term):
         return score_members(labels.errors(samples), labels.mask, score), labels.rows
 
     def exists(self, loss: FilterLoss) -> bool:
-        """A module writes its samples, or the user has named where they are."""
+        """Returns True if a module writes its samples, or the user has named where they are."""
         structure = loss.filter.structure
         samples = [*filter(beliefs.is_samples, structure.frame_keys)] or ("sensor", "ensemble") in structure.step_keys
         return loss.tensor_keys.sensor is not None or bool(samples)
@@ -140,7 +140,7 @@ class Visible(Term):
     needs_state = False
 
     def forward(self, out, truth):
-        p = truth.entry(truth.keys.visible, "A Visibility beside the sensor writes it. ")
+        p = truth.entry(truth.keys.visible, "A Visibility next to the sensor writes it. ")
         labels = truth.visible()
         target = labels.values.to(p.dtype)
         return labels.mean(nn.functional.binary_cross_entropy(p, target, reduction="none")), labels.rows
@@ -283,20 +283,20 @@ def score_gaussian(errors: Tensor, mask: Tensor, cov: Tensor, score: str, scale:
     return mean_of(crps_gaussian(zero, variance, errors), mask)
 
 
-def score_ensemble(truth: Truth, ensemble: Tensor) -> tuple[Tensor, Tensor]:
-    """The loss's score of members ``[*B, E, S]`` against the true state, and which elements have one."""
+def score_ensemble(truth: Targets, ensemble: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the loss's score of members ``[*B, E, S]`` against the true state, and which elements have one."""
     labels = truth.state(ensemble.shape[-1])
     return score_members(labels.errors(ensemble), labels.mask, truth.loss.score), labels.rows
 
 
-def score_moments(truth: Truth, mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
+def score_moments(truth: Targets, mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
     """Scores a mean ``[*B, S]`` and a covariance ``[*B, S, S]`` against the true state, and marks what has one."""
     labels = truth.state(mean.shape[-1])
     return score_gaussian(labels.errors(mean), labels.mask, cov, truth.loss.score, labels.scale), labels.rows
 
 
-def sensor_samples(truth: Truth) -> tuple[Tensor, Labels]:
-    """The sensor's samples ``[*B, E, O]``, and what they should be where it observed all.
+def sensor_samples(truth: Targets) -> tuple[Tensor, Labels]:
+    """Returns the sensor's samples ``[*B, E, O]``, and what they should be where it observed all.
 
     Raises:
         KeyError: if there are no samples, or no true observation.
@@ -305,7 +305,9 @@ def sensor_samples(truth: Truth) -> tuple[Tensor, Labels]:
     target, model = data.get(keys.target_observation, None), reading.model
     if target is None:
         if model is None or learns(model):
+            named = sorted({key[1] for key in filter.structure.frame_keys if beliefs.is_samples(key) and key[2:]})
             several = "has no observation model with an observe() method, or several sensors, of which none is named"
+            several += f" (there are {named})" * bool(named)
             why = several if model is None else "learns its observation model"
             raise KeyError(
                 f"loss_sensor needs the true observation in {keys.target_observation!r}, because the filter {why}. Add "

@@ -18,7 +18,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules.tensors import as_floating, check_dims
-from torch_denkf.objectives._labels import Keys, Reading, Truth
+from torch_denkf.objectives._labels import Keys, Reading, Targets
 
 __all__ = ["FilterLoss", "ReadingsOptions", "Scale", "SequenceKeys", "SequenceOptions", "StateOptions", "Term"]
 
@@ -126,8 +126,8 @@ class Term(nn.Module):
             check_number(self.name, weight, least=0, cure="It is a term's weight")
         self.weight = weight
 
-    def forward(self, out: TensorDictBase, truth: Truth) -> tuple[Tensor, Tensor | None]:
-        """The term's value in each element.
+    def forward(self, out: TensorDictBase, truth: Targets) -> tuple[Tensor, Tensor | None]:
+        """Returns the term's value in each element.
 
         Args:
             out: the batch ``[*B]`` with what the filter wrote.
@@ -146,7 +146,7 @@ class Term(nn.Module):
 
 @dataclass
 class SequenceKeys(Keys):
-    """The entries that losses of whole filters read beside those of all losses.
+    """The entries that losses of whole filters read besides those of all losses.
 
     Attributes:
         belief: prefix of the belief's entries: ``mean`` and ``cov``, or ``ensemble`` and ``log_weight``.
@@ -278,7 +278,7 @@ class FilterLoss(Checked, LossModule):
         self.out_keys = [f"loss_{name}" for name in self.weights]
 
     def named_parameters(self, prefix: str = "", recurse: bool = True) -> Iterator[tuple[str, nn.Parameter]]:
-        """The parameters that are trained, with their names in the loss."""
+        """Returns the parameters that are trained, with their names in the loss."""
         found, parts = super().named_parameters(prefix, recurse), self._trained()
         if parts is None:
             return found
@@ -289,7 +289,7 @@ class FilterLoss(Checked, LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the weighted terms; ``tensordict`` is left as it is."""
         out = self._run(tensordict)
-        truth, losses = Truth(self, tensordict, out), TensorDict({}, batch_size=[])
+        truth, losses = Targets(self, tensordict, out), TensorDict({}, batch_size=[])
         for term in self.terms:
             if term.name not in self.weights:
                 continue
@@ -306,7 +306,7 @@ class FilterLoss(Checked, LossModule):
     # ------------------------------------------------------------------------ what a loss of a part has otherwise
 
     def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The batch with what the filter, or its part, writes."""
+        """Returns the batch with what the filter, or its part, writes."""
         self.filter.observe(Record("data", tensordict, tensordict.batch_size, {}, {}))
         return self.filter.inside(self._filters().sequence(tensordict.copy(), detach_every=self.detach_every))
 
@@ -327,7 +327,7 @@ class FilterLoss(Checked, LossModule):
         return [*needed, self.tensor_keys.state] if supervised else needed
 
     def _trained(self) -> Iterable[nn.Module] | None:
-        """The modules of the part that is trained; ``None`` for all.
+        """Returns the modules of the part that is trained; ``None`` for all.
 
         The whole filter is kept, so that it follows the loss to another device, and its names stay in the state dict.
         """

@@ -15,6 +15,7 @@ from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
 
 from torch_denkf._arguments import check_key
 from torch_denkf._checks import check_count, check_values, flag_value
+from torch_denkf._registered import diagnosis
 from torch_denkf._slices import one_earlier
 from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record
@@ -22,7 +23,7 @@ from torch_denkf.filters.gather import controls_of
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules.tensors import as_floating
 from torch_denkf.objectives import _terms
-from torch_denkf.objectives._labels import Keys, Truth
+from torch_denkf.objectives._labels import Keys, Targets
 from torch_denkf.objectives.filter_loss import FilterLoss, ReadingsOptions, StateOptions, Term
 from torch_denkf.running import reads, reads_of, run_module, run_modules
 from torch_denkf.submodel import Call, Entries, Initial, role
@@ -152,7 +153,7 @@ class SensorLoss(FilterLoss):
         return [module for _, module in self._placed()]
 
     def _placed(self):
-        """The modules that read frames alone and lead to what is scored: the sensor; R and a head where they are."""
+        """Returns the modules that read frames alone and lead to the score: the sensor; R and a head where they are."""
         keys, reading, placed = self.tensor_keys, self.reading, []
         wanted = {reading.samples, reading.observed}
         wanted |= {unravel_key(keys.noise or reading.noise)} if "noise" in self.weights else set()
@@ -175,6 +176,9 @@ class SensorLoss(FilterLoss):
     def _run(self, tensordict):
         size, out = tensordict.batch_size, tensordict.copy()
         call = Call(size, time=len(size) > 1)
+        missing = [key for key in reads_of(self._trained())[0] if tensordict.get(key, None) is None]
+        if missing:
+            raise diagnosis().missing_entry(type(self).__name__, missing, tensordict.keys(True, True))
         # As in Filter.sequence: a recurrent network among these modules reads whole sequences.
         with set_recurrent_mode(True) if call.time else nullcontext():
             written = run_modules(self._placed(), self.filter.entries_of(tensordict), call)
@@ -199,7 +203,7 @@ class TransitionLoss(FilterLoss):
             ``"crps"``, ``"nll"`` or ``"mse"`` of a Gaussian, as in :class:`~torch_denkf.objectives.GaussianLoss`. A
             transition without noise has no spread but ``spread``: teach it by ``"mse"``.
         spread: standard deviation around the truth, in the state's units: a number or ``[S]``, of a space of tangents
-            ``[D]``. Members are drawn anew in each call.
+            ``[D]``. Members are drawn again in each call.
         members: E; by default as many as the initial belief has. One is a point, for ``"mse"`` alone.
         belief: prefix of the carried ``ensemble``, or of ``mean`` and ``cov``.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
@@ -263,7 +267,7 @@ class TransitionLoss(FilterLoss):
         if not tensordict.ndim:
             raise ValueError("A step needs two times, the last batch dimension; this tensordict has batch_size [].")
         self.filter.observe(Record("data", tensordict, tensordict.batch_size, {}, {}))
-        truth = Truth(self, tensordict, tensordict).whole_state().values
+        truth = Targets(self, tensordict, tensordict).whole_state().values
         # Whatever else reads the true state finds no NaN either.
         known = tensordict.copy().set(self.tensor_keys.state, truth)
         around = {"spread": self.spread, "members": self.members, "space": self.space}
@@ -273,7 +277,7 @@ class TransitionLoss(FilterLoss):
     def _counts(self, tensordict):
         # Without a stored belief, which would let the first element of a slice count: its truth before is unknown.
         stepped = self.filter.stepped(tensordict.exclude("previous"))
-        known = Truth(self, tensordict, tensordict).whole_state().rows
+        known = Targets(self, tensordict, tensordict).whole_state().rows
         return stepped & one_earlier(known, tensordict.ndim - 1)
 
 
@@ -290,7 +294,7 @@ class Step(Term):
 
 
 def members_of(filter: Filter, belief: str, members: int | None) -> int | None:
-    """E, as many as were asked for or as the initial belief has; ``None`` of a filter with a mean and a covariance.
+    """Returns E, as asked for or of the initial belief; ``None`` for a filter with a mean and a covariance.
 
     Raises:
         ValueError: if the filter carries neither below the prefix ``belief``, or nobody says how many.

@@ -58,7 +58,7 @@ class DEnKFLoss(FilterLoss):
         smoothed: weight of ``loss_smoothed``.
         smoother: makes the smoothed belief, e.g. ``partial(EnRTS, lag=10)`` or
             :class:`~torch_denkf.smoothers.EnRTS`; it is called with the filter.
-        terms: terms of your own beside these, see :class:`Term`.
+        terms: terms of your own besides these, see :class:`Term`.
         **options: ``dims``, scales, ``space``, ``reading_space``, ``detach_every`` and ``reduction``, see
             :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. It also says what gaps in the labels are.
 
@@ -83,7 +83,7 @@ class DEnKFLoss(FilterLoss):
 
     @dataclass
     class _AcceptedKeys(SequenceKeys):
-        """The entries that the loss reads beside those of all losses.
+        """The entries that the loss reads besides those of all losses.
 
         Attributes:
             belief: ensemble of the belief.
@@ -133,12 +133,12 @@ class DEnKFLoss(FilterLoss):
 
     @classmethod
     def paper(cls, filter: Filter, **kwargs) -> DEnKFLoss:
-        """The paper's loss: squared errors of the means of belief, forecast and sensor, equally weighted."""
+        """Returns the paper's loss: squared errors of the means of belief, forecast and sensor, equally weighted."""
         return cls(filter, **{"score": "mse", **kwargs})
 
     @classmethod
     def ad_enkf(cls, filter: Filter, *, detach_every: int | None = None, **kwargs) -> DEnKFLoss:
-        r"""Training without true states: the likelihood of the innovations alone, as in AD-EnKF.
+        r"""Trains without true states: the likelihood of the innovations alone, as in AD-EnKF.
 
         .. math:: -\log p(y_{1:T}) \approx -\sum_t \log N(y_t; H \bar x_{t|t-1}, H C_{t|t-1} H^T + R)
 
@@ -200,7 +200,7 @@ class GaussianLoss(FilterLoss):
             ``set_keys(sensor=...)`` names them), else the term is left out.
         nll: weight of ``loss_nll``.
         visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
-        terms: terms of your own beside these, see :class:`Term`.
+        terms: terms of your own besides these, see :class:`Term`.
         **options: ``dims``, scales, ``space``, ``reading_space``, ``detach_every`` and ``reduction``, see
             :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. It also says what gaps in the labels are.
 
@@ -280,7 +280,7 @@ class MixtureLoss(FilterLoss):
         sensor: weight of ``loss_sensor``.
         nll: weight of ``loss_nll``.
         visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
-        terms: terms of your own beside these, see :class:`Term`.
+        terms: terms of your own besides these, see :class:`Term`.
         **options: ``dims``, scales, ``space``, ``reading_space``, ``detach_every`` and ``reduction``, see
             :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. With a ``state_scale`` the mixture
             is a density of the state in its own units all the same.

@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
-    """A figure of its own that pyplot does not know, width and height in inches.
+    """Returns a figure of its own that pyplot does not know, width and height in inches.
 
     Raises:
         ImportError: without matplotlib.
@@ -38,7 +38,7 @@ def new_figure(size: tuple[float, float]) -> Figure:
 def axes_for(
     ax: Axes | Sequence[Axes] | None, count: int, size: tuple[float, float], *, share: bool = False
 ) -> list[Axes]:
-    """The Axes that were passed, or ``count`` new ones below each other.
+    """Returns the Axes that were passed, or ``count`` new ones below each other.
 
     Args:
         ax: an Axes, ``count`` of them, or ``None``.
@@ -104,7 +104,7 @@ def label_below(panels: Sequence[Axes], label: str) -> None:
 
 
 def one_each(what: str, given: Sequence[T] | None, default: list[T]) -> list[T]:
-    """One value a drawn component.
+    """Returns one value a drawn component.
 
     Raises:
         ValueError: if there are more or fewer.
@@ -115,12 +115,12 @@ def one_each(what: str, given: Sequence[T] | None, default: list[T]) -> list[T]:
 
 
 def labels_for(names: Sequence[str] | None, dims: Sequence[int]) -> list[str]:
-    """One label a component: the names, or ``state 3`` for dimension 3."""
+    """Returns one label a component: the names, or ``state 3`` for dimension 3."""
     return one_each("names", names, [f"state {dim}" for dim in dims])
 
 
 def times_of(time: float | Tensor | None, steps: int) -> np.ndarray:
-    """Seconds of the steps ``[T]`` from the seconds between two, or the steps' numbers.
+    """Returns seconds of the steps ``[T]`` from the seconds between two, or the steps' numbers.
 
     Raises:
         ValueError: for another number of times, and where they decrease, or are all the same.
@@ -136,7 +136,7 @@ def times_of(time: float | Tensor | None, steps: int) -> np.ndarray:
 
 
 def step_bounds(seconds: np.ndarray) -> np.ndarray:
-    """Where steps begin and end, half way between their times, ``[T+1]``."""
+    """Returns the borders of steps, half way between their times, ``[T+1]``."""
     if len(seconds) == 1:
         return np.array([seconds[0] - 0.5, seconds[0] + 0.5])
     middle = (seconds[1:] + seconds[:-1]) / 2

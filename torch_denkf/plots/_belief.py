@@ -1,4 +1,4 @@
-"""What the pictures read from a roll-out: belief, truth and which readings there were."""
+"""Belief, truth and observed masks of a roll-out, as plots read them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 
-Truth: TypeAlias = Tensor | NestedKey | None
+TensorOrKey: TypeAlias = Tensor | NestedKey | None
 
 
 class Belief(NamedTuple):
@@ -44,14 +44,14 @@ class Belief(NamedTuple):
 
     @property
     def ensemble_size(self) -> int | None:
-        """E of an ensemble whose members have one weight, else ``None``."""
+        """Returns E of an ensemble whose members have one weight, else ``None``."""
         return None if self.ensemble is None or self.log_weight is not None else self.ensemble.shape[-2]
 
 
 def read_belief(
     run: TensorDictBase | Tensor,
-    truth: Truth = None,
-    observed: Truth = None,
+    truth: TensorOrKey = None,
+    observed: TensorOrKey = None,
     *,
     belief: NestedKey = "belief",
     one_sequence: bool = False,
@@ -114,7 +114,7 @@ def read_belief(
 
 
 def covariance_at(read: Belief, step: int, dims: list[int]) -> Tensor:
-    """The belief's covariance of the chosen dimensions at one step, ``[len(dims), len(dims)]``; needs ``read.var``."""
+    """Returns the belief's covariance ``[len(dims), len(dims)]`` of dimensions at one step; needs ``read.var``."""
     assert read.var is not None
     if read.cov is not None:
         return read.cov[step][dims][:, dims]
@@ -129,13 +129,13 @@ def covariance_at(read: Belief, step: int, dims: list[int]) -> Tensor:
 
 
 def number(value: Tensor) -> Tensor:
-    """The tensor detached, on the CPU, in float64; masks stay masks."""
+    """Returns the tensor detached, on the CPU, in float64; masks stay masks."""
     value = torch.as_tensor(value).detach().cpu()
     return value if value.dtype == torch.bool else value.double()
 
 
 def dims_of(read: Belief, dims: object) -> list[int]:
-    """Checked dimensions of the state; all by default.
+    """Checks dimensions of the state; all by default.
 
     Raises:
         IndexError: if there is no such dimension.
@@ -149,7 +149,7 @@ def dims_of(read: Belief, dims: object) -> list[int]:
 
 
 def with_truth(read: Belief, dims: list[int]) -> Tensor:
-    """The truth of the chosen dimensions, ``[*B, len(dims)]``.
+    """Returns the truth of the chosen dimensions, ``[*B, len(dims)]``.
 
     Raises:
         ValueError: without a truth, or if it lacks the dimensions.
@@ -162,7 +162,7 @@ def with_truth(read: Belief, dims: list[int]) -> Tensor:
 
 
 def entry_of(source: TensorDictBase | Tensor, value: Any, default: str) -> Any:
-    """A tensor or array that is passed as such, that of a key, or the ``default`` entry where the roll-out has it.
+    """Returns a tensor or array that is passed, that of a key, or the ``default`` entry if the roll-out has it.
 
     Raises:
         KeyError: if there is no such key, or nothing that could have keys.

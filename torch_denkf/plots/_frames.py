@@ -14,7 +14,7 @@ _GIF_FOREVER = b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"
 
 
 def as_picture(frame: Tensor | np.ndarray) -> np.ndarray:
-    """A frame as ``[H, W, 3]`` uint8, from ``[H, W]``, ``[H, W, C]`` or ``[C, H, W]``, uint8 or floats in [0, 1].
+    """Converts a frame ``[H, W]``, ``[H, W, C]`` or ``[C, H, W]``, uint8 or floats in [0, 1], to ``[H, W, 3]`` uint8.
 
     Raises:
         ValueError: for other shapes.

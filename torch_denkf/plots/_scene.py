@@ -104,7 +104,7 @@ class Scene:
                 line.set_path_effects([withStroke(linewidth=line.get_linewidth() + 1, foreground="white")])
 
     def _shrink_labels(self) -> None:
-        """Makes the bands' names fit beside their Axes, all of one size."""
+        """Makes the bands' names fit next to their Axes, all of one size."""
         self.figure.draw_without_rendering()
         labels = [axes.yaxis.label for axes in self.bands]
         needed = [label.get_window_extent().height for label in labels]
@@ -122,7 +122,7 @@ class Scene:
         return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
 
     def frame(self, step: int) -> np.ndarray:
-        """The picture of one step, ``[H, W, 3]`` uint8."""
+        """Returns the picture of one step, ``[H, W, 3]`` uint8."""
         if self.camera is not None and self.pictures is not None:
             self.image.set_data(as_picture(self.pictures[step]))
             unseen = self.seen is not None and not bool(self.seen[step])

@@ -12,7 +12,7 @@ __all__ = ["angles_of", "in_components", "in_tangents", "names_of"]
 
 
 def in_components(read: Belief, space: Space) -> Belief:
-    """The belief in as many numbers as tangents have, D: roll, pitch and yaw in rad stand for a quaternion.
+    """Returns the belief in as many numbers as tangents have, D: roll, pitch and yaw in rad stand for a quaternion.
 
     Roll is about x, then pitch about y, then yaw about z, of axes that do not turn; pitch lies in [-pi/2, pi/2]. The
     variances, of tangents at the mean, are carried over by the derivative there. It has no end where pitch is +-pi/2:
@@ -40,7 +40,7 @@ def in_components(read: Belief, space: Space) -> Belief:
 
 
 def in_tangents(read: Belief, space: Space) -> Belief:
-    """The belief as tangents at its mean, ``[*, D]``: the mean is zero, and the truth is how far it lies from it.
+    """Returns the belief as tangents at its mean, ``[*, D]``: the mean is zero, the truth its distance to it.
 
     Args:
         read: points ``[*, P]``, variances of tangents.
@@ -62,12 +62,12 @@ def in_tangents(read: Belief, space: Space) -> Belief:
 
 
 def angles_of(space: Space) -> list[int]:
-    """Which of the D numbers are angles."""
+    """Returns the indices of the D numbers that are angles."""
     return [index for place in places_of(space) for index in range(place.rotation.start, place.rotation.stop)]
 
 
 def names_of(space: Space, turns: tuple[str, ...] = ("roll, deg", "pitch, deg", "yaw, deg")) -> list[str]:
-    """A label for each of the D numbers, with degrees for angles; ``turns`` are those of a rotation."""
+    """Returns a label for each of the D numbers, with degrees for angles; ``turns`` are those of a rotation."""
     names = [f"state {index}" for index in range(space.tangent_dim)]
     for place in places_of(space):
         names[place.rotation] = turns if _turns(place) == 3 else ("heading, deg",) * _turns(place)
@@ -79,7 +79,7 @@ def _turns(place: Place) -> int:
 
 
 def _components(point: Tensor, space: Space) -> Tensor:
-    """``[*, D]`` of points ``[*, P]``."""
+    """Returns ``[*, D]`` of points ``[*, P]``."""
     parts = []
     for place in places_of(space):
         own = point[..., place.point]
@@ -94,7 +94,7 @@ def _components(point: Tensor, space: Space) -> Tensor:
 
 
 def _slope(mean: Tensor, space: Space) -> Tensor:
-    """The derivative of the D numbers by the tangent, ``[*, D, D]``, at points ``[*, P]``."""
+    """Returns the derivative of the D numbers by the tangent, ``[*, D, D]``, at points ``[*, P]``."""
 
     def moved(tangent: Tensor, point: Tensor) -> Tensor:
         return _components(space.plus(point, tangent), space)

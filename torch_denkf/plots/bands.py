@@ -26,7 +26,7 @@ from torch_denkf.plots._axes import (
     step_bounds,
     times_of,
 )
-from torch_denkf.plots._belief import Belief, Truth, dims_of, number, read_belief, with_truth
+from torch_denkf.plots._belief import Belief, TensorOrKey, dims_of, number, read_belief, with_truth
 from torch_denkf.plots._space import angles_of, in_components, names_of
 
 if TYPE_CHECKING:
@@ -37,14 +37,14 @@ __all__ = ["plot_bands"]
 
 def plot_bands(
     run: TensorDictBase | Tensor,
-    truth: Truth = None,
+    truth: TensorOrKey = None,
     *,
     belief: NestedKey = "belief",
     dims: Sequence[int] | None = None,
     names: Sequence[str] | None = None,
     factors: Sequence[float] | None = None,
     readings: Mapping[int, Tensor] | None = None,
-    observed: Truth | Mapping[int, Truth] = None,
+    observed: TensorOrKey | Mapping[int, TensorOrKey] = None,
     gap: float | None = None,
     time: float | Tensor | None = None,
     level: float = 0.9,
@@ -163,19 +163,19 @@ def plot_bands(
 
 
 def _seen(read: Belief) -> Tensor | None:
-    """The steps at which anything was observed, ``[T]``."""
+    """Returns the steps at which anything was observed, ``[T]``."""
     return None if read.observed is None else read.observed.any(-1)
 
 
-def _masks(run: TensorDictBase | Tensor, observed: Mapping[int, Truth]) -> dict[int, Tensor | None]:
-    """The steps at which each component's sensor observed, ``[T]``."""
+def _masks(run: TensorDictBase | Tensor, observed: Mapping[int, TensorOrKey]) -> dict[int, Tensor | None]:
+    """Returns the steps at which each component's sensor observed, ``[T]``."""
     return {dim: _seen(read_belief(run, None, mask, one_sequence=True)) for dim, mask in observed.items()}
 
 
 def _edges(
     read: Belief, dims: list[int], angular: list[bool], level: float, band: str
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Mean, lower and upper end of the band, each ``[T, K]``."""
+    """Returns mean, lower and upper end of the band, each ``[T, K]``."""
     if band not in ("auto", "ensemble", "variance"):
         raise ValueError(f'band must be "auto", "ensemble" or "variance"; got {band!r}')
     if not 0 < level < 1:
@@ -206,7 +206,7 @@ def _unwrap(angle: Tensor) -> Tensor:
 
 
 def _turns(drawn: Sequence[Tensor | None], column: int) -> list[int]:
-    """The turns, 0 from -pi to pi, that unwrapped angles go through: of what is drawn, ``[T, K]`` each, in a column."""
+    """Returns the turns, 0 from -pi to pi, of unwrapped angles: of what is drawn, ``[T, K]`` each, in a column."""
     values = torch.cat([value[:, column] for value in drawn if value is not None])
     values = values[values.isfinite()]
     if not len(values):
@@ -216,13 +216,13 @@ def _turns(drawn: Sequence[Tensor | None], column: int) -> list[int]:
 
 
 def _beside(values: Tensor, mean: Tensor, angular: list[bool]) -> Tensor:
-    """The values; angles brought within π of the mean."""
+    """Returns the values; angles brought within π of the mean."""
     turned = torch.tensor(angular)
     return torch.where(turned, mean + wrap_angles(values - mean), values)
 
 
 def _outages(seen: Tensor, seconds: np.ndarray, gap: float | None) -> np.ndarray:
-    """The first step of each outage, and the step after its last, ``[K, 2]``."""
+    """Returns the first step of each outage, and the step after its last, ``[K, 2]``."""
     change = np.diff(np.concatenate([[0], (~seen).numpy().astype(int), [0]]))
     first, last = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0

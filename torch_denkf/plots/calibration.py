@@ -13,7 +13,7 @@ from torch import Tensor
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.metrics import pit
 from torch_denkf.plots._axes import FILL, TRUTH, axes_for, label_below, labels_for, legend_above
-from torch_denkf.plots._belief import Truth, dims_of, read_belief, with_truth
+from torch_denkf.plots._belief import TensorOrKey, dims_of, read_belief, with_truth
 from torch_denkf.plots._space import in_tangents, names_of
 from torch_denkf.plots.histograms import histogram_band, rank_histogram
 
@@ -25,7 +25,7 @@ __all__ = ["plot_calibration"]
 
 def plot_calibration(
     run: TensorDictBase,
-    truth: Truth = None,
+    truth: TensorOrKey = None,
     *,
     belief: NestedKey = "belief",
     dims: Sequence[int] | None = None,

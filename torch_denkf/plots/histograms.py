@@ -1,4 +1,4 @@
-"""What the pictures of calibration show: histograms of ranks with their band, and errors over spread."""
+"""Plots of calibration: rank histograms with their band, and errors over spread."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def spread_error(
     ensemble_size: int | None = None,
     space: Space | None = None,
 ) -> SpreadError:
-    """Predicted spread and actual error, in bins of states with similar spread.
+    """Returns the predicted spread and actual error, in bins of states with similar spread.
 
     A filter that knows how wrong it is has spread = error in each bin.
 

@@ -1,4 +1,4 @@
-"""The path that a filter believes in, against the truth."""
+"""The path of the belief, against the truth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torch_denkf.plots._axes import BELIEF, DASHES, OTHERS, READING, TRUTH, axes_for, legend_above, new_figure
-from torch_denkf.plots._belief import Belief, Truth, covariance_at, dims_of, number, read_belief, with_truth
+from torch_denkf.plots._belief import Belief, TensorOrKey, covariance_at, dims_of, number, read_belief, with_truth
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +24,7 @@ MEMBERS, ELLIPSES = 32, 12  # that are drawn: the first ones; evenly over time
 
 def plot_path(
     run: TensorDictBase | Tensor,
-    truth: Truth = None,
+    truth: TensorOrKey = None,
     *,
     belief: NestedKey = "belief",
     others: Mapping[str, Tensor] | None = None,
@@ -37,7 +37,7 @@ def plot_path(
     legend: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draws the believed path with its spread, the true one and others, with one scale for both axes.
+    """Draws the mean path with its spread, the true one and others, with one scale for both axes.
 
     Args:
         run: a roll-out or sequence of T steps with ``("belief", "mean")`` ``[T, S]`` or ``("belief", "ensemble")``
@@ -81,7 +81,7 @@ def plot_path(
     axes = _axes(ax, len(chosen))
 
     def place(states: Tensor, dims: Sequence[int] = chosen) -> list[np.ndarray]:
-        """Coordinates on the picture's axes, each ``[T, ...]``."""
+        """Returns coordinates on the picture's axes, each ``[T, ...]``."""
         parts = [states[..., dim].numpy() for dim in dims]
         return [-parts[1], parts[0]] if forward_up else parts
 
@@ -118,7 +118,7 @@ def plot_path(
 
 
 def _kind(read: Belief, spread: str, count: int) -> str:
-    """Which spread to draw."""
+    """Returns the kind of spread to draw."""
     if spread not in ("auto", "ensemble", "ellipses", "none"):
         raise ValueError(f'spread must be "auto", "ensemble", "ellipses" or "none"; got {spread!r}')
     if spread == "ensemble" and read.ensemble_size is None:

@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.plots._axes import BELIEF, MARKERS, OTHERS, TRUTH, axes_for, labels_for, legend_above, one_each
-from torch_denkf.plots._belief import Truth, dims_of, read_belief, with_truth
+from torch_denkf.plots._belief import TensorOrKey, dims_of, read_belief, with_truth
 from torch_denkf.plots._space import angles_of, in_tangents, names_of
 from torch_denkf.plots.histograms import spread_error
 
@@ -22,7 +22,7 @@ __all__ = ["plot_spread_error"]
 
 def plot_spread_error(
     run: TensorDictBase,
-    truth: Truth = None,
+    truth: TensorOrKey = None,
     *,
     belief: NestedKey = "belief",
     dims: Sequence[int] | None = None,

@@ -1,4 +1,4 @@
-"""Videos: frames to a file, and a belief that grows with time beside what the camera saw."""
+"""Videos: frames to a file, and a belief that grows with time next to what the camera saw."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torch_denkf.plots._axes import times_of
-from torch_denkf.plots._belief import Truth, entry_of, read_belief
+from torch_denkf.plots._belief import TensorOrKey, entry_of, read_belief
 from torch_denkf.plots._frames import as_picture, write_gif, write_mp4
 from torch_denkf.plots._scene import Scene
 from torch_denkf.plots.bands import plot_bands
@@ -64,8 +64,8 @@ def belief_video(
     pixels: Tensor | np.ndarray | NestedKey | None = None,
     *,
     belief: NestedKey = "belief",
-    truth: Truth = None,
-    observed: Truth = None,
+    truth: TensorOrKey = None,
+    observed: TensorOrKey = None,
     time: float | Tensor | None = None,
     path: Mapping[str, Any] | None = None,
     on_picture: bool = False,
@@ -106,7 +106,7 @@ def belief_video(
     Raises:
         ImportError: without matplotlib or pillow; the message names the extra.
         KeyError: if the roll-out lacks a key that was named.
-        ValueError: if there is nothing to draw, and for all that the functions above refuse.
+        ValueError: if there is nothing to draw, and for all errors of the functions above.
 
     Example:
         >>> import tempfile
@@ -146,7 +146,7 @@ def _panel_count(bands: Mapping[str, Any] | None, state_dim: int) -> int:
 
 
 def _own_speed(time: float | Tensor | None, every: int) -> float:
-    """Frames a second at which the sequence goes by as fast as it did."""
+    """Returns frames a second at which the sequence goes by as fast as it did."""
     if time is None:
         return 10.0 / every
     dt = float(torch.as_tensor(time).flatten().diff().median()) if isinstance(time, Tensor) else time

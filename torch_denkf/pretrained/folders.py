@@ -29,7 +29,7 @@ def available() -> list[str]:
 def from_pretrained(
     name_or_folder: str | Path, *, builders: Mapping[str, Callable[..., Filter]] | None = None
 ) -> Filter:
-    """A trained filter: one that comes with the library, or one that was saved to a folder. Nothing is downloaded.
+    """Loads a trained filter: one that comes with the library, or one that was saved to a folder; without downloads.
 
     The weights are data only, the filter is built by a function of this library from the numbers in ``config.json``,
     and the weights' SHA-256 is compared with the one that stands there: no code of a file is executed.
@@ -83,7 +83,7 @@ def save_pretrained(
 ) -> Path:
     """Writes a filter to a folder that :func:`from_pretrained` reads.
 
-    The filter is built anew from its settings, and compared with the one that is to be stored: numbers of members,
+    The filter is built again from its settings, and compared with the one that is to be stored: numbers of members,
     keys, schemes, shapes, whatever does not come back with the weights. Where the two differ, nothing is written.
 
     Args:

@@ -23,7 +23,7 @@ class Smoother(Checked, TensorDictModuleBase):
 
     It writes all that the filter writes, and ``("smoothed", "mean")`` and ``("smoothed", "var")`` ``[*B, T, S]``, with
     ``("smoothed", "cov")`` or ``("smoothed", "ensemble")`` where there is one. At a time t that is the belief of the
-    state *of t*, given the readings up to t + lag. (:class:`FixedLag` writes at t what it believes of t - lag.) Nothing
+    state *of t*, given the readings up to t + lag. (:class:`FixedLag` writes at t the belief of t - lag.) Nothing
     flows back over the border of an episode or a slice: those that :meth:`Filter.sequence` heeds. The gradient flows
     through filter and smoother.
 
@@ -50,7 +50,7 @@ class Smoother(Checked, TensorDictModuleBase):
         self._running: tuple = (None, None)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Like :meth:`sequence`."""
+        """Runs :meth:`sequence`."""
         return self.sequence(tensordict)
 
     def sequence(
@@ -66,7 +66,7 @@ class Smoother(Checked, TensorDictModuleBase):
             tensordict: frames, see there.
             detach_every: truncates back-propagation through the filter's time; what flows back from later states does
                 not stop there.
-            keep: the filter's outputs to write beside the smoothed belief; all by default.
+            keep: the filter's outputs to write besides the smoothed belief; all by default.
 
         Returns:
             ``tensordict``, with the outputs.
@@ -96,7 +96,7 @@ class Smoother(Checked, TensorDictModuleBase):
         return self.filter.stepped(tensordict)
 
     def _filter_for(self, count: int) -> Filter:
-        """The filter that runs on sequences of ``count`` steps; made anew where a module has been replaced."""
+        """Returns the filter that runs on sequences of ``count`` steps; made again where a module has been replaced."""
         lag = self.lag if self.lag is not None else max(count - 1, 1)
         if self._running[0] != lag or self._running[1] is not self.filter.structure:
             self._running = (lag, self.filter.structure, self._extended(lag))
@@ -106,11 +106,11 @@ class Smoother(Checked, TensorDictModuleBase):
         return filter
 
     def _extended(self, lag: int) -> Filter:
-        """The filter, or one of the same modules that also writes what the smoother needs."""
+        """Returns the filter, or one of the same modules that also writes what the smoother needs."""
         return self.filter
 
     def _smooth(self, entries: Entries, follows: Tensor, out: TensorDictBase) -> tuple[Tensor, ...]:
-        """The smoothed belief, in the order of ``smoothed_keys``.
+        """Returns the smoothed belief, in the order of ``smoothed_keys``.
 
         Args:
             entries: ``[*B, T, ...]``, what is read and what the filter wrote.
@@ -121,7 +121,7 @@ class Smoother(Checked, TensorDictModuleBase):
 
 
 def last_of_runs(follows: Tensor) -> Tensor:
-    """The last index of each element's run of elements that follow each other, ``[*B, T]``.
+    """Returns the last index of each element's run of elements that follow each other, ``[*B, T]``.
 
     Example:
         >>> last_of_runs(torch.tensor([False, True, False, True, True])).tolist()

@@ -59,16 +59,16 @@ class EnRTS(Smoother):
         if damping is not None:
             check_number("damping", damping, above=0, most=1, cure="It is a factor on each gain")
         self.damping = damping
-        self._refuse_inflation()
+        self._check_inflation()
 
     def _smooth(self, entries, follows, out):
-        self._refuse_inflation()  # it may have been set since
+        self._check_inflation()  # it may have been set since
         values, damping = (entries[key] for key in self._needed), 1.0 if self.damping is None else self.damping
         space = self.filter.structure.space
         ensemble = enrts_smooth(*values, follows=follows, lag=self.lag, damping=damping, space=space)
         return ensemble, *moments_of(ensemble, None, space)
 
-    def _refuse_inflation(self) -> None:
+    def _check_inflation(self) -> None:
         """Raises where gains would carry an inflation back, and nobody said how to damp it."""
         for part in in_role(self.filter, SubModel) if self.damping is None else ():
             for name, none in (("inflation", 1.0), ("adapt_inflation", 0.0)):
@@ -112,7 +112,7 @@ class EnKS(Smoother):
         self.prefix = prefix_of(filter, "ensemble", self)
         keys = [(self.prefix, "ensemble")] + [(self.prefix, "past")] * (lag != 0)
         super().__init__(filter, lag, keys, ("ensemble", "mean", "var"))
-        self._filter_for(2)  # refuses what a lag cannot be added to
+        self._filter_for(2)  # raises for modules that cannot have a lag
 
     def _extended(self, lag):
         return FixedLag(self.filter, lag) if lag else self.filter
@@ -126,7 +126,7 @@ class EnKS(Smoother):
 
 
 def of_own_time(ensemble: Tensor, past: Tensor, follows: Tensor) -> tuple[Tensor, Tensor]:
-    """The members of each time as they are L steps later, or at the end of their episode.
+    """Returns the members of each time as they are L steps later, or at the end of their episode.
 
     Args:
         ensemble: ``[*B, T, E, S]``.

@@ -1,4 +1,4 @@
-"""Fixed-lag smoothing online: any filter, with its last states beside its belief."""
+"""Fixed-lag smoothing online: any filter, with its last states next to its belief."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ __all__ = ["FixedLag", "kind_of", "prefix_of"]
 
 
 class FixedLag(Filter):
-    """A filter that also says, at each step, what it now believes of the state L steps ago.
+    """A filter that also writes, at each step, the smoothed belief of the state L steps ago.
 
-    The belief of t is the filter's own. Beside it stand ``("smoothed", "mean")`` and ``("smoothed", "var")``,
+    The belief of t is the filter's own. Next to it stand ``("smoothed", "mean")`` and ``("smoothed", "var")``,
     ``[*B, S]``, of the state at t - L, given all readings up to t, and ``("smoothed", "age")`` ``[*B, 1]``: by how many
     steps that state lies back, which is L, or fewer where the episode is younger. How it is done follows from the
     belief:
@@ -168,7 +168,7 @@ def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> Ordere
             return TensorDictSequential(OrderedDict((name, changed(part)) for name, part in named_modules_of(module)))
         if role(module, Update).info_prefix is not None:
             found = True
-            return lagged(module)  # which refuses what it cannot wrap
+            return lagged(module)  # raises for what it cannot wrap
         return module
 
     out = OrderedDict((name, changed(module)) for name, module in modules.items())

@@ -84,7 +84,7 @@ class ParticleSmoother(Smoother):
         return particles, smoothed, *moments_of(particles, smoothed, self.filter.structure.space)
 
     def _densities(self, entries: Entries, particles: Tensor, log_weights: Tensor) -> Tensor:
-        """Log-density of each particle at t, in the columns, given each at t − 1, in the rows, ``[*B, T, E, E]``."""
+        """Returns log-densities of particles at t (columns), given those at t − 1 (rows), ``[*B, T, E, E]``."""
         motion, structure = self.filter.transition_module.module, self.filter.structure
         space = structure.space
         key, out_key = unravel_key(motion.in_keys[0]), unravel_key(motion.out_keys[0])
@@ -115,7 +115,7 @@ class ParticleSmoother(Smoother):
 
 
 def log_density_of_pairs(values: Tensor, means: Tensor, cov: Tensor, space: Space | None = None) -> Tensor:
-    """Log-density N(value; mean, cov) of each value, in the columns, around each mean, in the rows.
+    """Returns the log-density N(value; mean, cov) of each value, in the columns, around each mean, in the rows.
 
     Args:
         values: ``[*B, E, S]``.

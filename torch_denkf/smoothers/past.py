@@ -56,7 +56,7 @@ def with_past(
     age: int = 0,
     belief_prefix: str = "belief",
 ) -> AugmentedBelief:
-    """An initial belief with a past: L copies of its state.
+    """Returns an initial belief with a past: L copies of its state.
 
     Args:
         initial: the initial belief.
@@ -122,7 +122,7 @@ class EnsemblePast(SubModel):
         super().__init__(nn.Identity(), [(belief_prefix, "ensemble"), (belief_prefix, "past")], [PAST_KEY])
 
     def compute(self, ensemble, past):
-        """The past."""
+        """Returns the past."""
         return torch.cat([ensemble.unsqueeze(-2), past[..., :-1, :]], -2)
 
 
@@ -163,15 +163,15 @@ class LaggedAnalysis(Around):
     updates_ensemble = True
 
     def on_entries(self, entries, call):
-        """The belief, the diagnostics, and the past."""
+        """Returns the belief, the diagnostics, and the past."""
         return self.on_aligned(self.aligned(entries), call)
 
     def aligned(self, entries):
-        """See :meth:`EnsembleAnalysis.aligned`."""
+        """Implements :meth:`EnsembleAnalysis.aligned`."""
         return self.module.aligned(entries)
 
     def on_aligned(self, entries, call):
-        """See :meth:`EnsembleAnalysis.on_aligned`."""
+        """Implements :meth:`EnsembleAnalysis.on_aligned`."""
         analysis = self.module
         values, past = analysis.values(entries), self.required(entries, self.out_keys[-1])
         noise = analysis._noise(entries, values, call) if analysis.draws else None
@@ -180,7 +180,7 @@ class LaggedAnalysis(Around):
 
 
 def lagged(analysis: Update) -> Update:
-    """The analysis, which corrects the past, too; inside of what goes around it, such as a gate.
+    """Extends an analysis to correct the past, too; inside of what goes around it, such as a gate.
 
     Raises:
         TypeError: if it does not say what it does to other states.
@@ -221,12 +221,12 @@ class LaggedBelief(SubModel):
         self.space = space
 
     def compute(self, past, age, log_weight=None):
-        """The past, and the belief of its oldest state."""
+        """Returns the past, and the belief of its oldest state."""
         check_age(age, past.shape[:-3])
         ensemble = past[..., -1, :]
         return past, ensemble, *moments_of(ensemble, log_weight, self.space), (age + 1).clamp(max=past.shape[-2])
 
 
 def check_age(age: torch.Tensor, batch_size: Sequence[int]) -> None:
-    """Raise unless the age of the oldest state that is carried is ``[*B, 1]``."""
+    """Raises unless the age of the oldest state that is carried is ``[*B, 1]``."""
     check_shape("the age of what is smoothed", age, (*batch_size, 1), "[*B, 1]")

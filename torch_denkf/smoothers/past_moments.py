@@ -32,7 +32,7 @@ class CrossTransition(Wrapper, Transition):
         transition: :class:`LinearTransition`, :class:`EKFTransition` or :class:`UKFTransition`; its keys and its noise
             are kept.
         with_open: whether it also writes ``"open"``, the covariance of the state before the step where that after it is
-            known, ``[*B, S, S]``; ``"cross"`` has rows before the step, ``[*B, S, S]``, and both stand beside the mean.
+            known, ``[*B, S, S]``; ``"cross"`` has rows before the step, ``[*B, S, S]``, and both stand by the mean.
 
     Raises:
         TypeError: for another transition.
@@ -54,7 +54,7 @@ class CrossTransition(Wrapper, Transition):
         super().__init__(transition, out_keys=[*transition.out_keys, *keys])
 
     def on_entries(self, entries, call):
-        """The forecast and the cross-covariance."""
+        """Returns the forecast and the cross-covariance."""
         written, link = self.module.with_link(entries, call)
         before, middle, after = link[:3]
         made = [before @ middle @ after.mT]
@@ -69,7 +69,7 @@ class CrossTransition(Wrapper, Transition):
 
 
 def _copies(prefix: str, lag: int, belief: Entries) -> list[torch.Tensor]:
-    """The state itself, of which nothing is left open."""
+    """Returns the state itself, of which nothing is left open."""
     mean, cov = belief[prefix, "mean"], belief[prefix, "cov"]
     gain = torch.eye(cov.shape[-1], dtype=mean.dtype, device=mean.device).expand(cov.shape)
     return [torch.stack([value] * lag, -2 if value is mean else -3) for value in (mean, 0 * cov, gain)]
@@ -80,7 +80,7 @@ def _oldest_carried(prefix: str, lag: int, entries: Entries, *, space: Space | N
 
 
 def _oldest(cov: torch.Tensor, past_mean, past_cov, past_gain) -> tuple[torch.Tensor, ...]:
-    """Mean, covariance and variance of the oldest state, beside the covariance of the present one."""
+    """Returns mean, covariance and variance of the oldest state, next to the covariance of the present one."""
     gain = past_gain[..., -1, :, :]
     smoothed = past_cov[..., -1, :, :] + gain @ cov @ gain.mT
     smoothed = (smoothed + smoothed.mT) / 2
@@ -113,7 +113,7 @@ class MomentsPast(SubModel):
         super().__init__(nn.Identity(), in_keys, [("past", name) for name in ("mean", "cov", "gain")])
 
     def compute(self, mean, cov, cross, open_cov, past_mean, past_cov, past_gain, age):
-        """The past."""
+        """Returns the past."""
         check_age(age, mean.shape[:-1])
         # At the start of an episode, before its own frame, no step has been made.
         start = (age < 0).unsqueeze(-1)
@@ -127,7 +127,7 @@ class MomentsPast(SubModel):
 
 
 class LaggedMoments(SubModel):
-    """The past after a reading, and what is believed of the state L steps ago.
+    """The past after a reading, and the smoothed belief of the state L steps ago.
 
     Args:
         belief_prefix: prefix of ``mean``, ``cov`` and of the past that is carried on, see ``MOMENTS_PAST``.
@@ -150,7 +150,7 @@ class LaggedMoments(SubModel):
         self.space = space
 
     def compute(self, mean, cov, forecast, past_mean, past_cov, past_gain, age):
-        """The past, and the belief of its oldest state."""
+        """Returns the past, and the belief of its oldest state."""
         learned = mean - forecast if self.space is None else self.space.minus(mean, forecast)
         shift = (past_gain @ learned[..., None, :, None]).squeeze(-1)
         if self.space is None:

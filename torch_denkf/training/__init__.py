@@ -2,6 +2,7 @@
 
 from torch_denkf.training.calibration import choose, choose_for_coverage, hold_last
 from torch_denkf.training.distributed import Processes
+from torch_denkf.training.kin import take_weights
 from torch_denkf.training.logs import RunLogs
 from torch_denkf.training.stage import Stage
 from torch_denkf.training.trainer import FilterTrainer
@@ -14,4 +15,5 @@ __all__ = [
     "choose",
     "choose_for_coverage",
     "hold_last",
+    "take_weights",
 ]

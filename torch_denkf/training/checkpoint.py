@@ -23,7 +23,7 @@ _FORMAT = "torch_denkf.training/1"
 
 
 def write_checkpoint(file: Path | str, content: Mapping[str, Any]) -> None:
-    """Writes ``content`` beside ``file`` and then puts it in its place: a kill leaves the old file or the new one.
+    """Writes ``content`` next to ``file`` and then puts it in its place: a kill leaves the old file or the new one.
 
     Equal content gives equal bytes.
 
@@ -47,7 +47,7 @@ def write_checkpoint(file: Path | str, content: Mapping[str, Any]) -> None:
 
 
 def _alone(content: Any) -> Any:
-    """The content in containers of its own, with one object for each text.
+    """Copies the content to new containers, with one object for each text.
 
     Pickle writes an object that it has met before as a reference to the first. So the same words and numbers give other
     bytes where two equal texts are two objects, as they are once one of them has been read from a file.
@@ -72,7 +72,7 @@ def read_checkpoint(file: Path | str) -> dict[str, Any]:
     file = Path(file)
     if not file.is_file():
         raise FileNotFoundError(f"There is no checkpoint {file}.")
-    cure = "move it away to start anew, or restore it from a copy"
+    cure = "move it away to start again, or restore it from a copy"
     try:
         with zipfile.ZipFile(file) as archive:  # torch.load does not look at the checksums
             if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
@@ -98,6 +98,7 @@ _STATE = {
     "results": dict,
     "best": (dict, type(None)),
     "last_metrics": dict,
+    "first": (float, type(None)),
     "logs": dict,
     "hooks": dict,
 }
@@ -116,7 +117,7 @@ def check_state(file: Path | str, state: Mapping[str, Any]) -> None:
     """
 
     def refuse(what: str) -> None:
-        raise ValueError(f"{file} is not the state of a training: {what}; move it away to start anew.")
+        raise ValueError(f"{file} is not the state of a training: {what}; move it away to start again.")
 
     def check(part: Mapping[str, Any], kinds: Mapping[str, Any], where: str) -> None:
         for name, kind in kinds.items():
@@ -169,13 +170,13 @@ def check_settings(file: Path | str, saved: Mapping[str, Any], wanted: Mapping[s
     different = [f"{name} ({_short(old, new)}, now {_short(new, old)})" for name, old, new in pairs if old != new]
     if different:
         raise ValueError(
-            f"{file} is of another training: {', '.join(different)} differ. Give another out, or start anew with "
+            f"{file} is of another training: {', '.join(different)} differ. Give another out, or start again with "
             "fit(resume=False)."
         )
 
 
 def _short(value: Any, other: Any) -> str:
-    """A setting, for a message; of the names of parameters those that the other one has not."""
+    """Returns a setting, for a message; of the names of parameters those that the other one has not."""
     if not isinstance(value, list) or not isinstance(other, list):
         return str(value)
     own = [name for group in value for name in group if not any(name in theirs for theirs in other)]

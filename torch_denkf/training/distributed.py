@@ -57,7 +57,7 @@ class Processes:
 
     @property
     def is_main(self) -> bool:
-        """Whether this process validates, logs and writes checkpoints."""
+        """Returns True in the process that validates, logs and writes checkpoints."""
         return self.rank == 0
 
     def share(self, value: T) -> T:

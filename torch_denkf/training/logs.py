@@ -75,7 +75,7 @@ class RunLogs:
             self._log(values, step)
 
     def files(self) -> list[Path]:
-        """The files that the loggers made here write."""
+        """Returns the files that the loggers made here write."""
         return [file for file, _ in self._files()]
 
     def _log(self, values: Mapping[str, float], step: int) -> None:
@@ -83,7 +83,7 @@ class RunLogs:
             logger.log_metrics(dict(values), step=step)
 
     def mark(self) -> dict[str, int]:
-        """The sizes of all files in bytes, as they are now."""
+        """Returns the sizes of all files in bytes, as they are now."""
         with clear_errors(self.folder / "csv", "choose another out", name=f"logs to {self.folder}"):
             for logger in self._own:
                 logger.flush()

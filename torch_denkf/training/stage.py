@@ -94,13 +94,13 @@ class Stage:
             object.__setattr__(self, "parameters", parameters)
 
     def length(self, update: int) -> int | None:
-        """The sequence length of an update, counted from zero; ``None`` without ``lengths``."""
+        """Returns the sequence length of an update, counted from zero; ``None`` without ``lengths``."""
         if self.lengths is None:
             return None
         return self.lengths[max(start for start in self.lengths if start <= update)]
 
     def groups(self, model: nn.Module) -> list[dict]:
-        """The trained parameters as an optimiser's groups.
+        """Returns the trained parameters as an optimiser's groups.
 
         Raises:
             ValueError: if there are none, or ``model`` lacks some: no checkpoint would hold them.
@@ -125,7 +125,7 @@ class Stage:
         return groups
 
     def optimiser(self, groups: list[dict]) -> tuple[torch.optim.Optimizer, LRScheduler]:
-        """AdamW for :meth:`groups`, and its schedule."""
+        """Returns AdamW for :meth:`groups`, and its schedule."""
         optimiser = torch.optim.AdamW(groups, lr=self.lr, weight_decay=self.weight_decay)
         if callable(self.schedule):
             return optimiser, self.schedule(optimiser, self.updates)
@@ -137,7 +137,7 @@ class Stage:
         return optimiser, LambdaLR(optimiser, lambda update: 1.0)
 
     def settings(self, model: nn.Module) -> dict:
-        """What a checkpoint must agree with to be resumed; plain values."""
+        """Returns the settings that a checkpoint must share to be resumed; plain values."""
         names = {id(parameter): name for name, parameter in model.named_parameters()}
         schedule = self.schedule if isinstance(self.schedule, str) else getattr(self.schedule, "__qualname__", "custom")
         return {
@@ -150,6 +150,32 @@ class Stage:
             "lengths": None if self.lengths is None else dict(sorted(self.lengths.items())),
             "parameters": [[names[id(p)] for p in group["params"]] for group in self.groups(model)],
         }
+
+
+def why_no_gain(stage: Stage, first: float, value: float, update: int) -> str:
+    """Returns what a stage that gained less than 1 % is to be told, or nothing.
+
+    Args:
+        stage: the stage.
+        first: the monitored error before its first update.
+        value: the one that was kept.
+        update: after which it was found.
+
+    Example:
+        >>> why_no_gain(Stage("whole", dict, dict, 100, lengths={0: 6}), 2.0, 2.0, 0)[:67]
+        "Stage 'whole' gained nothing: the error is 2 as before it. Likely: "
+    """
+    if not first - value < 0.01 * abs(first):
+        return ""
+    said = f"made the error worse, {first:.4g} to {value:.4g}" if value > first else "gained nothing: the error is "
+    if value <= first:
+        said += f"{value:.4g} as before it" if update == 0 else f"{value:.4g}, and {first:.4g} before it"
+    causes = [f"lr={stage.lr:g} is too high" if update == 0 or value > first else f"lr={stage.lr:g} is too low"]
+    if stage.lengths is not None:
+        longest = max(stage.lengths.values())
+        causes.append(f"windows of {longest} steps are too short to show what the filter does later")
+    causes.append("the loss and the validation ask for different things, or the training batches are learned by heart")
+    return f"Stage {stage.name!r} {said}. Likely: {'; '.join(causes)}."
 
 
 @contextmanager

@@ -16,12 +16,12 @@ from torchrl.record.loggers.common import Logger
 from torch_denkf._checks import check_count
 from torch_denkf.compilation.lock import locked
 from torch_denkf.deployment.progress import progress_bar
+from torch_denkf.training.backups import back_up
 from torch_denkf.training.checkpoint import check_settings, check_state, read_checkpoint, write_checkpoint
 from torch_denkf.training.distributed import Processes
-from torch_denkf.training.earlier import set_aside
 from torch_denkf.training.hooks import HookPoints
 from torch_denkf.training.logs import RunLogs
-from torch_denkf.training.stage import Stage, only_trainable
+from torch_denkf.training.stage import Stage, only_trainable, why_no_gain
 from torch_denkf.training.update import Updates, seed_update
 
 __all__ = ["FilterTrainer"]
@@ -38,7 +38,8 @@ class FilterTrainer(HookPoints):
     (:class:`~torch_denkf.training.hooks.HookPoints`) go in as they are.
 
     A stage is validated before its first update, every ``validate_every`` updates and after its last. The next stage
-    starts from the best parameters of the one before, and those of the last are in the model at the end.
+    starts from the best parameters of the one before, and those of the last are in the model at the end. A stage that
+    lowered the monitored error by less than 1 % is logged as a warning, with what is likely.
 
     **Resuming.** ``fit`` goes on from ``out/last.pt`` where there is one. After a kill at any point, parameters and
     CSV logs are bit for bit those of an unbroken run, on the same machine and number of threads; so are the checkpoint
@@ -142,17 +143,18 @@ class FilterTrainer(HookPoints):
         self._results: dict[str, dict[str, Any]] = {}
         self._best: dict[str, Any] | None = None
         self._last_metrics: dict[str, float] = {}
+        self._first: float | None = None  # the monitored error before the stage's first update
 
     @property
     def last_checkpoint(self) -> Path:
-        """The file from which a training is resumed."""
+        """Returns the file from which a training is resumed."""
         return self.out / "last.pt"
 
     def fit(self, *, resume: bool = True) -> dict[str, dict[str, Any]]:
         """Trains to the end; where a checkpoint is, from there.
 
         Args:
-            resume: ``False`` removes an earlier run's checkpoints and logs from ``out`` and starts anew.
+            resume: ``False`` removes an earlier run's checkpoints and logs from ``out`` and restarts.
 
         Returns:
             for each stage: ``value`` of the monitored error (``None`` without validation) at its best ``update``, all
@@ -172,7 +174,7 @@ class FilterTrainer(HookPoints):
         state = self.processes.share(self._open(resume) if self.processes.is_main else {})
         self._load_model(state["model"], str(self.last_checkpoint))
         self._results, self._best = state["results"], state["best"]
-        self._last_metrics = state["last_metrics"]
+        self._last_metrics, self._first = state["last_metrics"], state["first"]
         self._load_hook_state(state["hooks"])
         randomness = GlobalRNGState().state_dict()  # what follows a training is not to depend on where it was resumed
         try:
@@ -257,6 +259,8 @@ class FilterTrainer(HookPoints):
             raise KeyError(f"Stage {stage.name!r}: monitor={monitor!r} is none of {sorted(metrics)}; set monitor=...")
         self._log(stage, {f"validation/{name}": value for name, value in metrics.items()}, made)
         self._last_metrics = metrics
+        if made == 0:
+            self._first = metrics[monitor]
         if self.keep == "last" or metrics[monitor] < (float("inf") if self._best is None else self._best["value"]):
             self._set_best(stage, made, metrics[monitor], metrics)
 
@@ -278,6 +282,10 @@ class FilterTrainer(HookPoints):
         self._load_model(best["model"], f"best_{stage.name}.pt")
         result = {key: best[key] for key in ("value", "update", "metrics")}
         self._results[stage.name] = {**result, "path": f"best_{stage.name}.pt", "skipped": updates.skipped}
+        if self.processes.is_main and self._first is not None and result["value"] is not None:
+            said = why_no_gain(stage, self._first, result["value"], result["update"])
+            if said:
+                _LOG.warning(said)
         if number + 1 == len(self.stages):
             self._save(number + 1, 0, None)
 
@@ -291,6 +299,7 @@ class FilterTrainer(HookPoints):
             state = {"settings": self._settings, "stage": number, "update": made, "logs": self._logs.mark()}
             state |= {"model": self.model.state_dict(), "updates": None if updates is None else updates.state_dict()}
             state |= {"results": self._results, "best": self._best, "last_metrics": self._last_metrics}
+            state |= {"first": self._first}
             write_checkpoint(self.last_checkpoint, {**state, "hooks": self._hook_state()})
 
     def _open(self, resume: bool) -> dict[str, Any]:
@@ -304,19 +313,28 @@ class FilterTrainer(HookPoints):
             self._logs.open(state["logs"])
             if state["stage"] == len(self.stages):
                 _LOG.warning(
-                    "The training in %s is finished: its result is read and nothing is trained. Start anew with "
+                    "The training in %s is finished: its result is read and nothing is trained. Start again with "
                     "fit(resume=False), or give another out.",
                     self.out,
                 )
             return state
-        if self.last_checkpoint.exists():  # the caller wants to start anew
+        if self.last_checkpoint.exists():  # the caller wants to start again
             for file in (self.last_checkpoint, *self.out.glob("best_*.pt")):
                 file.unlink(missing_ok=True)
         else:
-            set_aside(self.out, [*self.out.glob("best_*.pt"), *self._logs.files()])
+            back_up(self.out, [*self.out.glob("best_*.pt"), *self._logs.files()])
         self._logs.open({})
-        state = {"stage": 0, "update": 0, "updates": None, "results": {}, "best": None, "last_metrics": {}, "hooks": {}}
-        return {**state, "model": self._model_on_cpu()}
+        state = {
+            "stage": 0,
+            "update": 0,
+            "updates": None,
+            "results": {},
+            "best": None,
+            "last_metrics": {},
+            "first": None,
+            "hooks": {},
+        }
+        return {**state, "hooks": {}, "model": self._model_on_cpu()}
 
     def _model_on_cpu(self) -> dict[str, torch.Tensor]:
         return {name: tensor.detach().cpu().clone() for name, tensor in self.model.state_dict().items()}

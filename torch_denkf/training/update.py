@@ -116,7 +116,7 @@ class Updates:
         return False
 
     def summary(self) -> dict[str, float]:
-        """Means over the updates since the last call: terms, their sum ``loss``, and the gradient's norm unclipped.
+        """Returns means over the updates since the last call: terms, their sum ``loss``, the unclipped gradient norm.
 
         Also ``lr`` (of the first group, at the last update) and ``skipped``, counted from the start of the stage.
         """
@@ -127,7 +127,7 @@ class Updates:
         return {**values, "skipped": float(self.skipped)}
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next update depends on, beside the model."""
+        """Returns all that the next update depends on, besides the model."""
         return {
             "optimiser": self.optimiser.state_dict(),
             "schedule": self.schedule.state_dict(),

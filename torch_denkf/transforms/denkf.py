@@ -19,7 +19,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters.finish import Record, check_belief
 from torch_denkf.filters.scan import where_rows
 from torch_denkf.submodel import Entries
-from torch_denkf.transforms.primer import refuse_resets_of_groups
+from torch_denkf.transforms.primer import check_no_group_resets
 
 __all__ = ["DEnKFTransform"]
 
@@ -46,8 +46,8 @@ class DEnKFTransform(Checked, Transform):
     the frame already, and count each reading twice. In one process a warning says so; across processes, or where the
     belief is copied on its way, it is not noticed. Behind this transform, torchrl's ``FrameSkipTransform`` makes
     one step of the belief a skip, with the last frame; put it in front, where it skips for the environment alone. With
-    groups of agents, the belief is the environment's, and starts anew where the environment's own ``done`` says so; an
-    environment without one is refused.
+    groups of agents, the belief is the environment's, and is reset where the environment's own ``done`` says so; an
+    environment without one raises an error.
 
     Args:
         filter: any :class:`~torch_denkf.filters.Filter`, also one inside a :class:`~torch_denkf.smoothers.FixedLag` or
@@ -63,6 +63,7 @@ class DEnKFTransform(Checked, Transform):
         check_finite: whether a belief that is not finite raises; on a GPU, which a step would wait for, none does.
             Where an environment emits readings that are not finite, put ``torch_denkf.imperfect.RejectReadings`` in
             front.
+        ahead: writes the belief of a later moment beside that of now: :class:`~torch_denkf.fusion.BeliefAhead`.
         packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step` (native code:
             load only what you would execute). At B=1 it is ten times as fast as the filter itself. It has the
             parameters of its export, is for environments of the batch size of the export, and not for use inside a
@@ -93,6 +94,7 @@ class DEnKFTransform(Checked, Transform):
         store_ensemble: bool = True,
         no_grad: bool = True,
         check_finite: bool = True,
+        ahead: TensorDictModuleBase | None = None,
         packaged: Callable[[Mapping[str, torch.Tensor]], Mapping[str, torch.Tensor]] | None = None,
     ):
         if not isinstance(filter, Filter):
@@ -112,15 +114,16 @@ class DEnKFTransform(Checked, Transform):
             raise KeyError(f"diagnostics {unknown} are not written by the filter; it writes {list(inner)}.")
         self._keep = [*structure.belief, *further]
         self.store_ensemble, self.no_grad, self.check_finite = store_ensemble, no_grad, check_finite
+        later = [] if ahead is None else list(ahead.out_keys)
         dropped = [] if store_ensemble else [key for key in structure.belief if not is_summary(key)]
         super().__init__(
             in_keys=list(structure.needed),
-            out_keys=[filter.outer(key) for key in self._keep if key not in dropped],
+            out_keys=[*(filter.outer(key) for key in self._keep if key not in dropped), *later],
         )
         self._dropped_keys = dropped
         names = {key: (*key[:-1], "_" + key[-1]) if key in dropped else key for key in self._keep}
         self._names = {key: filter.outer(key)[:-1] + names[key][-1:] for key in self._keep}
-        self.filter = filter
+        self.filter, self.ahead = filter, ahead
         self._controls, self._optional = list(structure.controls), list(structure.optional)
         if packaged is not None and not no_grad:
             raise ValueError("A packaged step records no graph; leave out packaged=, or no_grad=False.")
@@ -173,7 +176,16 @@ class DEnKFTransform(Checked, Transform):
         kept = self.filter.finished(record, check=self.check_finite)
         for key, name in self._names.items():
             next_tensordict.set(name, kept[key])
-        return next_tensordict
+        return self._look_ahead(kept, next_tensordict)
+
+    def _look_ahead(self, belief: Mapping[NestedKey, torch.Tensor], tensordict: TensorDictBase) -> TensorDictBase:
+        if self.ahead is None:
+            return tensordict
+        now = tensordict.copy()
+        for key, value in belief.items():
+            now.set(self.filter.outer(key), value)
+        with self._grad_mode():
+            return tensordict.update(self.ahead(now).select(*self.ahead.out_keys))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         with self._grad_mode(), set_recurrent_mode(False):
@@ -199,7 +211,7 @@ class DEnKFTransform(Checked, Transform):
             check_belief(self.filter.structure, entries, entries)
         for key, name in self._names.items():
             tensordict_reset.set(name, start.get(self.filter.outer(key)))
-        return tensordict_reset
+        return self._look_ahead({key: start.get(self.filter.outer(key)) for key in self._names}, tensordict_reset)
 
     def _reset_on_native_autoreset(self, tensordict, tensordict_reset):
         return self._reset(tensordict, tensordict_reset)
@@ -209,11 +221,11 @@ class DEnKFTransform(Checked, Transform):
         masks = [mask for mask in (tensordict.get(key, None) for key in keys) if mask is not None]
         if not masks:
             return None
-        # The belief is the environment's: it starts anew where any group or agent does.
+        # The belief is the environment's: it is reset where any group or agent does.
         return torch.stack([mask.reshape(*tensordict.batch_size, -1).any(-1) for mask in masks]).any(0)
 
     def _trial(self, row: TensorDictBase) -> dict[NestedKey, torch.Tensor]:
-        """All that a step from ``row`` without actions writes."""
+        """Returns all that a step from ``row`` without actions writes."""
         if self._controls:
             actions = self.parent.full_action_spec.zero()
             self._copy(actions, row, self._controls, "the environment's action spec")
@@ -250,9 +262,12 @@ class DEnKFTransform(Checked, Transform):
         # The shapes come from a trial; it must not use up random numbers.
         with torch.no_grad(), torch.random.fork_rng(devices=_cuda_devices(row)), set_recurrent_mode(False):
             written = self._trial(self.filter.initialise(row))
-        for key in keys:
-            value = written[key]
-            spec[self.filter.outer(key)] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
+            told = {self.filter.outer(key): written[key] for key in keys}
+            if spec is observation_spec and self.ahead is not None:
+                out = self._look_ahead(written, row)
+                told.update((key, out.get(key)) for key in self.ahead.out_keys)
+        for key, value in told.items():
+            spec[key] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
         return spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -263,7 +278,7 @@ class DEnKFTransform(Checked, Transform):
                 if a transform behind this one writes over the belief that the filter goes on with.
         """
         keys = [key for key in self._keep if key not in self._dropped_keys]
-        refuse_resets_of_groups(self.parent.reset_keys, self.out_keys)
+        check_no_group_resets(self.parent.reset_keys, self.out_keys)
         diagnosis().check_behind(self, [self._names[key] for key in self.filter.structure.carry])
         taken = [name for name in self.out_keys if name in observation_spec.keys(True, True)]
         if taken:
@@ -311,14 +326,15 @@ class DEnKFTransform(Checked, Transform):
         """Filters a sequence ``[*B, T]``, e.g. a sample of a replay buffer; see :class:`Filter`.
 
         torchrl's buffers apply their transforms before ``SliceSampler`` marks the slices: a buffer of flat slices is
-        refused. Filter what it returns, or store whole windows ``[T]`` as its items.
+        an error. Filter what it returns, or store whole windows ``[T]`` as its items.
 
         Raises:
             ValueError: if a flat batch seems to hold several sequences that are not marked.
         """
         self.filter.observe(Record("data", tensordict, tensordict.batch_size, {}, {}))
         with self._grad_mode(), set_recurrent_mode(True):
-            return self.filter(tensordict)
+            out = self.filter(tensordict)
+            return out if self.ahead is None else self.ahead(out)
 
 
 def _cuda_devices(tensordict: TensorDictBase) -> list[torch.device]:

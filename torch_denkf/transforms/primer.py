@@ -8,15 +8,15 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
-__all__ = ["LastAction", "refuse_resets_of_groups"]
+__all__ = ["LastAction", "check_no_group_resets"]
 
 
-def refuse_resets_of_groups(reset_keys: Sequence[NestedKey], kept: Iterable[NestedKey]) -> None:
+def check_no_group_resets(reset_keys: Sequence[NestedKey], kept: Iterable[NestedKey]) -> None:
     """Raises where torchrl would not reset what is kept: it resets the entries of the group that is done, no others.
 
     Args:
         reset_keys: of the environment.
-        kept: keys that start anew with each episode.
+        kept: keys that are reset with each episode.
 
     Raises:
         ValueError: if episodes end in groups of agents alone, and an entry stands outside of them.
@@ -35,7 +35,7 @@ def refuse_resets_of_groups(reset_keys: Sequence[NestedKey], kept: Iterable[Nest
 
 
 class LastAction(TensorDictPrimer):
-    """Keeps the action that led to an observation, as ``("previous", "action")`` beside it; zero after a reset.
+    """Keeps the action that led to an observation, as ``("previous", "action")`` next to it; zero after a reset.
 
     A filter in a policy runs before the next action is chosen, and needs the last one.
     :meth:`torch_denkf.filters.Filter.make_tensordict_primer` brings it where actions drive the filter; append it
@@ -78,7 +78,7 @@ class LastAction(TensorDictPrimer):
         """
         self._with_actions()
         if self.parent is not None:
-            refuse_resets_of_groups(self.parent.reset_keys, self.primers.keys(True, True))
+            check_no_group_resets(self.parent.reset_keys, self.primers.keys(True, True))
         taken = [key for key in self._carried if key in observation_spec.keys(True, True)]
         if taken:
             raise ValueError(

@@ -6,9 +6,10 @@ from torch.multiprocessing import start_processes
 
 from tests.functional.checks import assert_refused
 from tests.functional.kernels.two_shards import SHARES, analyse_shares, problem
+from torch_denkf.deployment import ShardedEnsembleAnalysis
 from torch_denkf.functional import analyse
 from torch_denkf.functional.kernels.sharded import analyse_sharded
-from torch_denkf.modules import EnsembleAnalysis, ShardedEnsembleAnalysis
+from torch_denkf.modules import EnsembleAnalysis
 
 # Sums in another order. The forecast's members reach 5, where single precision has steps of 5e-7: ten of them.
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 5e-6}

@@ -5,8 +5,8 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
+from torch_denkf.deployment import ShardedEnsembleAnalysis
 from torch_denkf.functional.kernels.sharded import analyse_sharded
-from torch_denkf.modules import ShardedEnsembleAnalysis
 
 SHARES = {"uneven": (17_500, 7_500), "blind": (25_000, 0)}  # of the observations
 STATES = (15_000, 10_000)  # several tiles in each process

@@ -38,12 +38,12 @@ class NamedSpan(NamedTuple):
 
 
 def path_options(tracked: TensorDictBase) -> dict[str, Any]:
-    """What :func:`torch_denkf.plots.plot_path` draws of a tracked drive."""
+    """Returns the arguments of :func:`torch_denkf.plots.plot_path` for a tracked drive."""
     return {"others": {"dead reckoning (last reading held)": tracked["dead_reckoning"]}, "forward_up": True}
 
 
 def named_frames(images: Sequence[np.ndarray], spans: Sequence[NamedSpan]) -> list[np.ndarray]:
-    """Frames ``[H, W, 3]``, RGB, each with the name of the span that it lies in, if any, in its lower left corner."""
+    """Writes the name of the span that a frame lies in, if any, in its lower left corner: ``[H, W, 3]``, RGB, each."""
     out = []
     for step, image in enumerate(images):
         for span in spans:
@@ -58,7 +58,7 @@ def named_frames(images: Sequence[np.ndarray], spans: Sequence[NamedSpan]) -> li
 def drive_picture(
     tracked: TensorDictBase, images: Sequence[np.ndarray], spans: Sequence[NamedSpan], title: str = ""
 ) -> Figure:
-    """A still of the whole drive: what the camera showed at four times, the map, and the velocities with 90 % bands.
+    """Draws a still of the whole drive: the camera's picture at four times, the map, and velocities with 90 % bands.
 
     Args:
         tracked: ``[T]`` with ``"belief"`` (``"mean"`` ``[T, 5]``, ``"var"``, ``"ensemble"`` ``[T, E, 5]``), ``"state"``

@@ -1,4 +1,4 @@
-"""What the car adds to the library's registers."""
+"""Entries of the car in the library's registers."""
 
 BUILDERS = {"car": "torch_denkf.applications.car.odometry.filter:car_filter"}
 COMMANDS = {

@@ -37,7 +37,7 @@ def unicycle_move(pose: Tensor, velocity: Tensor, dt: float | Tensor) -> Tensor:
 
 
 def unicycle_jacobians(pose: Tensor, velocity: Tensor, dt: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Jacobians of :func:`unicycle_move`.
+    """Returns the Jacobians of :func:`unicycle_move`.
 
     Args:
         pose: (x m, y m, theta rad) before the step, ``[*, 3]``.

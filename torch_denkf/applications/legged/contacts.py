@@ -1,4 +1,4 @@
-"""Which feet stand, by the forces under them."""
+"""Foot contacts, from the forces under the feet."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["contacts"]
 
 
 def contacts(force: Tensor, on: float, off: float | None = None, *, before: Tensor | None = None) -> Tensor:
-    """Where feet stand: from when the force exceeds ``on`` until it falls below ``off``.
+    """Detects contacts with hysteresis: from when the force exceeds ``on`` until it falls below ``off``.
 
     Two thresholds keep noise about one of them from lifting a foot that stands.
 

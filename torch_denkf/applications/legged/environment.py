@@ -193,7 +193,7 @@ class LeggedEnv(EnvBase):
                 force[:2], self.pushed = self.pushes * self.random.standard_normal(2), round(0.1 / self.dt)
 
     def _simulate(self) -> None:
-        """One step of the simulator."""
+        """Runs one step of the simulator."""
         mujoco.mj_step(self.model, self.data)
 
     def _with_errors(self, imu: np.ndarray) -> dict:
@@ -205,7 +205,7 @@ class LeggedEnv(EnvBase):
         return {"imu": imu + self.bias + white, "joints": joints, "joint_rates": rates}
 
     def _forces(self) -> np.ndarray:
-        """What presses each foot, in N."""
+        """Returns the contact force of each foot, in N."""
         found, six = np.zeros(len(self.feet)), np.empty(6)
         bodies = self.model.geom_bodyid[self.data.contact.geom]  # [contacts, 2]
         for place, body in enumerate(self.feet):
@@ -216,7 +216,7 @@ class LeggedEnv(EnvBase):
 
 
 def on_floor(robot: ElementTree.Element, assets: dict, friction: float, softness: float) -> mujoco.MjModel:
-    """A robot of dm_control on a floor, as its sensors need it.
+    """Returns a robot of dm_control on a floor, as its sensors need it.
 
     Args:
         robot: its MJCF.

@@ -47,7 +47,7 @@ def legged_filter(
     contact_key: NestedKey = "contact",
     **options: Any,
 ) -> Filter:
-    r"""A filter of the base of a legged robot, from its inertial sensor, its joints, and which feet stand.
+    r"""Returns a filter of the base of a legged robot, from its inertial sensor, its joints, and which feet stand.
 
     ``("belief", "velocity")`` ``[*B, 3]`` is the velocity of the base in its own axes, in m/s, and
     ``("belief", "velocity_var")`` its variances. ``("belief", "mean")`` ``[*B, 16 + 3 F]`` holds the sensor's

@@ -52,7 +52,7 @@ class HarnessedEnv(LeggedEnv):
         force[:] = others
 
     def _harness(self) -> np.ndarray:
-        """Its force on the base in N, and its torque in Nm, in the world's axes."""
+        """Returns the harness's force on the base in N, and its torque in Nm, in the world's axes."""
         data, step = self.data, self.model.opt.timestep
         share = min(1.0, max(0.0, data.time - self.begun))
         self.heading += share * self.turn * step
@@ -76,7 +76,7 @@ def humanoid_env(
     turn: float = 0.0,
     seed: int = 0,
 ) -> HarnessedEnv:
-    """dm_control's humanoid in a harness, with an inertial sensor beside the middle of its chest, 100 steps a second.
+    """Returns dm_control's humanoid in a harness, with an inertial sensor next to its chest, 100 steps a second.
 
     Its motors turn joints to the angles of the action, in rad.
 

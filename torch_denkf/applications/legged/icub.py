@@ -32,7 +32,7 @@ _ON, _OFF = 60.0, 40.0  # N, of the force under a foot; iCub weighs 330 N
 
 
 def icub_model(folder: Path) -> mujoco.MjModel:
-    """The robot's chains of joints, without meshes, from ``model.urdf`` in a folder."""
+    """Returns the robot's chains of joints, without meshes, from ``model.urdf`` in a folder."""
     robot = ElementTree.parse(folder / "model.urdf").getroot()
     for parent in (robot, *robot.findall("link")):
         for child in list(parent):
@@ -44,7 +44,7 @@ def icub_model(folder: Path) -> mujoco.MjModel:
 
 
 def icub_log(folder: Path) -> TensorDict:
-    """A walk of 1.5 m in 12 s at 99 Hz, with motion capture as truth.
+    """Returns a walk of 1.5 m in 12 s at 99 Hz, with motion capture as truth.
 
     Args:
         folder: with ``walking.npz``.
@@ -74,7 +74,7 @@ def icub_log(folder: Path) -> TensorDict:
 
 
 def savitzky_golay(values: torch.Tensor, time: torch.Tensor, rows: int = 21, order: int = 3) -> torch.Tensor:
-    """Derivatives ``[T, N]`` of ``[T, N]``: of the polynomial through the rows about each; ends are held."""
+    """Returns derivatives ``[T, N]`` of ``[T, N]``: of the polynomial through the rows about each; ends are held."""
     half = rows // 2
     at = torch.arange(len(time)).clamp(half, len(time) - 1 - half)
     window = at.unsqueeze(-1) + torch.arange(-half, half + 1)
@@ -84,6 +84,6 @@ def savitzky_golay(values: torch.Tensor, time: torch.Tensor, rows: int = 21, ord
 
 
 def of_rpy(rpy: torch.Tensor) -> torch.Tensor:
-    """The quaternions of roll, pitch and yaw ``[*, 3]``, turns about x, then y, then z of the world."""
+    """Returns the quaternions of roll, pitch and yaw ``[*, 3]``, turns about x, then y, then z of the world."""
     turns = [SO3().exp(rpy[..., axis : axis + 1] * torch.eye(3).to(rpy)[axis]) for axis in range(3)]
     return SO3().compose(turns[2], SO3().compose(turns[1], turns[0]))

@@ -1,4 +1,4 @@
-"""Where the feet of a robot are, by the angles of its joints."""
+"""Forward kinematics of a robot's feet."""
 
 from __future__ import annotations
 
@@ -84,11 +84,11 @@ class LegKinematics(nn.Module):
         self.register_buffer("column", torch.tensor([[step[4] for step in row] for row in rows]), persistent=False)
 
     def forward(self, positions: Tensor) -> Tensor:
-        """Positions ``[*, F, 3]`` in m, by angles ``[*, J]`` in rad (slides in m)."""
+        """Returns positions ``[*, F, 3]`` in m, by angles ``[*, J]`` in rad (slides in m)."""
         return self._along(positions)[0]
 
     def velocities(self, positions: Tensor, rates: Tensor) -> Tensor:
-        """Velocities ``[*, F, 3]`` in m/s as seen from the base, by angles and rates ``[*, J]``."""
+        """Returns velocities ``[*, F, 3]`` in m/s as seen from the base, by angles and rates ``[*, J]``."""
         return self.moving(positions, rates)[1]
 
     def moving(self, positions: Tensor, rates: Tensor) -> tuple[Tensor, Tensor]:
@@ -97,7 +97,7 @@ class LegKinematics(nn.Module):
         return end, (jacobian * rates[..., self.column].unsqueeze(-1)).sum(-2)
 
     def jacobian(self, positions: Tensor) -> Tensor:
-        """Derivatives ``[*, F, K, 3]`` of the positions by the K joints of each foot, zero where it has fewer."""
+        """Returns derivatives ``[*, F, K, 3]`` of positions by the K joints of each foot, zero where it has fewer."""
         return self._with_jacobian(positions)[1]
 
     def _with_jacobian(self, positions: Tensor) -> tuple[Tensor, Tensor]:
@@ -106,7 +106,7 @@ class LegKinematics(nn.Module):
         return end, torch.linalg.cross(axes, lever) + slides
 
     def _along(self, positions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The feet, and of each joint its axis of turn, its direction of slide, and its place."""
+        """Returns the feet, and of each joint its axis of turn, its direction of slide, and its place."""
         moved = positions[..., self.column] - self.zero
         length = self.zero.shape[-1]
         turn = self.fixed[:, 0, :4].expand(*moved.shape[:-1], 4)
@@ -127,7 +127,7 @@ class LegKinematics(nn.Module):
         return place, torch.stack(axes, -2), torch.stack(slides, -2), torch.stack(places, -2)
 
     def _chain(self, model, name, root, to_sensor):
-        """A fixed pose, then joints: the pose behind each, its axes, its zero and its column."""
+        """Returns a fixed pose, then joints: the pose behind each, its axes, its zero and its column."""
         body, behind = _frame(model, "feet", name)
         steps: list[tuple] = []
         while body != root:
@@ -168,7 +168,7 @@ def check_names(argument: str, names: Sequence[str]) -> None:
 
 
 def _frame(model: mujoco.MjModel, argument: str, name: str) -> tuple[int, Tensor]:
-    """The body that a site or body belongs to, and its pose there ``[7]``."""
+    """Returns the body that a site or body belongs to, and its pose there ``[7]``."""
     for kind, number in _OBJECTS.items():
         found = mujoco.mj_name2id(model, number, name)
         if found >= 0 and kind == "site":
@@ -181,7 +181,7 @@ def _frame(model: mujoco.MjModel, argument: str, name: str) -> tuple[int, Tensor
 
 
 def _pose(model: mujoco.MjModel, body: int) -> Tensor:
-    """Of a body on its parent, before its joints move it."""
+    """Returns the pose of a body on its parent, before its joints move it."""
     return _point(model.body_quat[body], model.body_pos[body])
 
 
@@ -190,7 +190,7 @@ def _point(quaternion, position) -> Tensor:
 
 
 def _moving_joints(model: mujoco.MjModel, body: int) -> list[str]:
-    """The names of a body's joints, a free one left out."""
+    """Returns the names of a body's joints, a free one left out."""
     first = model.body_jntadr[body]
     joints = range(first, first + model.body_jntnum[body])
     return [model.joint(joint).name for joint in joints if model.jnt_type[joint] != _FREE]

@@ -1,4 +1,4 @@
-"""How much each standing foot moves, as a network tells it by the last rows of what a legged robot reads."""
+"""Learned velocity of each standing foot: a network of the last rows of readings of a legged robot."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class LearnedContacts(Sensor):
         self.register_buffer("lasts", torch.tensor(float(lasts)))
 
     def compute(self, imu, joints, rates, contact):
-        """The covariance, the variance with which feet walk, and how they move."""
+        """Returns the covariance, the variance with which feet walk, and how they move."""
         mean, cov = self._moments(self.features(imu, joints, rates, contact))
         cov = self.lasts * cov
         feet = torch.eye(cov.shape[-3], dtype=cov.dtype, device=cov.device)
@@ -93,13 +93,13 @@ class LearnedContacts(Sensor):
         return blocks.flatten(-4, -3).flatten(-2), slip, mean.flatten(-2)
 
     def _moments(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Of each foot's velocity the mean ``[*B, F, 3]`` and the covariance ``[*B, F, 3, 3]``."""
+        """Returns mean ``[*B, F, 3]`` and covariance ``[*B, F, 3, 3]`` of each foot's velocity."""
         noise = self.module
         mean = self.mean((features - noise.loc) / noise.scale)
         return mean, noise.compute(features, batch_size=features.shape[:-1])
 
     def loss(self, log: TensorDictBase) -> Tensor:
-        """How unlikely the true velocities of the standing feet are, a scalar: their mean negative log-likelihood.
+        """Returns the mean negative log-likelihood of the true velocities of the standing feet, a scalar.
 
         Args:
             log: ``[*B]``, rows in any order, with the last rows and ``("true", "velocity")`` of the base ``[*B, 3]`` in
@@ -131,7 +131,7 @@ class LearnedContacts(Sensor):
     def features(
         self, imu: Tensor, joints: Tensor, rates: Tensor, contact: Tensor, *, rows: int | None = None
     ) -> Tensor:
-        """What the network reads of each foot, ``[*B, F, 16 K]``; ``rows`` in the place of K."""
+        """Returns the network's inputs for each foot, ``[*B, F, 16 K]``; ``rows`` in the place of K."""
         rows, kinematics = self.rows if rows is None else rows, self.kinematics
         like = kinematics.base
         sizes = 6, len(kinematics.joints), len(kinematics.joints), len(kinematics.feet)
@@ -166,7 +166,7 @@ class Variances(Sensor):
         self.observation_dim = contacts.observation_dim
 
     def compute(self, *last):
-        """The variances ``[*B, 3 F]``, and how feet walk."""
+        """Returns the variances ``[*B, 3 F]``, and how feet walk."""
         cov, *others = self.module.compute(*last)
         return cov.diagonal(dim1=-2, dim2=-1), *others
 
@@ -178,7 +178,7 @@ def check_rows(rows: int, every: int) -> None:
 
 
 def last_rows(rows: int, every: int = 1) -> Compose:
-    """A transform of an environment that keeps the last rows of what :class:`LearnedContacts` reads.
+    """Returns a transform of an environment that keeps the last rows of what :class:`LearnedContacts` reads.
 
     Args:
         rows: K.
@@ -195,7 +195,7 @@ def _picked(frames: Tensor, rows: int, every: int) -> Tensor:
 
 
 def with_last_rows(log: TensorDictBase, rows: int, every: int = 1) -> TensorDictBase:
-    """A log ``[*B, T]`` with the last rows of what :class:`LearnedContacts` reads.
+    """Returns a log ``[*B, T]`` with the last rows of what :class:`LearnedContacts` reads.
 
     The first row stands for those before it.
 

@@ -1,4 +1,4 @@
-"""How a legged robot moves, by an inertial sensor and by which feet stand."""
+"""Motion model of a legged robot, by an inertial sensor and foot contacts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["LeggedMotion", "LeggedMotionNoise", "LeggedSpace"]
 
 @dataclass(frozen=True)
 class LeggedSpace(Space):
-    """Where the states live: the inertial sensor's pose with its velocity, its biases, and the feet in the world.
+    """State space: the inertial sensor's pose with its velocity, its biases, and the feet in the world.
 
     A point has 16 + 3 F numbers: orientation (4), velocity in m/s and position in m (3 each), both in the world's axes;
     the gyro's bias in rad/s and the accelerometer's in m/s^2; then each foot's position in m.
@@ -47,32 +47,32 @@ class LeggedSpace(Space):
 
     @property
     def point_dim(self) -> int:  # type: ignore[override]
-        """16 + 3 F."""
+        """Returns 16 + 3 F."""
         return 16 + 3 * self.feet
 
     @property
     def tangent_dim(self) -> int:  # type: ignore[override]
-        """15 + 3 F."""
+        """Returns 15 + 3 F."""
         return 15 + 3 * self.feet
 
     def compose(self, first, second):
-        """The second, then the first; biases add up."""
+        """Composes in reverse order: the second, then the first; biases add up."""
         return _in_order(self.in_groups.compose(_in_groups(first, 10), _in_groups(second, 10)), 10)
 
     def inverse(self, point):
-        """What undoes it."""
+        """Returns the inverse element."""
         return _in_order(self.in_groups.inverse(_in_groups(point, 10)), 10)
 
     def exp(self, tangent):
-        """Where a constant rate of all leads."""
+        """Returns the end of a step at a constant rate: the exponential map."""
         return _in_order(self.in_groups.exp(_in_groups(tangent, 9)), 10)
 
     def log(self, point):
-        """What leads there."""
+        """Returns the step that leads to a point: the inverse of :meth:`exp`."""
         return _in_order(self.in_groups.log(_in_groups(point, 10)), 9)
 
     def right_jacobian(self, tangent):
-        """That of a step in the world's axes."""
+        """Returns that of a step in the world's axes."""
         return _matrix_in_order(self.in_groups.right_jacobian(_in_groups(tangent, 9)))
 
     def adjoint(self, point):
@@ -80,23 +80,23 @@ class LeggedSpace(Space):
         return _matrix_in_order(self.in_groups.adjoint(_in_groups(point, 10)))
 
     def basis(self, point):
-        """How points move by steps in the world's axes."""
+        """Returns the derivative of points by steps in the world's axes."""
         return _matrix_in_order(self.in_groups.basis(_in_groups(point, 10)), rows=10)
 
     def dual_basis(self, point):
-        """The step in the world's axes that leads to a point nearby."""
+        """Returns the step in the world's axes that leads to a point nearby."""
         return _matrix_in_order(self.in_groups.dual_basis(_in_groups(point, 10)), columns=10)
 
     def neutral(self, like=None):
-        """No rotation, zeros."""
+        """Returns no rotation and zeros."""
         return _in_order(self.in_groups.neutral(like), 10)
 
     def normalise(self, point):
-        """With a quaternion of length one."""
+        """Scales the quaternion to length one."""
         return _in_order(self.in_groups.normalise(_in_groups(point, 10)), 10)
 
     def near(self, points, weights=None):
-        """Part by part."""
+        """Works part by part."""
         return _in_order(self.in_groups.near(_in_groups(points, 10), weights), 10)
 
     def _whole(self, known):
@@ -111,12 +111,12 @@ class LeggedSpace(Space):
 
 
 def _in_groups(value: Tensor, begin: int) -> Tensor:
-    """Points or tangents with the biases, which begin there, at the end."""
+    """Returns points or tangents with the biases, which begin there, at the end."""
     return torch.cat([value[..., :begin], value[..., begin + 6 :], value[..., begin : begin + 6]], -1)
 
 
 def _in_order(value: Tensor, begin: int) -> Tensor:
-    """The inverse of :func:`_in_groups`."""
+    """Returns the inverse of :func:`_in_groups`."""
     return torch.cat([value[..., :begin], value[..., -6:], value[..., begin:-6]], -1)
 
 
@@ -160,7 +160,7 @@ class LeggedMotion(Motion):
         self.inertial = InertialMotion(dt, gravity=gravity)
 
     def move(self, state, imu, feet, contact, *moves, dt):
-        """The states one step later."""
+        """Returns the states one step later."""
         base = self.inertial.move(state[..., :16], imu, dt=dt)
         turn, place = base[..., None, :4], base[..., None, 7:10]
         by_joints = place + rotate(turn, feet.unflatten(-1, (-1, 3)))
@@ -173,7 +173,7 @@ class LeggedMotion(Motion):
 
 
 class LeggedMotionNoise(SubModel):
-    """What a step of :class:`LeggedMotion` adds, by which feet stand.
+    """Process noise of a step of :class:`LeggedMotion`, given the foot contacts.
 
     A foot that stands slips a little; one in the air is where its joints say but for their error.
 
@@ -216,7 +216,7 @@ class LeggedMotionNoise(SubModel):
         self.register_buffer("air", torch.tensor(n.kinematics**2))
 
     def compute(self, *entries):
-        """Variances, or the covariance."""
+        """Returns variances, or the covariance."""
         mean, (contact, *more) = (None, entries) if self.ensemble else (entries[0], entries[1:])
         dt = self.slip.new_full((), self.dt) if len(more) == self.learned else more[-1].to(self.slip.dtype)
         slip = more[0] * dt if self.learned else self.slip

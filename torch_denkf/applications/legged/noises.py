@@ -1,4 +1,4 @@
-"""How wrong the sensors of a legged robot are, and how much a standing foot moves."""
+"""Noise of a legged robot's sensors, and of the velocity of a standing foot."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["LeggedNoises"]
 
 @dataclass(frozen=True)
 class LeggedNoises:
-    """All that a filter of a legged robot's base is told about errors.
+    """Noise model of a filter of a legged robot's base.
 
     The defaults fit :func:`~torch_denkf.applications.legged.quadruped_env` on firm ground, with some room for a worse
     accelerometer. Feet that slide, or rows that are stamped unevenly, ask for more.

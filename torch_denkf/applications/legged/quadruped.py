@@ -33,7 +33,7 @@ def quadruped_env(
     pushes: float = 0.0,
     seed: int = 0,
 ) -> LeggedEnv:
-    """dm_control's quadruped on a floor, with an inertial sensor beside its middle, 100 steps a second.
+    """Returns dm_control's quadruped on a floor, with an inertial sensor next to its middle, 100 steps a second.
 
     Args:
         errors: of the sensors.
@@ -81,7 +81,7 @@ def quadruped(
     kind: Literal["DEnKF", "EKF", "UKF"] = "EKF",
     **noises: float,
 ) -> Filter:
-    """The filter of dm_control's quadruped with :class:`~torch_denkf.applications.legged.LearnedContacts`, untrained.
+    """Returns an untrained filter of dm_control's quadruped, with :class:`LearnedContacts`.
 
     ``from_pretrained("quadruped")`` is this filter, trained. It reads what ``last_rows(10, every=5)`` keeps.
 

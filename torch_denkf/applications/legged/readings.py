@@ -1,4 +1,4 @@
-"""What the joints of a legged robot say: where its feet are, how fast, and how the robot stands at the start."""
+"""Observations from the joints of a legged robot: positions and velocities of its feet, and its first pose."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class LegReadings(SubModel):
         super().__init__(kinematics, in_keys, [(prefix, name) for name in names])
 
     def compute(self, imu, joints, contact, *others):
-        """The feet, which of them stand, the start, and the feet's rates."""
+        """Returns the feet, which of them stand, the start, and the feet's rates."""
         kinematics, values = self.module, (imu, joints, contact, *others)
         sizes = [6, len(kinematics.joints), len(kinematics.feet), *[1] * len(self.steps), len(kinematics.joints)]
         for key, size, value in zip(self.in_keys, sizes, values, strict=False):
@@ -82,7 +82,7 @@ class LegReadings(SubModel):
 
 
 class FeetInBody(SubModel):
-    r"""Where the feet are in the inertial sensor's axes, :math:`R^\top (f_i - p)`, of forecast states.
+    r"""Observes the feet in the inertial sensor's axes, :math:`R^\top (f_i - p)`, of forecast states.
 
     Args:
         space: of the states, :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.
@@ -101,13 +101,13 @@ class FeetInBody(SubModel):
         self.observed_space = space
 
     def compute(self, state):
-        """The predicted readings."""
+        """Returns the predicted readings."""
         self.observed_space.check(point=state)
         return _feet(state).flatten(-2)
 
 
 class FeetRates(SubModel):
-    r"""How fast standing feet move in the sensor's axes, :math:`-R^\top v - (\omega - b) \times R^\top (f_i - p)`.
+    r"""Observes standing feet's velocities in sensor axes, :math:`-R^\top v - (\omega - b) \times R^\top (f_i - p)`.
 
     It is told by the joints' rates, and says the base's velocity at once.
 
@@ -132,7 +132,7 @@ class FeetRates(SubModel):
         self.observed_space = space
 
     def compute(self, state, imu, moves=None):
-        """The predicted readings."""
+        """Returns the predicted readings."""
         self.observed_space.check(point=state)
         turn = (imu[..., :3].to(state.dtype).unsqueeze(-2) - state[..., 10:13]).unsqueeze(-2)
         velocity = rotate(SO3().inverse(state[..., :4]), state[..., 4:7]).unsqueeze(-2)
@@ -141,6 +141,6 @@ class FeetRates(SubModel):
 
 
 def _feet(state: Tensor) -> Tensor:
-    """Of the feet in the sensor's axes, ``[*, F, 3]``."""
+    """Returns the feet in the sensor's axes, ``[*, F, 3]``."""
     away = state[..., 16:].unflatten(-1, (-1, 3)) - state[..., None, 7:10]
     return rotate(SO3().inverse(state[..., None, :4]), away)

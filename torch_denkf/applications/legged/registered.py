@@ -1,4 +1,4 @@
-"""What legged robots add to the library's registers."""
+"""Entries of legged robots in the library's registers."""
 
 from __future__ import annotations
 

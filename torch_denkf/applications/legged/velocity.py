@@ -16,7 +16,7 @@ _KEYS = [("belief", "velocity"), ("belief", "velocity_var")]
 
 
 def base_velocity(state: Tensor, gyro: Tensor, sensor: Tensor) -> Tensor:
-    r"""The velocity of the base's origin in the base's axes, :math:`S R^\top v - S (\omega - b) \times r`.
+    r"""Returns the velocity of the base's origin in the base's axes, :math:`S R^\top v - S (\omega - b) \times r`.
 
     Args:
         state: of the sensor ``[*, 16 + 3 F]``, see :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.
@@ -32,7 +32,7 @@ def base_velocity(state: Tensor, gyro: Tensor, sensor: Tensor) -> Tensor:
 
 
 def base_velocity_of_moments(mean: Tensor, cov: Tensor, gyro: Tensor, sensor: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean ``[*, 3]`` and variances ``[*, 3]`` of :func:`base_velocity`, to first order.
+    """Returns mean ``[*, 3]`` and variances ``[*, 3]`` of :func:`base_velocity`, to first order.
 
     Args:
         mean: ``[*, 16 + 3 F]``.
@@ -71,7 +71,7 @@ class BaseVelocity(SubModel):
         self.register_buffer("jitter", gyro_std**2 * skew(sensor[4:]).square().sum(-1), persistent=False)
 
     def compute(self, imu, belief, cov=None):
-        """Velocity and variances."""
+        """Returns velocity and variances."""
         gyro = imu[..., :3].to(belief.dtype)
         if cov is not None:
             velocity, var = base_velocity_of_moments(belief, cov, gyro, self.sensor)
@@ -89,7 +89,7 @@ class BaseVelocity(SubModel):
 
 
 class StartEnsemble(AroundState):
-    """Members around where a robot starts that stands still, with the base's velocity beside them.
+    """Members around where a robot starts that stands still, with the base's velocity next to them.
 
     Args:
         std: standard deviations of tangents, as of :class:`AroundState`.
@@ -104,7 +104,7 @@ class StartEnsemble(AroundState):
         self.velocity_std, self._velocity = velocity_std, (velocity,)  # in a tuple: it is a module of the filter's
 
     def compute(self, state, *, noise, batch_size):
-        """The belief, and the velocity."""
+        """Returns the belief, and the velocity."""
         ensemble, mean, var = super().compute(state, noise=noise, batch_size=batch_size)
         return ensemble, mean, var, *_still(mean, self.velocity_std)
 
@@ -114,7 +114,7 @@ class StartEnsemble(AroundState):
 
 
 class StartMoments(GaussianAround):
-    """A mean and a covariance around where a robot starts that stands still, with the base's velocity beside them.
+    """A mean and a covariance around where a robot starts that stands still, with the base's velocity next to them.
 
     Args:
         std: standard deviations of tangents, as of :class:`GaussianAround`.
@@ -130,7 +130,7 @@ class StartMoments(GaussianAround):
         self.velocity_std, self._velocity = velocity_std, (velocity,)
 
     def compute(self, state):
-        """The belief, and the velocity."""
+        """Returns the belief, and the velocity."""
         mean, cov, var = super().compute(state)
         return mean, cov, var, *_still(mean, self.velocity_std)
 

@@ -31,13 +31,13 @@ class NoisyEncoders(Transform):
         return self._call(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """The spec with the encoders."""
+        """Returns the spec with the encoders."""
         observation_spec["encoder"] = observation_spec["position"].clone()
         return observation_spec
 
 
 def reacher_env(seed: int = 0) -> TransformedEnv:
-    """Reacher, whose ``"encoder"`` is noisy by 0.05 rad; ``"state"`` is the truth, for training and scoring alone.
+    """Returns a reacher with a noisy ``"encoder"`` (0.05 rad); ``"state"`` is the truth, for training and scores.
 
     Args:
         seed: of the environment; the noise follows torch's generator.

@@ -74,7 +74,7 @@ class ReacherFilter(DEnKF):
 
 
 def reacher(**settings) -> ReacherFilter:
-    """A DEnKF for dm_control's reacher, untrained.
+    """Returns a DEnKF for dm_control's reacher, untrained.
 
     Args:
         **settings: those of :class:`ReacherSettings`.

@@ -1,4 +1,4 @@
-"""What the reacher adds to the library's registers."""
+"""Entries of the reacher in the library's registers."""
 
 BUILDERS = {"reacher": "torch_denkf.applications.reacher.filter:reacher"}
 COMMANDS = {

@@ -63,7 +63,7 @@ def train_reacher(
 
 @torch.no_grad()
 def evaluate_reacher(model: ReacherFilter, *, episodes: int = 10, steps: int = 400, seed: int = 1000) -> dict[str, Any]:
-    """Errors over episodes that the training has not seen.
+    """Returns errors over episodes that the training has not seen.
 
     Returns:
         Root mean square errors in rad and rad/s of the filter, of the encoders, their differences, and the mean of the

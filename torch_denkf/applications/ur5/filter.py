@@ -108,12 +108,12 @@ class UR5TableFilter(DEnKF):
 
     @property
     def settings(self) -> UR5TableSettings:
-        """All numbers that it is built from, with the inflation as it is now."""
+        """Returns all numbers that it is built from, with the inflation as it is now."""
         return replace(self._settings, inflation=self.inflation)
 
     @property
     def inflation(self) -> float:
-        """The factor on the belief's spread in each step."""
+        """Returns the factor on the belief's spread in each step."""
         return self["analysis"].inflation
 
     @inflation.setter
@@ -136,14 +136,14 @@ class _ArmTransition(LearnedTransition):
         self.register_buffer("change", torch.tensor(scale))
 
     def compute(self, state, action=None, dt=None, *, noise):
-        """The forecast ensemble: each joint on its way to its target, and what the network adds to that."""
+        """Returns the forecast ensemble: each joint on its way to its target, and what the network adds to that."""
         way = action.to(state.dtype).unsqueeze(-2) - state[..., :JOINTS]
         features = torch.cat([(state - self.loc) / self.scale, (way / _STEP).clamp(-4, 4)], -1)
         return state + self.change * self._run(features, noise)
 
 
 def ur5_table(**settings) -> UR5TableFilter:
-    """A DEnKF for the UR5 table, untrained.
+    """Returns a DEnKF for the UR5 table, untrained.
 
     Args:
         **settings: those of :class:`UR5TableSettings`.

@@ -1,4 +1,4 @@
-"""What the UR5 table adds to the library's registers."""
+"""Entries of the UR5 table in the library's registers."""
 
 BUILDERS = {"ur5-table": "torch_denkf.applications.ur5.filter:ur5_table"}
 COMMANDS = {

@@ -86,7 +86,7 @@ def train_ur5_table(
 
 
 def whole_demos(out: Path, sequences: int = 60, *, processes: int = 1, progress: bool = True) -> Path:
-    """The folder of whole demos, of which the replay's hash puts a fifth on the test side; collects what is missing."""
+    """Returns the folder of whole demos, a fifth of them for tests by the replay's hash; collects missing ones."""
     folder = out / "demos/sequences"
     _collect(folder, sequences, 0, processes, progress)
     return folder
@@ -99,7 +99,7 @@ def _collect(folder: Path, demos: int, frames: int, processes: int, progress: bo
 
 
 def _frames(data: UR5ExperienceReplay, first: int) -> TensorDict:
-    """Single frames of the demos from ``first`` on, pixels as uint8."""
+    """Returns single frames of the demos from ``first`` on, pixels as uint8."""
     chosen = torch.tensor([episode.demo >= first for episode in data.episodes])
     rows = chosen[data.storage[:]["episode"]].nonzero().squeeze(-1)
     parts = [data[index].select("pixels", "state") for index in rows.split(512)]
@@ -107,7 +107,7 @@ def _frames(data: UR5ExperienceReplay, first: int) -> TensorDict:
 
 
 def _sequences(data: UR5ExperienceReplay) -> TensorDict:
-    """Whole demos ``[N, T]``; T is the shortest one's length."""
+    """Returns whole demos ``[N, T]``; T is the shortest one's length."""
     steps = min(episode.length for episode in data.episodes)
     rows = [data[torch.arange(e.start, e.start + steps)].select("pixels", "state", "action") for e in data.episodes]
     return torch.stack([row.set("pixels", (row["pixels"] * 255).round().to(torch.uint8)) for row in rows])
@@ -159,7 +159,7 @@ def _train_sensor(
 
 @torch.no_grad()
 def read_demos(model: UR5TableFilter, demos: TensorDict, seed: int = 0) -> TensorDict:
-    """What the sensor reads of whole demos ``[N, T]``: samples and encodings in the place of the pixels."""
+    """Runs the sensor on whole demos ``[N, T]``: samples and encodings in the place of the pixels."""
     parts = []
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -170,7 +170,7 @@ def read_demos(model: UR5TableFilter, demos: TensorDict, seed: int = 0) -> Tenso
 
 
 def behind_sensor(model: UR5TableFilter) -> Filter:
-    """The same filter for readings that the sensor has made before."""
+    """Returns this filter for precomputed readings of its sensor."""
     names = [name for name in model.module if name != "sensor"]
     parts = {name: model[name] for name in names}
     return Filter(parts, initial=model.initial, update_at_reset=model.update_at_reset)
@@ -220,7 +220,7 @@ def _believe(behind: Filter, readings: TensorDict, seed: int = 0) -> TensorDict:
 def evaluate_ur5_table(
     model: UR5TableFilter, demos: str | Path, *, missing: float = 0.0, cache: Path | bool = True, progress: bool = True
 ) -> dict[str, Any]:
-    """Errors on whole demos of the test side, beside the sensor alone.
+    """Returns errors on whole demos of the test side, next to the sensor alone.
 
     Args:
         model: the filter.

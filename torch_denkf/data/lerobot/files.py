@@ -37,7 +37,7 @@ _WIDTH = re.compile(r"0?\d{0,2}d?")
 
 @dataclass(frozen=True)
 class EpisodeFiles:
-    """Where one episode is.
+    """Files of one episode.
 
     Attributes:
         number: of the episode.
@@ -104,7 +104,7 @@ class Layout:
 
 
 def read_layout(root: Path, camera: str | None, chosen: Sequence[int] | None = None) -> Layout:
-    """Read the metadata of a LeRobot folder.
+    """Reads the metadata of a LeRobot folder.
 
     Args:
         root: the folder.
@@ -124,7 +124,7 @@ def read_layout(root: Path, camera: str | None, chosen: Sequence[int] | None = N
         info = json.loads("\n".join(read_lines(file)))
         version, fps, features = info["codebase_version"], float(info["fps"]), dict(info["features"])
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{file} is malformed ({type(error).__name__}: {error}); download it anew") from error
+        raise ValueError(f"{file} is malformed ({type(error).__name__}: {error}); download it again") from error
     check_number(f"fps in {file}", fps, above=0, cure="It is the number of rows a second")
     _check_features(file, features)
     if not isinstance(version, str) or version not in VERSIONS:
@@ -214,7 +214,7 @@ def _check_features(file: Path, features: dict) -> None:
         known = isinstance(feature, dict) and isinstance(feature.get("dtype"), str)
         if not known or not isinstance(feature.get("shape"), (list, tuple)):
             raise ValueError(
-                f"{file} is malformed: feature {key!r} has no 'dtype' and 'shape', but {feature!r}; download it anew"
+                f"{file} is malformed: feature {key!r} has no 'dtype' and 'shape', but {feature!r}; download it again"
             )
 
 
@@ -224,7 +224,7 @@ def _check_episodes(meta: list[Path], episodes: list[EpisodeFiles]) -> None:
         if episode.number in seen:
             raise ValueError(
                 f"{meta[0]} lists episode {episode.number} twice, again as entry {len(seen) + 1} of {len(episodes)}; "
-                "leave one out, or download it anew"
+                "leave one out, or download it again"
             )
         seen.add(episode.number)
 
@@ -269,7 +269,7 @@ def _episodes_of_version_2(root: Path, info: dict, camera: str) -> tuple[list[Ep
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{file} has a malformed line {line[:80]!r}, line {at} ({type(error).__name__}: {error}); download it "
-                "anew"
+                "again"
             ) from error
         for name, value in (("episode_index", number), ("length", length)):
             check_count(f"{name} in {file}:{at}", value, least=0)
@@ -296,7 +296,7 @@ def _episodes_of_version_3(root: Path, info: dict, camera: str) -> tuple[list[Ep
                 where = [int(entry[key]) for key in keys[4:6]]
                 begin = float(entry[keys[6]]) if video else 0.0
             except (TypeError, ValueError) as error:
-                raise ValueError(f"{file} has a row with gaps, {entry}; download it anew") from error
+                raise ValueError(f"{file} has a row with gaps, {entry}; download it again") from error
             for name, value in (("episode_index", number), ("length", length)):
                 check_count(f"{name} in {file}", value, least=0)
             check_number(f"from_timestamp of episode {number} in {file}", begin, least=0)
@@ -310,14 +310,14 @@ def _episodes_of_version_3(root: Path, info: dict, camera: str) -> tuple[list[Ep
 
 
 def _inside(root: Path, info: dict, name: str, **place: Any) -> Path:
-    """A file that a template of ``info.json`` names.
+    """Returns a file that a template of ``info.json`` names.
 
     Raises:
         ValueError: if there is no such template, it is none of LeRobot's, or it leads out of the folder.
     """
     file, template = root / "meta" / "info.json", info.get(name)
     if not isinstance(template, str):
-        raise ValueError(f"{file} is malformed: {name!r} is no template of a path, but {template!r}; download it anew")
+        raise ValueError(f"{file} is malformed: {name!r} is no template of a path, but {template!r}; download it again")
     try:
         parts = list(Formatter().parse(template))
         fields = {field for _, field, _, _ in parts if field is not None}
@@ -328,13 +328,13 @@ def _inside(root: Path, info: dict, name: str, **place: Any) -> Path:
         path = template.format(**place)
     except (KeyError, IndexError, ValueError, AttributeError, TypeError) as error:
         raise ValueError(
-            f"{file} has a path {name!r}, {template!r}, that cannot be filled in: {error}; download it anew"
+            f"{file} has a path {name!r}, {template!r}, that cannot be filled in: {error}; download it again"
         ) from error
     return stay_inside(root, path, f"{file}, by {name!r},")
 
 
 def read_table(file: Path, columns: list[str] | None = None):
-    """Columns of a parquet file, or all, as a pyarrow table.
+    """Returns columns of a parquet file, or all, as a pyarrow table.
 
     Raises:
         ImportError: without pyarrow.
@@ -347,7 +347,7 @@ def read_table(file: Path, columns: list[str] | None = None):
 
 
 def rows_of_episode(table, episode: EpisodeFiles):
-    """The rows of one episode.
+    """Returns the rows of one episode.
 
     Raises:
         ValueError: if they are not as many as the metadata says, or not in order.
@@ -357,7 +357,7 @@ def rows_of_episode(table, episode: EpisodeFiles):
     try:
         table = table.filter(compute.equal(table["episode_index"], episode.number))
     except (NotImplementedError, ValueError) as error:  # pyarrow's are both
-        raise ValueError(f"{episode.data}: episode_index holds no whole numbers ({error}); download it anew") from error
+        raise ValueError(f"{episode.data}: episode_index has no whole numbers ({error}); download it again") from error
     if table.num_rows != episode.length:
         raise ValueError(
             f"{episode.data} has {table.num_rows} rows of episode {episode.number}, but the metadata says "
@@ -371,7 +371,7 @@ def rows_of_episode(table, episode: EpisodeFiles):
 
 
 def vectors(table, file: Path, key: str, width: int) -> np.ndarray:
-    """A column of numbers, float64 ``[n, width]``.
+    """Returns a column of numbers, float64 ``[n, width]``.
 
     Raises:
         ValueError: if a row has another width, or none.
@@ -394,7 +394,7 @@ def vectors(table, file: Path, key: str, width: int) -> np.ndarray:
 
 
 def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict | None) -> np.ndarray | None:
-    """One image of a parquet file, or of a file that it names, as RGB ``[H, W, 3]``; None if it cannot be decoded."""
+    """Decodes an image of a parquet file, or of a file that it names, to RGB ``[H, W, 3]``; None if that fails."""
     data = (value or {}).get("bytes")
     if data is None:
         names = [(value or {}).get("path")]
@@ -406,7 +406,7 @@ def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict 
 
 
 def stay_inside(root: Path, path: str, source: str) -> Path:
-    """A path below a folder, as metadata name it.
+    """Returns a path below a folder, as metadata name it.
 
     Args:
         root: the folder.

@@ -27,7 +27,7 @@ from torch_denkf.data.lerobot.files import (
     rows_of_episode,
     vectors,
 )
-from torch_denkf.data.lerobot.sound import mask_rows, sound_times
+from torch_denkf.data.lerobot.masking import mask_invalid_rows, repaired_times
 from torch_denkf.data.pictures import image_store, scaled, text_of_size
 from torch_denkf.data.video import frames_at_times
 from torch_denkf.deployment.progress import progress_bar
@@ -38,14 +38,14 @@ _FORMAT = 2  # part of the cache's key: raise it when what is stored changes
 
 @dataclass(frozen=True)
 class DecodedRecording:
-    """What :class:`torch_denkf.data.LeRobotReplay` replays.
+    """Decoded data set that :class:`torch_denkf.data.LeRobotReplay` replays.
 
     Attributes:
         rows: batch size ``[N]``, the rows of each episode one behind the other in time: ``image`` uint8 ``[N,3,H,W]``,
             zeros where it is missing, ``observed`` bool ``[N,1]``, ``state`` float32 ``[N,S]``, maybe ``action``
             float32 ``[N,A]``, ``time`` float64 ``[N,1]`` s, ``frame`` int64 ``[N,1]``, counted from 0 in each episode,
             and ``episode`` int64 ``[N]``. Where a row's state or action is not finite, also the masks of
-            :func:`~torch_denkf.data.lerobot.sound.mask_rows`.
+            :func:`~torch_denkf.data.lerobot.masking.mask_invalid_rows`.
         fps: rows a second.
         names: of the state's numbers, if they have any.
         source: folder that it was read from, if there is one.
@@ -69,7 +69,7 @@ def read_recording(
     episodes: Sequence[int] | None = None,
     origin: Mapping[str, Any] | None = None,
 ) -> DecodedRecording:
-    """Read episodes of a LeRobot folder, or load them from the cache.
+    """Reads episodes of a LeRobot folder, or loads them from the cache.
 
     Raises:
         ImportError: without pyarrow.
@@ -139,7 +139,7 @@ class _Frames:
         self._bar = progress_bar("reading recordings", rows, unit=" frames", shown=progress)
 
     def put(self, rows: np.ndarray, image: np.ndarray, source: object) -> None:
-        """Scale an image and take it for ``rows``."""
+        """Scales an image and takes it for ``rows``."""
         if self._native is None:
             self._native = image.shape[:2], source
         if image.shape[:2] != self._native[0]:
@@ -189,7 +189,7 @@ def _read(
                     swallowed.add(key)
             if "timestamp" in rows.column_names:
                 source = f"{opened}, episode {episode.number}"
-                time[at], stamped[at] = sound_times(rows["timestamp"].to_numpy(), layout.fps, source)
+                time[at], stamped[at] = repaired_times(rows["timestamp"].to_numpy(), layout.fps, source)
             else:
                 time[at] = np.arange(episode.length) / layout.fps
             if episode.video is None:
@@ -217,7 +217,7 @@ def _read(
         },
         batch_size=[int(starts[-1])],
     )
-    return mask_rows(out, torch.from_numpy(stamped), str(layout.root))
+    return mask_invalid_rows(out, torch.from_numpy(stamped), str(layout.root))
 
 
 def _check_columns(file: Path, table, columns: Sequence[str]) -> None:
@@ -236,11 +236,11 @@ def _put_images(layout: Layout, episode: EpisodeFiles, rows, start: int, frames:
 
 
 def _check_seen(episode: EpisodeFiles, seen: np.ndarray) -> None:
-    """A frame that is not there is a warning; an episode without any is an error."""
+    """Warns of missing frames; raises for an episode without any."""
     source = episode.video or episode.data
     if not seen.any():
         raise ValueError(
-            f"{source} shows none of the {episode.length} frames of episode {episode.number}; download it anew"
+            f"{source} shows none of the {episode.length} frames of episode {episode.number}; download it again"
         )
     missing = np.flatnonzero(~seen).tolist()
     if missing:

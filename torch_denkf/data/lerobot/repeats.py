@@ -11,7 +11,7 @@ from torch_denkf.data.pictures import JoinedPictures
 
 __all__ = ["REPEAT_THRESHOLD", "repeated_pictures"]
 
-# Grey levels of 255. Measured on a Unitree G1's recording, encoded anew by H.264: repeats differ by some 0.01, other
+# Grey levels of 255. Measured on a Unitree G1's recording, encoded again by H.264: repeats differ by some 0.01, other
 # pictures by some 2, and 2 % of all lie between 0.025 and 0.12.
 REPEAT_THRESHOLD = 0.08
 
@@ -19,7 +19,7 @@ REPEAT_THRESHOLD = 0.08
 def repeated_pictures(
     pictures: Tensor | JoinedPictures, shown: Tensor, first: Tensor, threshold: float = REPEAT_THRESHOLD
 ) -> Tensor:
-    """Which rows show the picture of the row before once more.
+    """Masks rows that repeat the picture of the row before.
 
     A recorder that writes more rows than its camera takes pictures repeats some. A video's codec changes a repeated
     picture a little, so that not only equal ones count. A repeat carries no news: a filter that takes it for a second

@@ -38,7 +38,7 @@ class LeRobotEpisode(Episode):
 
 
 def is_for_tests(number: int) -> bool:
-    """Whether an episode is the one of its five that is for tests; it does not depend on the others."""
+    """Returns True for the test episode among its five; it does not depend on the others."""
     block, place = divmod(number, _FOLD)
     return hashlib.sha256(f"torch_denkf {block}".encode()).digest()[0] % _FOLD == place
 
@@ -215,7 +215,7 @@ class LeRobotReplay(EpisodeReplay):
 
 
 def _paired(rows: TensorDict, lag: int) -> tuple[TensorDict, Tensor]:
-    """Rows that have a partner ``lag`` rows before them, with their ``step``; and the partners' numbers."""
+    """Returns rows that have a partner ``lag`` rows before them, with their ``step``; and the partners' numbers."""
     numbers, lengths = torch.unique_consecutive(rows["episode"], return_counts=True)
     if int(lengths.min()) <= abs(lag):
         short = numbers[lengths <= abs(lag)].tolist()

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from torch_denkf._checks import check_number
+from torch_denkf.data.lerobot.masking import mask_invalid_rows
 from torch_denkf.data.lerobot.recording import DecodedRecording, look_for_actions
-from torch_denkf.data.lerobot.sound import mask_rows
 from torch_denkf.data.pictures import image_store, scaled
 
 __all__ = ["recording_from_rows"]
@@ -33,7 +33,7 @@ def recording_from_rows(
     names: tuple[str, ...] | None = None,
     folder: str | Path | None = None,
 ) -> DecodedRecording:
-    """Turn rows as :class:`torchrl.data.datasets.OpenXExperienceReplay` stores them into a recording.
+    """Turns rows as :class:`torchrl.data.datasets.OpenXExperienceReplay` stores them into a recording.
 
     The defaults are the keys that most of the Open X-Embodiment sets have there, and those of
     :class:`torchrl.data.datasets.LeRobotExperienceReplay`. Berkeley's UR5 set has others::
@@ -131,7 +131,7 @@ def recording_from_rows(
             "frame": frame,
         }
     )
-    return DecodedRecording(mask_rows(out, None, "the rows"), float(fps), names)
+    return DecodedRecording(mask_invalid_rows(out, None, "the rows"), float(fps), names)
 
 
 def _get(rows: TensorDictBase, key: NestedKey) -> Tensor | TensorDictBase:
@@ -179,7 +179,7 @@ def _images(rows: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def _count_from_start(episode: Tensor, key: NestedKey) -> Tensor:
-    """Each row's number in its episode, ``[N, 1]``."""
+    """Returns each row's number in its episode, ``[N, 1]``."""
     names, lengths = torch.unique_consecutive(episode, return_counts=True)
     if len(names.unique()) < len(names):
         torn = names[(names[:, None] == names).sum(1) > 1].unique().tolist()

@@ -19,7 +19,7 @@ from tensordict import TensorDict
 from torch_denkf._checks import check_number
 from torch_denkf.data.cache import cache_folder, cached, stamp
 from torch_denkf.data.pictures import CURE, decode_picture, picture_files, scaled, text_of_size, unnamed_file
-from torch_denkf.data.recordings.tables import check_stream, check_times, read_numbers
+from torch_denkf.data.recordings.tables import check_stream, check_times, given_times
 from torch_denkf.data.text import read_number
 from torch_denkf.data.video import NOT_DECODED, decoded_frames, say_if_cut
 from torch_denkf.deployment.files import clear_errors
@@ -34,7 +34,7 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 
 @dataclass(frozen=True)
 class Frames:
-    """What a camera's pictures have in common; take :class:`Video` or :class:`Images`.
+    """Base of a camera's pictures; take :class:`Video` or :class:`Images`.
 
     Args:
         file: the video, or the folder of images.
@@ -67,7 +67,7 @@ class Frames:
         check_number("start", self.start, cure="It is a time in s")
 
     def read(self, size: tuple[int, int], cache: str | Path | bool | None, progress: bool) -> TensorDict:
-        """All pictures, batch size ``[F]``: ``pixels`` uint8 ``[F, 3, H, W]``, RGB, and ``time`` float64 ``[F]``, s.
+        """Reads all pictures, batch size ``[F]``: ``pixels`` uint8 ``[F, 3, H, W]``, RGB, and ``time`` float64, s.
 
         They are decoded once and then come memory-mapped from the cache, whatever the clock.
 
@@ -91,36 +91,25 @@ class Frames:
         return TensorDict({"pixels": stored["pixels"], "time": torch.from_numpy(times)}, stored.batch_size)
 
     def _files(self, source: Path) -> list[Path]:
-        """The files that are decoded, in order."""
+        """Returns the files that are decoded, in order."""
         raise NotImplementedError
 
     def _pictures(self, files: list[Path]) -> Iterator[tuple[float, np.ndarray | None, str]]:
-        """Each picture's own time, its RGB pixels (None if it is damaged), and its name for messages."""
+        """Returns each picture's own time, its RGB pixels (None if it is damaged), and its name for messages."""
         raise NotImplementedError
 
     def _own_times(self, source: Path, stored: TensorDict) -> np.ndarray:
-        """Times of the pictures, where none were passed, s."""
+        """Returns times of the pictures, where none were passed, s."""
         return stored["time"].numpy().copy()
 
     def _times(self, source: Path, stored: TensorDict) -> np.ndarray:
         if self.times is None:
             return self._own_times(source, stored) + self.start
-        given = self.times
-        if isinstance(given, (str, Path)):
-            _, numbers, where = read_numbers(Path(given).expanduser(), self.time, [])
-            times = numbers[:, 0]
-            check_times(times * SECONDS[self.unit], where, self.time)
-        else:
-            if np.ma.is_masked(given):
-                raise ValueError(f"times of {source} has masked elements; pass a time for each picture")
-            times = np.asarray(given, dtype=np.float64).reshape(-1)
-            check_times(times * SECONDS[self.unit], "times[{}]".format, self.time)
         # Damaged pictures are not stored: the place of each tells which time is its own.
-        place, there = stored["place"].numpy(), int(stored["count"][0])
-        if len(times) != there:
-            name = given if isinstance(given, (str, Path)) else "times"
-            raise ValueError(f"{name} has {len(times)} times, but {source} has {there} pictures; it needs one for each")
-        return times[place] * SECONDS[self.unit] + self.start
+        kept, there = stored["place"].numpy(), int(stored["count"][0])
+        times, place = given_times(self.times, self.time, str(source), there, "pictures")
+        check_times(times * SECONDS[self.unit], place, self.time)
+        return times[kept] * SECONDS[self.unit] + self.start
 
     def _decode(
         self, source: Path, files: list[Path], size: tuple[int, int], folder: Path | None, progress: bool
@@ -184,7 +173,7 @@ class Images(Frames):
             that is missing is a picture that is missing; a warning counts them.
 
     Raises:
-        ValueError: as :class:`Frames`, for a ``rate`` that is not positive, and for ``times`` beside it.
+        ValueError: as :class:`Frames`, for a ``rate`` that is not positive, and for ``times`` next to it.
 
     Examples:
         >>> Images("run1/images", rate=10.0).sample
@@ -228,7 +217,7 @@ class Images(Frames):
 
 
 def _counted(source: Path, files: list[Path]) -> np.ndarray:
-    """How many pictures a camera of steady rate took before each: where names end in numbers, one may be missing."""
+    """Counts the frames of a camera of steady rate before each: where names end in numbers, one may be missing."""
     numbers = np.array([_number(file) or float((re.findall(r"\d+", file.stem) or "0")[-1]) for file in files])
     steps = np.diff(numbers)
     least = steps.min(initial=np.inf)
@@ -247,7 +236,7 @@ def _counted(source: Path, files: list[Path]) -> np.ndarray:
 
 
 def _number(file: Path) -> float | None:
-    """The number that a file is called."""
+    """Returns the number that a file is called."""
     try:
         return read_number(file.stem)
     except ValueError:
@@ -255,7 +244,7 @@ def _number(file: Path) -> float | None:
 
 
 def _in_order(file: Path) -> tuple[list[float], str]:
-    """By number, or by the numbers in the name: img_9 comes before img_10."""
+    """Sorts by number, or by the numbers in the name: img_9 comes before img_10."""
     number = _number(file)
     return [float(part) for part in re.findall(r"\d+", file.stem)] if number is None else [number], file.name
 
@@ -274,7 +263,7 @@ class _Store:
         self._folder = folder or Path()
 
     def add(self, pixels: np.ndarray) -> None:
-        """Keep a picture ``[3, H, W]``."""
+        """Keeps a picture ``[3, H, W]``."""
         data = np.ascontiguousarray(pixels).tobytes()
         if self._file is None:
             self._memory += data
@@ -283,7 +272,7 @@ class _Store:
                 self._file.write(data)
 
     def pictures(self, count: int) -> torch.Tensor:
-        """All of them, uint8 ``[count, 3, H, W]``."""
+        """Returns all of them, uint8 ``[count, 3, H, W]``."""
         shape = (count, 3, *self._size)
         if self._file is None:
             return torch.frombuffer(self._memory, dtype=torch.uint8).reshape(shape)

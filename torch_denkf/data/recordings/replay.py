@@ -135,7 +135,7 @@ class RecordingReplay(EpisodeReplay):
     With ``"linear"`` every value counts as observed. Readings that come late, of a :class:`~torch_denkf.data.Table`
     with ``arrived``, are observed in the first row after they arrived.
 
-    Pictures are decoded once, scaled to ``size`` and memory-mapped. Tables are read anew each time.
+    Pictures are decoded once, scaled to ``size`` and memory-mapped. Tables are read again each time.
 
     Args:
         recordings: one, or several with the same streams; each is an episode.
@@ -240,7 +240,7 @@ def _pixels(pictures: JoinedPictures, picture: Tensor, row: Tensor) -> dict[str,
 
 
 def _check(recordings: Sequence[Recording], clock: str | float | None) -> str | float:
-    """The clock, where the recordings go together.
+    """Checks that the recordings go together, and returns their clock.
 
     Raises:
         ValueError: where they do not, or the clock is none of their streams.
@@ -278,7 +278,7 @@ def _check(recordings: Sequence[Recording], clock: str | float | None) -> str | 
 
 
 def _warn_of_lost_readings(recording: str, key: str, times: np.ndarray, rows: np.ndarray, seen: np.ndarray) -> None:
-    """Warn where few readings lie in the common time, or some share rows although the clock has one for each."""
+    """Warns where few readings lie in the common time, or some share rows although the clock has one for each."""
     inside = int(((times >= rows[0]) & (times <= rows[-1])).sum())
     if inside < _LITTLE * len(times):
         warnings.warn(
@@ -297,7 +297,7 @@ def _warn_of_lost_readings(recording: str, key: str, times: np.ndarray, rows: np
 
 
 def _warn_of_lost_rows(recording: str, times: Mapping[str, np.ndarray], clock: str | float, rows: np.ndarray) -> None:
-    """Warn where the clock had begun before some other stream, or went on after it."""
+    """Warns where the clock had begun before some other stream, or went on after it."""
     own = [times[clock]] if isinstance(clock, str) else list(times.values())
     begin, end = rows[0] - min(of[0] for of in own), max(of[-1] for of in own) - rows[-1]
     step = float(np.median(np.diff(rows)))
@@ -315,7 +315,7 @@ def _warn_of_lost_rows(recording: str, times: Mapping[str, np.ndarray], clock: s
 def _on_clock(
     recording: Recording, streams: Mapping[str, Any], clock: str | float, span: Span
 ) -> tuple[TensorDict, float]:
-    """Rows of a recording, with the number of each one's picture, and the time of the first, s."""
+    """Returns rows of a recording, with the number of each one's picture, and the time of the first, s."""
     taken = {
         key: stream.times if isinstance(stream, Readings) else stream["time"].numpy() for key, stream in streams.items()
     }

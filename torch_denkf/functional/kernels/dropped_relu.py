@@ -11,7 +11,7 @@ __all__ = ["dropped_relu"]
 
 
 def dropped_relu(x: Tensor, factor: Tensor, rate: float) -> Tensor:
-    """ReLU, then dropout: ``relu(x) * factor``.
+    """Applies ReLU, then dropout: ``relu(x) * factor``.
 
     What is neither cut off nor dropped is the result where it is positive, and its derivative is 1 / (1 - rate). The
     next layer keeps the result anyway, so that no masks are kept for the backward pass; storing those costs a chunk

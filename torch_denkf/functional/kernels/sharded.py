@@ -25,7 +25,7 @@ def analyse_sharded(
     rotation: Tensor | None = None,
     group: dist.ProcessGroup | None = None,
 ) -> Analysis:
-    """:func:`~torch_denkf.functional.analyse`, for a state too large for one process.
+    """Runs :func:`~torch_denkf.functional.analyse` for a state too large for one process.
 
     Every process holds all members of some components of the state, and of some components of the observation. In
     ensemble space the analysis needs of the others only sums over components: YYᵀ, E x E, and Y times the members'

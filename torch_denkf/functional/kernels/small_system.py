@@ -47,7 +47,7 @@ def on_gpu(tensor: Tensor) -> bool:
 
 
 def inverse_of(matrix: Tensor, ridge: float = 0) -> tuple[Tensor, Tensor]:
-    """The inverse of a symmetric M, N x N, and log det M, in few launches and without a look at the numbers.
+    """Returns the inverse of a symmetric M, N x N, and log det M, in few launches and without a look at the numbers.
 
     Up to :data:`LARGEST` rows of M and of the identity are eliminated one after the other; larger ones are factored.
 

@@ -61,32 +61,32 @@ class Flat(Space):
 
     @property
     def flat(self):
-        """This space."""
+        """Returns this space."""
         return self
 
     @property
     def parts(self) -> tuple[Space, ...]:  # type: ignore[override]
-        """The lines that stand side by side, and each circle."""
+        """Returns the lines that stand side by side, and each circle."""
         return tuple(
             part for turns, count in self._runs for part in ([Circle()] * count if turns else [Euclidean(count)])
         )
 
     def compose(self, first, second):
-        """The sum, angles wrapped."""
+        """Returns the sum, angles wrapped."""
         return self.normalise(first + second)
 
     def inverse(self, point):
-        """The negative."""
+        """Returns the negative."""
         return -point
 
     def right_jacobian(self, tangent):
-        """The identity."""
+        """Returns the identity."""
         return eye(tangent, self.size)
 
     adjoint = basis = dual_basis = right_jacobian
 
     def neutral(self, like=None):
-        """Zeros."""
+        """Returns zeros."""
         return torch.zeros(self.size) if like is None else like.new_zeros(self.size)
 
     def normalise(self, point):
@@ -96,17 +96,17 @@ class Flat(Space):
     exp = log = normalise
 
     def plus(self, point, tangent):
-        """The sum, angles wrapped."""
+        """Returns the sum, angles wrapped."""
         self.check(point=point, tangent=tangent)
         return self.normalise(point + tangent)
 
     def minus(self, point, origin):
-        """The difference, angles wrapped."""
+        """Returns the difference, angles wrapped."""
         self.check(point=point, origin=origin)
         return self.normalise(point - origin)
 
     def mean(self, points, weights=None):
-        """The mean; of angles that of the deviations from the direction of their sum as unit vectors."""
+        """Returns the mean; of angles that of the deviations from the direction of their sum as unit vectors."""
 
         def of_circles(values: Tensor) -> tuple[Tensor]:
             center = _direction(values, weights)
@@ -117,7 +117,7 @@ class Flat(Space):
     near = mean
 
     def innovation(self, reading, expected, observed=None):
-        """The difference, angles wrapped; NaN where the reading is."""
+        """Returns the difference, angles wrapped; NaN where the reading is."""
         return self.minus(reading, expected)
 
     def align(self, predicted, reading, observed=None):
@@ -162,7 +162,7 @@ class Flat(Space):
         return tuple(torch.cat(own, -1) for own in zip(*parts, strict=True))
 
     def told(self, observed):
-        """The mask itself: numbers are hidden one by one."""
+        """Returns the mask itself: numbers are masked one by one."""
         return observed, observed
 
     _whole = told
@@ -206,11 +206,11 @@ def _same(*values: Tensor) -> tuple[Tensor, ...]:
 
 
 def _mean(values: Tensor, weights: Tensor | None) -> Tensor:
-    """The mean ``[*B, 1, N]`` of values ``[*B, E, N]``."""
+    """Returns the mean ``[*B, 1, N]`` of values ``[*B, E, N]``."""
     return values.mean(-2, keepdim=True) if weights is None else (weights.unsqueeze(-1) * values).sum(-2, keepdim=True)
 
 
 def _direction(turns: Tensor, weights: Tensor | None = None) -> Tensor:
-    """The direction of the sum of unit vectors, ``[*B, 1, N]``; a constant to the gradient: it only picks the turn."""
+    """Returns the direction of the sum of unit vectors, ``[*B, 1, N]``; detached, since it only picks the turn."""
     turns = turns.detach()
     return torch.atan2(_mean(turns.sin(), weights), _mean(turns.cos(), weights))

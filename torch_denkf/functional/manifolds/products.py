@@ -39,17 +39,17 @@ class Opposite(Space):
 
     @property
     def point_dim(self) -> int:  # type: ignore[override]
-        """P."""
+        """Returns P."""
         return self.part.point_dim
 
     @property
     def tangent_dim(self) -> int:  # type: ignore[override]
-        """D."""
+        """Returns D."""
         return self.part.tangent_dim
 
     @property
     def parts(self) -> Sequence[Space]:  # type: ignore[override]
-        """Those of the space, each with its steps on the other side."""
+        """Returns the parts of the space, each with its steps on the other side."""
         return tuple(part.flat or Opposite(part) for part in self.part.parts)
 
     @property
@@ -57,47 +57,47 @@ class Opposite(Space):
         return self.part._angles
 
     def compose(self, first, second):
-        """The second, then the first."""
+        """Composes in reverse order: the second, then the first."""
         return self.part.compose(self.part.normalise(second), first)  # a reading may be so to rounding alone
 
     def inverse(self, point):
-        """That of the space."""
+        """Returns that of the space."""
         return self.part.inverse(point)
 
     def exp(self, tangent):
-        """That of the space."""
+        """Returns that of the space."""
         return self.part.exp(tangent)
 
     def log(self, point):
-        """That of the space."""
+        """Returns that of the space."""
         return self.part.log(point)
 
     def right_jacobian(self, tangent):
-        """The left one of the space."""
+        """Returns the left one of the space."""
         return self.part.right_jacobian(-tangent)
 
     def adjoint(self, point):
-        """The inverse of the space's: it takes errors in the world's axes to the body's."""
+        """Returns the inverse of the space's: it takes errors in the world's axes to the body's."""
         return self.part.adjoint(self.part.inverse(point))
 
     def basis(self, point):
-        """That of the space, of the step as the body sees it."""
+        """Returns that of the space, of the step as the body sees it."""
         return self.part.basis(point) @ self.adjoint(point)
 
     def dual_basis(self, point):
-        """That of the space, as the world sees it."""
+        """Returns that of the space, as the world sees it."""
         return self.part.adjoint(point) @ self.part.dual_basis(point)
 
     def neutral(self, like=None):
-        """That of the space."""
+        """Returns that of the space."""
         return self.part.neutral(like)
 
     def normalise(self, point):
-        """That of the space."""
+        """Returns that of the space."""
         return self.part.normalise(point)
 
     def near(self, points, weights=None):
-        """That of the space."""
+        """Returns that of the space."""
         return self.part.near(points, weights)
 
 
@@ -106,7 +106,7 @@ class _Made(Space):
 
     @property
     def flat(self):
-        """The joined lines and circles."""
+        """Returns the joined lines and circles."""
         circular, size = [], 0
         for part in self.parts:
             if part.flat is None:
@@ -185,6 +185,12 @@ class Product(_Made):
         object.__setattr__(self, "point_dim", sum(part.point_dim for part in parts))
         object.__setattr__(self, "tangent_dim", sum(part.tangent_dim for part in parts))
 
+    def exp_and_jacobian(self, tangent):
+        """Returns those of the parts, side by side and as blocks."""
+        pairs = [part.exp_and_jacobian(own) for part, own in zip(self.parts, self._apart("exp", tangent), strict=True)]
+        points, jacobians = zip(*pairs, strict=True)
+        return torch.cat(points, -1), blocks(jacobians)
+
     def neutral(self, like=None):
         """Returns those of the parts."""
         return torch.cat([part.neutral(like) for part in self.parts])
@@ -234,25 +240,25 @@ class Repeated(_Made):
 
     @property
     def point_dim(self) -> int:  # type: ignore[override]
-        """N P."""
+        """Returns N P."""
         return self.count * self.part.point_dim
 
     @property
     def tangent_dim(self) -> int:  # type: ignore[override]
-        """N D."""
+        """Returns N D."""
         return self.count * self.part.tangent_dim
 
     @property
     def parts(self) -> Sequence[Space]:  # type: ignore[override]
-        """N times the same."""
+        """Returns N times the same."""
         return (self.part,) * self.count
 
     def neutral(self, like=None):
-        """N times the same."""
+        """Returns N times the same."""
         return self.part.neutral(like).repeat(self.count)
 
     def near(self, points, weights=None):
-        """Point by point."""
+        """Works point by point."""
         apart = points.unflatten(-1, (self.count, -1)).movedim(-2, -3)
         return self.part.near(apart, None if weights is None else weights.unsqueeze(-2)).flatten(-2)
 
@@ -281,7 +287,7 @@ class Place(NamedTuple):
 
 
 def places_of(space: Space) -> list[Place]:
-    """The parts of a product, and of products within it; a space that is none is its own part.
+    """Returns the parts of a product, and of products within it; a space that is none is its own part.
 
     Example:
         >>> from torch_denkf.functional.manifolds import Euclidean, SE3

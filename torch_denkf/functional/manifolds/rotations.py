@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torch_denkf.functional.angles import wrap_angles
+from torch_denkf.functional.kernels.small_system import made_once
 from torch_denkf.functional.manifolds.quaternions import (
     conjugate,
     products,
@@ -50,13 +51,13 @@ class SE2(Space):
     _told = _one_by_one
 
     def compose(self, first, second):
-        """The second pose, seen from the first one's axes."""
+        """Composes two poses: the second one is seen from the first one's axes."""
         return torch.cat(
             [wrap_angles(first[..., :1] + second[..., :1]), _turn(first, second[..., 1:]) + first[..., 1:]], -1
         )
 
     def inverse(self, point):
-        """The pose that undoes it."""
+        """Returns the inverse pose."""
         back = -point
         return torch.cat([back[..., :1], _turn(back, back[..., 1:])], -1)
 
@@ -67,7 +68,7 @@ class SE2(Space):
         return torch.cat([wrap_angles(tangent[..., :1]), along * x - across * y, across * x + along * y], -1)
 
     def log(self, point):
-        """The twist that leads there."""
+        """Returns the twist that leads to a point."""
         angle = wrap_angles(point[..., :1])
         along, across = self._arc(angle)
         size = along.square() + across.square()
@@ -75,7 +76,7 @@ class SE2(Space):
         return torch.cat([angle, (along * x + across * y) / size, (along * y - across * x) / size], -1)
 
     def right_jacobian(self, tangent):
-        """Solà et al., eq. 163, with the angle first."""
+        """Returns the matrix of Solà et al., eq. 163, with the angle first."""
         angle, x, y = tangent.unbind(-1)
         along, across = (value.squeeze(-1) for value in self._arc(tangent[..., :1]))
         square = angle.square()
@@ -90,29 +91,29 @@ class SE2(Space):
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
     def adjoint(self, point):
-        """Solà et al., eq. 159, with the angle first."""
+        """Returns the matrix of Solà et al., eq. 159, with the angle first."""
         angle, x, y = point.unbind(-1)
         cos, sin, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
         rows = [[one, zero, zero], [y, cos, -sin], [-x, sin, cos]]
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
     def basis(self, point):
-        """A rotation of what leads ahead and to the left."""
+        """Rotates the directions ahead and to the left."""
         cos, sin = point[..., 0].cos(), point[..., 0].sin()
         zero, one = torch.zeros_like(cos), torch.ones_like(cos)
         rows = [[one, zero, zero], [zero, cos, -sin], [zero, sin, cos]]
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
     def dual_basis(self, point):
-        """The rotation back."""
+        """Returns the inverse rotation of :meth:`basis`."""
         return self.basis(point).mT
 
     def neutral(self, like=None):
-        """Zeros."""
+        """Returns zeros."""
         return torch.zeros(3) if like is None else like.new_zeros(3)
 
     def normalise(self, point):
-        """The angle, wrapped."""
+        """Wraps the angle."""
         return torch.cat([wrap_angles(point[..., :1]), point[..., 1:]], -1)
 
     def _between(self, points, weights):
@@ -121,7 +122,7 @@ class SE2(Space):
 
     @staticmethod
     def _arc(angle: Tensor) -> tuple[Tensor, Tensor]:
-        """sin(a) / a and (1 - cos(a)) / a."""
+        """Returns sin(a) / a and (1 - cos(a)) / a."""
         square = angle.square()
         return series(square, sinc), angle * series(square, half_versine)
 
@@ -135,16 +136,16 @@ class _RotationAndVectors(Space):
 
     @property
     def point_dim(self) -> int:  # type: ignore[override]
-        """4 + 3 K."""
+        """Returns 4 + 3 K."""
         return 4 + 3 * self.vectors
 
     @property
     def tangent_dim(self) -> int:  # type: ignore[override]
-        """3 + 3 K."""
+        """Returns 3 + 3 K."""
         return 3 + 3 * self.vectors
 
     def compose(self, first, second):
-        """The second, seen from the first one's axes."""
+        """Composes two points: the second one is seen from the first one's axes."""
         turn = unit(quaternion_product(first[..., :4], second[..., :4]))
         if not self.vectors:
             return turn
@@ -162,11 +163,12 @@ class _RotationAndVectors(Space):
         """Maps a tangent, a constant rate of all, to the point that it leads to."""
         angles = tangent[..., :3]
         square = angles.square().sum(-1, keepdim=True)
-        quaternion = torch.cat([series(square, cos_half), 0.5 * series(square, sinc_half) * angles], -1)
-        return self._bent(quaternion, angles, tangent, series(square, half_versine), series(square, one_minus_sinc))
+        w, share, *bends = several(square, *_EXP[: 4 if self.vectors else 2])
+        quaternion = torch.cat([w, 0.5 * share * angles], -1)
+        return self._bent(quaternion, angles, tangent, *bends) if self.vectors else quaternion
 
     def log(self, point):
-        """The shorter rotation, and what leads to the vectors meanwhile."""
+        """Returns the shorter rotation, and what leads to the vectors meanwhile."""
         quaternion = point[..., :4]
         quaternion = torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
         w, axis = quaternion[..., :1], quaternion[..., 1:]
@@ -180,7 +182,7 @@ class _RotationAndVectors(Space):
         return self._bent(turns, turns, point, torch.full_like(third, -0.5), third)
 
     def _bent(self, turn: Tensor, turns: Tensor, value: Tensor, half: Tensor, third: Tensor) -> Tensor:
-        """A rotation, and what :func:`bend` makes of the vectors of a point or tangent."""
+        """Returns a rotation, and what :func:`bend` makes of the vectors of a point or tangent."""
         if not self.vectors:
             return turn
         vectors = self._vectors(value, value.shape[-1] - 3 * self.vectors)
@@ -188,13 +190,13 @@ class _RotationAndVectors(Space):
         return torch.cat([turn, bent.flatten(-2)], -1)
 
     def right_jacobian(self, tangent):
-        """Solà et al., eq. 143; Barfoot, eq. 7.86, of the negative tangent."""
+        """Returns the matrix of Solà et al., eq. 143; Barfoot, eq. 7.86, of the negative tangent."""
         back = -tangent
         square = back[..., :3].square().sum(-1)[..., None, None]
         turn = skew(back[..., :3])
         turn2 = turn @ turn
-        third = series(square, one_minus_sinc)
-        block = eye(back[..., :3], 3) + series(square, half_versine) * turn + third * turn2
+        half, third = several(square, half_versine, one_minus_sinc)
+        block = torch.addcmul(torch.addcmul(eye(back[..., :3], 3), half, turn), third, turn2)
         if not self.vectors:
             return block
         move = skew(self._vectors(back, 3))
@@ -206,8 +208,17 @@ class _RotationAndVectors(Space):
         low = low + series(square, fifth) * (around @ turn + turn @ around)
         return self._matrix(block, low)
 
+    def exp_and_jacobian(self, tangent):
+        """Returns point and Jacobian; for a rotation alone from three functions of its angle."""
+        if self.vectors or torch.compiler.is_compiling():
+            return super().exp_and_jacobian(tangent)
+        w, share, third = several(tangent.square().sum(-1, keepdim=True), cos_half, sinc_half, one_minus_sinc)
+        share, turn = 0.5 * share, skew(tangent)
+        half = torch.addcmul(eye(tangent, 3), (share * share).unsqueeze(-1), turn, value=-2)  # 1 - cos = 2 sin^2
+        return torch.cat([w, share * tangent], -1), torch.addcmul(half, third.unsqueeze(-1), turn @ turn)
+
     def adjoint(self, point):
-        """Solà et al., eq. 175."""
+        """Returns the matrix of Solà et al., eq. 175."""
         turn = rotation_matrix(point[..., :4])
         return self._matrix(turn, skew(self._vectors(point, 4)) @ turn.unsqueeze(-3)) if self.vectors else turn
 
@@ -219,20 +230,20 @@ class _RotationAndVectors(Space):
         return torch.cat([first, torch.cat([torch.zeros_like(others[..., :3, :]), others], -2)], -1)
 
     def basis(self, point):
-        """Half the quaternion's products with i, j and k; the rotation, once for each vector."""
+        """Returns half the quaternion's products with i, j and k; the rotation, once for each vector."""
         return blocks([products(point) / 2, *[rotation_matrix(point[..., :4])] * self.vectors])
 
     def dual_basis(self, point):
-        """Its transpose, with twice the products."""
+        """Returns the transpose of :meth:`basis`, with twice the products."""
         return blocks([2 * products(point), *[rotation_matrix(point[..., :4])] * self.vectors]).mT
 
     def neutral(self, like=None):
-        """No rotation, zeros."""
+        """Returns no rotation and zeros."""
         zeros = torch.zeros(self.point_dim) if like is None else like.new_zeros(self.point_dim)
         return torch.cat([torch.ones_like(zeros[:1]), zeros[1:]])
 
     def normalise(self, point):
-        """With a quaternion of length one."""
+        """Scales the quaternion to length one."""
         return torch.cat([unit(point[..., :4]), point[..., 4:]], -1)
 
     def _between(self, points, weights):
@@ -297,7 +308,7 @@ class Turned(_RotationAndVectors):
 
 
 def _turn(pose: Tensor, vector: Tensor) -> Tensor:
-    """A vector ``[*, 2]`` turned by the angle of a pose ``[*, 3]``."""
+    """Rotates a vector ``[*, 2]`` by the angle of a pose ``[*, 3]``."""
     cos, sin = pose[..., :1].cos(), pose[..., :1].sin()
     x, y = vector[..., :1], vector[..., 1:]
     return torch.cat([cos * x - sin * y, sin * x + cos * y], -1)
@@ -312,7 +323,7 @@ class Function:
 
 
 def series(square: Tensor, function: Function) -> Tensor:
-    """The value at the angle whose square is given; value and gradient are finite at 0."""
+    """Returns the value at the angle whose square is given; value and gradient are finite at 0."""
     small = square < _SMALL[square.dtype]
     safe = torch.where(small, 1.0, square).sqrt()
     near = torch.zeros_like(square)
@@ -321,8 +332,24 @@ def series(square: Tensor, function: Function) -> Tensor:
     return torch.where(small, near, function.formula(safe))
 
 
+def several(square: Tensor, *functions: Function) -> Sequence[Tensor]:
+    """Returns the :func:`series` of several functions of squares ``[*, 1]``, in fewer calls."""
+    if torch.compiler.is_compiling():
+        return [series(square, function) for function in functions]
+    dtype, device = square.dtype, square.device
+    key = ("series", *map(id, functions), dtype, device)
+    first, *others = made_once(
+        key, lambda: torch.tensor([each.terms[::-1] for each in functions], dtype=dtype, device=device).mT.contiguous()
+    ).unbind()
+    small = square < _SMALL[dtype]
+    safe, near = torch.where(small, 1.0, square).sqrt(), first
+    for terms in others:
+        near = torch.addcmul(terms, near, square)
+    return torch.where(small, near, torch.cat([each.formula(safe) for each in functions], -1)).split(1, -1)
+
+
 cos_half = Function(lambda a: (a / 2).cos(), (1.0, -1 / 8, 1 / 384, -1 / 46080))
-sinc_half = Function(lambda a: (a / 2).sin() / (a / 2), (1.0, -1 / 24, 1 / 1920, -1 / 322560))
+sinc_half = Function(lambda a: (a / 2).sin() * 2 / a, (1.0, -1 / 24, 1 / 1920, -1 / 322560))
 sinc = Function(lambda a: a.sin() / a, (1.0, -1 / 6, 1 / 120, -1 / 5040))
 half_versine = Function(lambda a: (1 - a.cos()) / a**2, (1 / 2, -1 / 24, 1 / 720, -1 / 40320))
 one_minus_sinc = Function(lambda a: (a - a.sin()) / a**3, (1 / 6, -1 / 120, 1 / 5040, -1 / 362880))
@@ -336,9 +363,12 @@ inverse_third = Function(
     (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600),
 )
 
+#: What the exponential of a rotation needs, and behind it that of the vectors which it turns.
+_EXP = (cos_half, sinc_half, half_versine, one_minus_sinc)
+
 
 def bend(turn: Tensor, vector: Tensor, half: Tensor, third: Tensor) -> Tensor:
-    """The vector v + half w x v + third w x (w x v), with turn w."""
+    """Returns the vector v + half w x v + third w x (w x v), with turn w."""
     turn, vector = torch.broadcast_tensors(turn, vector)
     once = torch.linalg.cross(turn, vector)
     return vector + half * once + third * torch.linalg.cross(turn, once)

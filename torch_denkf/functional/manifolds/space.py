@@ -40,7 +40,7 @@ class Space:
         return None
 
     def __mul__(self, other: Space) -> Product:
-        """The product of both, with the points of ``other`` behind."""
+        """Returns the product of both, with the points of ``other`` behind."""
         from torch_denkf.functional.manifolds.products import Product
 
         if not isinstance(other, Space):
@@ -48,7 +48,7 @@ class Space:
         return Product(*(part for one in (self, other) for part in (one.parts if isinstance(one, Product) else [one])))
 
     def compose(self, first: Tensor, second: Tensor) -> Tensor:
-        """The product of two points ``[*, P]``."""
+        """Returns the product of two points ``[*, P]``."""
         raise NotImplementedError
 
     def inverse(self, point: Tensor) -> Tensor:
@@ -60,49 +60,53 @@ class Space:
         raise NotImplementedError
 
     def log(self, point: Tensor) -> Tensor:
-        """The shortest tangent ``[*, D]`` that leads from the neutral point to a point ``[*, P]``."""
+        """Returns the shortest tangent ``[*, D]`` that leads from the neutral point to a point ``[*, P]``."""
         raise NotImplementedError
 
     def right_jacobian(self, tangent: Tensor) -> Tensor:
-        r"""J with :math:`\exp(d + \delta) \approx \exp(d) \exp(J \delta)`: ``[*, D, D]`` of ``[*, D]``."""
+        r"""Returns J with :math:`\exp(d + \delta) \approx \exp(d) \exp(J \delta)`: ``[*, D, D]`` of ``[*, D]``."""
         raise NotImplementedError
 
+    def exp_and_jacobian(self, tangent: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns :meth:`exp` and :meth:`right_jacobian`, which may share what they need."""
+        return self.exp(tangent), self.right_jacobian(tangent)
+
     def adjoint(self, point: Tensor) -> Tensor:
-        r"""A with :math:`x \exp(d) x^{-1} = \exp(A d)`: ``[*, D, D]`` of ``[*, P]``."""
+        r"""Returns A with :math:`x \exp(d) x^{-1} = \exp(A d)`: ``[*, D, D]`` of ``[*, P]``."""
         raise NotImplementedError
 
     def basis(self, point: Tensor) -> Tensor:
-        r"""B with :math:`x \oplus d \approx x + B d` for a small d: ``[*, P, D]`` of ``[*, P]``."""
+        r"""Returns B with :math:`x \oplus d \approx x + B d` for a small d: ``[*, P, D]`` of ``[*, P]``."""
         raise NotImplementedError
 
     def dual_basis(self, point: Tensor) -> Tensor:
-        r"""B with :math:`(x + e) \ominus x \approx B e` for a small e: ``[*, D, P]`` of ``[*, P]``."""
+        r"""Returns B with :math:`(x + e) \ominus x \approx B e` for a small e: ``[*, D, P]`` of ``[*, P]``."""
         raise NotImplementedError
 
     def neutral(self, like: Tensor | None = None) -> Tensor:
-        """The neutral point ``[P]``, of the precision and on the device of ``like``."""
+        """Returns the neutral point ``[P]``, of the precision and on the device of ``like``."""
         raise NotImplementedError
 
     def normalise(self, point: Tensor) -> Tensor:
-        """The nearest point to numbers ``[*, P]`` that are one but for rounding, or that a network gave."""
+        """Returns the nearest point to numbers ``[*, P]`` that are one but for rounding, or that a network gave."""
         return point
 
     def plus(self, point: Tensor, tangent: Tensor) -> Tensor:
-        """The point ``[*, P]`` that a tangent ``[*, D]`` leads to."""
+        """Returns the point ``[*, P]`` that a tangent ``[*, D]`` leads to."""
         self.check(point=point, tangent=tangent)
         return self.compose(point, self.exp(tangent))
 
     def minus(self, point: Tensor, origin: Tensor) -> Tensor:
-        """The shortest tangent ``[*, D]`` from ``origin`` to ``point``, both ``[*, P]``."""
+        """Returns the shortest tangent ``[*, D]`` from ``origin`` to ``point``, both ``[*, P]``."""
         self.check(point=point, origin=origin)
         return self.log(self.compose(self.inverse(origin), point))
 
     def distance(self, point: Tensor, other: Tensor) -> Tensor:
-        """The length ``[*]`` of the tangent between two points; of two rotations the angle between them, in rad."""
+        """Returns the length ``[*]`` of the tangent between points; for rotations the angle between them, in rad."""
         return torch.linalg.vector_norm(self.minus(point, other), dim=-1)
 
     def mean(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
-        """The point ``[*B, P]`` around which the tangents to points ``[*B, E, P]`` add up to zero.
+        """Returns the point ``[*B, P]`` around which the tangents to points ``[*B, E, P]`` add up to zero.
 
         A few Gauss-Newton steps. It is unique where the points lie within a quarter turn of one of them.
 
@@ -118,17 +122,17 @@ class Space:
         return center.squeeze(-2)
 
     def near(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
-        """A point ``[*B, P]`` near the mean, where any will do for tangents: the mean of the numbers."""
+        """Returns a point ``[*B, P]`` near the mean, where any will do for tangents: the mean of the numbers."""
         return self.normalise(self._between(points, weights)).squeeze(-2)
 
     def _between(self, points: Tensor, weights: Tensor | None) -> Tensor:
-        """A point ``[*B, 1, P]`` near the mean: the mean of the numbers, counted from the first point."""
+        """Returns a point ``[*B, 1, P]`` near the mean: the mean of the numbers, counted from the first point."""
         away = points - points[..., :1, :]
         away = away.mean(-2, keepdim=True) if weights is None else (weights.unsqueeze(-1) * away).sum(-2, keepdim=True)
         return points[..., :1, :] + away
 
     def innovation(self, reading: Tensor, expected: Tensor, observed: Tensor | None = None) -> Tensor:
-        """The shortest tangent ``[*, D]`` from an expected reading to the one that came, both ``[*, P]``.
+        """Returns the shortest tangent ``[*, D]`` from an expected reading to the one that came, both ``[*, P]``.
 
         Where a mask ``[*, 1]`` or ``[*, D]`` hides the reading, see :meth:`told`, the expected one stands in its place:
         no number there, a zero or NaN, has a part in a value or a gradient.
@@ -179,7 +183,7 @@ class Space:
     _told = _whole  # of a mask of tangents
 
     def perturb(self, point: Tensor, std: Tensor, noise: Tensor) -> Tensor:
-        """A random point ``[*, P]``: standard normal ``noise`` ``[*, D]`` times standard deviations ``[*, D]`` away."""
+        """Draws a point ``[*, P]``: standard normal ``noise`` ``[*, D]`` times standard deviations ``[*, D]`` away."""
         return self.plus(point, std * noise)
 
     def check(self, **values: Tensor) -> None:
@@ -242,7 +246,7 @@ def side_by_side(parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor
 
 
 def blocks(parts: Sequence[Tensor]) -> Tensor:
-    """Matrices on the diagonal of one."""
+    """Returns matrices on the diagonal of one."""
     sizes = [part.shape[-1] for part in parts]
     rows = []
     for place, part in enumerate(parts):

@@ -1,4 +1,4 @@
-"""Ensemble smoothers: the members of an earlier time, moved by what later readings said.
+"""Ensemble smoothers: the members of an earlier time, corrected by later readings.
 
 Both use that members are paired in time: member i at t + 1 is the forecast of member i at t. An update that mixes the
 pairing up, such as a random rotation of the members after each analysis, takes their ground away.
@@ -20,7 +20,7 @@ from torch_denkf.functional.smoothing.backward import run_backward
 
 
 def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping: float = 1.0) -> Tensor:
-    """One step back in time: the smoothed members of t from those of t + 1.
+    """Smooths one step back in time: the members of t from those of t + 1.
 
     X + (X_s − X_f) A_f⁺ A, with A and A_f the anomalies at t and of the forecast: the gain of
     :func:`~torch_denkf.functional.smoothing.rts.rts_step` from sample covariances. The smaller of the two possible
@@ -54,7 +54,7 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping:
     check_number("damping", damping, above=0, most=1, cure="It is a factor on the gain")
     size, dim = ensemble.shape[-2:]
     anomalies, forecast_anomalies = ensemble_anomalies(ensemble), ensemble_anomalies(forecast)
-    # Where all members are alike, what they have beside their mean is rounding, and no direction to learn from.
+    # Where all members are alike, what they have besides their mean is rounding, and no direction to learn from.
     spread = forecast_anomalies.square().mean(-2, keepdim=True).detach().sqrt()
     alike = spread <= 4 * torch.finfo(forecast.dtype).eps * forecast.abs().amax(-2, keepdim=True).detach()
     forecast_anomalies = torch.where(alike, 0, forecast_anomalies)
@@ -84,7 +84,7 @@ def enrts_smooth(
     damping: float = 1.0,
     space: Space | None = None,
 ) -> Tensor:
-    """Smooth the ensembles of a whole sequence.
+    """Smooths the ensembles of a whole sequence.
 
     Args:
         ensemble: the filter's beliefs, ``[*B, T, E, S]``.

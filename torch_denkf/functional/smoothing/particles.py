@@ -14,7 +14,7 @@ from torch_denkf.functional.smoothing.backward import run_backward
 
 
 def backward_weights(log_weights: Tensor, log_transition: Tensor, log_smoothed: Tensor) -> Tensor:
-    r"""One step back in time: the smoothed weights of the particles at t from those at t + 1.
+    r"""Smooths one step back in time: the weights of the particles at t from those at t + 1.
 
     .. math:: w^i_{t|T} = w^i_t \sum_j w^j_{t+1|T}
         \frac{p(x^j_{t+1} | x^i_t)}{\sum_l w^l_t\, p(x^j_{t+1} | x^l_t)}
@@ -31,7 +31,7 @@ def backward_weights(log_weights: Tensor, log_transition: Tensor, log_smoothed: 
         ValueError: if the shapes do not fit.
 
     Examples:
-        Two particles, of which only the second can have led to the later one that is believed:
+        Two particles, of which only the second can have led to the later one with all weight:
 
         >>> import torch
         >>> even = torch.tensor([0.5, 0.5]).log()
@@ -50,7 +50,7 @@ def backward_weights(log_weights: Tensor, log_transition: Tensor, log_smoothed: 
 def backward_smooth(
     log_weights: Tensor, log_transition: Tensor, *, follows: Tensor | None = None, lag: int | None = None
 ) -> Tensor:
-    """Smooth the weights of a whole sequence of particles, which stay where they are.
+    """Smooths the weights of a whole sequence of particles, which stay where they are.
 
     Args:
         log_weights: of the filter's beliefs, normalised, ``[*B, T, E]``.

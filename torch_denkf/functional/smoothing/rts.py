@@ -18,7 +18,7 @@ from torch_denkf.functional.smoothing.backward import run_backward
 
 
 def smoothing_gain(cross: Tensor, forecast_cov: Tensor) -> Tensor:
-    """The smoother's gain G = C P_f⁻¹, also for a singular P_f.
+    """Returns the smoother's gain G = C P_f⁻¹, also for a singular P_f.
 
     Args:
         cross: C, the covariance of the state at t and the state at t + 1, ``[*B, S, S]``, rows at t.
@@ -73,7 +73,7 @@ def rts_step(
     open_cov: Tensor | None = None,
     space: Space | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """One step back in time: the smoothed belief of t from that of t + 1.
+    """Smooths one step back in time: the belief of t from that of t + 1.
 
     The covariance is (P − G P_f Gᵀ) + G P_s Gᵀ: what the next state leaves open, and what is not known of that.
 
@@ -136,7 +136,7 @@ def rts_smooth(
     lag: int | None = None,
     space: Space | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Smooth the beliefs of a whole sequence.
+    """Smooths the beliefs of a whole sequence.
 
     Args:
         mean: of the filter's beliefs, ``[*B, T, S]``.

@@ -84,7 +84,7 @@ def test_the_object_is_no_ghost(env):
 
 @pytest.mark.parametrize("shape", [(10,), (4, 5, 10), (5, 6)])
 def test_ghosts_of_another_shape(env, shape):
-    with pytest.raises(ValueError, match=r"ghosts are \[\*N, G, S\] beside a state \[\*N, S\]"):
+    with pytest.raises(ValueError, match=r"ghosts are \[\*N, G, S\] next to a state \[\*N, S\]"):
         env.render_state(torch.zeros(10), ghosts=torch.zeros(shape))
 
 

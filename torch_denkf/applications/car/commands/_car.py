@@ -12,7 +12,7 @@ __all__ = ["load_car", "set_threads"]
 
 
 def load_car(name_or_folder: str | Path) -> CarFilter:
-    """The filter of that name or in that folder.
+    """Returns the filter of that name or in that folder.
 
     Raises:
         FileNotFoundError: if there is none.

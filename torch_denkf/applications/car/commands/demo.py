@@ -107,7 +107,7 @@ class Demo(Command):
 
 
 def _table(scores: dict[str, float]) -> str:
-    """Three lines on a drive."""
+    """Formats three lines on a drive."""
     way = scores["way_m"]
     lines = [
         f"{'':16}{'off at the end':>18}{'off on average':>18}   after {way:.0f} m with a camera that failed 3 times"

@@ -23,7 +23,7 @@ __all__ = ["Evaluate"]
 
 @dataclass
 class Evaluate(Command):
-    """Errors of a trained car filter on drives with known poses, beside dead reckoning on the same readings."""
+    """Errors of a trained car filter on drives with known poses, next to dead reckoning on the same readings."""
 
     root: Path  # folder in KITTI's layout, with sequences/ and poses/
     checkpoint: str = "car-odometry"  # that of the library, or a folder that denkf train left

@@ -138,7 +138,7 @@ def _leave(beliefs, out: Path, *, pictures: bool) -> None:
 
 
 def _times(file: Path | None, source) -> Sequence[float] | None:
-    """The frames' times; of a file with a row for each number, those of the numbers that are there."""
+    """Returns the frames' times; of a file with a row for each number, those of the numbers that are there."""
     if file is None:
         return None
     from torch_denkf.applications.car.odometry.images import read_times
@@ -155,7 +155,7 @@ def _times(file: Path | None, source) -> Sequence[float] | None:
 
 
 def _uneven(source) -> Sequence[float] | None:
-    """The times that a video says its frames were taken at, where they are not evenly spaced."""
+    """Returns the times that a video says its frames were taken at, where they are not evenly spaced."""
     stamps = source.stamps()
     if stamps is None:
         return None

@@ -49,7 +49,7 @@ class StereoCamera:
                 check_number(f"each number of {name}", number)
 
     def corners(self, pixels: Tensor) -> Tensor:
-        """Corners ``[*, 3]`` of what a tracker gives, ``[*, 4]``: u left, v left, u right, v right."""
+        """Returns corners ``[*, 3]`` of what a tracker gives, ``[*, 4]``: u left, v left, u right, v right."""
         left, right = self._undistorted(pixels[..., :2]), self._undistorted(pixels[..., 2:])
         x, y = ((pixels[..., :2] - torch.tensor(self.center).to(pixels)) / self.focal).unbind(-1)
         powers = [torch.ones_like(x), x, y, x.square(), x * y, y.square(), (x.square() + y.square()).square()]
@@ -58,18 +58,18 @@ class StereoCamera:
         return torch.cat([left, disparity.unsqueeze(-1)], -1)
 
     def points(self, corners: Tensor) -> Tensor:
-        """Points ``[*, 3]`` in m of corners ``[*, 3]``."""
+        """Returns points ``[*, 3]`` in m of corners ``[*, 3]``."""
         center = torch.tensor([*self.center, 0.0]).to(corners)
         away = corners[..., :2] - center[:2]
         return torch.cat([away, torch.full_like(away[..., :1], self.focal)], -1) * self.baseline / corners[..., 2:]
 
     def project(self, points: Tensor) -> Tensor:
-        """Corners ``[*, 3]`` of points ``[*, 3]`` ahead of the camera."""
+        """Returns corners ``[*, 3]`` of points ``[*, 3]`` ahead of the camera."""
         seen = torch.cat([points[..., :2], torch.full_like(points[..., :1], self.baseline)], -1)
         return self.focal * seen / points[..., 2:] + torch.tensor([*self.center, 0.0]).to(points)
 
     def jacobian(self, points: Tensor) -> Tensor:
-        """Of :meth:`project`, ``[*, 3, 3]``."""
+        """Returns the Jacobian of :meth:`project`, ``[*, 3, 3]``."""
         over = self.focal / points[..., 2]
         x, y = points[..., 0] * over / points[..., 2], points[..., 1] * over / points[..., 2]
         zero, depth = torch.zeros_like(over), over * self.baseline / points[..., 2]
@@ -77,7 +77,7 @@ class StereoCamera:
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
     def jacobian_of_points(self, corners: Tensor) -> Tensor:
-        """Of :meth:`points`, ``[*, 3, 3]``."""
+        """Returns the Jacobian of :meth:`points`, ``[*, 3, 3]``."""
         points = self.points(corners)
         over = self.baseline / corners[..., 2]
         zero = torch.zeros_like(over)

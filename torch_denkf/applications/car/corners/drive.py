@@ -33,7 +33,7 @@ FASTEST = 40.0  # rad/s: gyros end at 35
 
 
 def read_corner_drive(file: str | Path, rows: int | None = None) -> tuple[TensorDict, StereoCamera]:
-    """Rows of a drive: the corners that each row shares with the row before, and its turn rates.
+    """Returns rows of a drive: the corners that each row shares with the row before, and its turn rates.
 
     A row *repeats* the one before where all shared corners are in the same places to the bit: the tracker has found
     new corners there and followed none. Such a row says nothing of the motion since the row before, and is not
@@ -113,7 +113,7 @@ def corner_replay(drives: dict[str, TensorDict], **options) -> EpisodeReplay:
 def _read_entries(file: Path) -> dict[str, np.ndarray]:
     if not file.is_file():
         raise FileNotFoundError(f"no file {file}; check the path")
-    damaged = f"{file} is no npz file of numbers ({{}}); download or copy it anew"
+    damaged = f"{file} is no npz file of numbers ({{}}); download or copy it again"
     try:
         with zipfile.ZipFile(file) as archive:
             if (size := sum(part.file_size for part in archive.infolist())) > MOST_BYTES:
@@ -163,7 +163,7 @@ def _check_entries(file: Path, entries: dict[str, np.ndarray]) -> None:
 
 
 def _pairs(features: np.ndarray) -> dict[str, Tensor]:
-    """Corners of neighbouring rows side by side, with the keys of :func:`read_corner_drive`; which rows are repeats."""
+    """Returns corners of neighbouring rows with the keys of :func:`read_corner_drive`, and which rows are repeats."""
     there = (features != -1).all(0)
     both = there[:, 1:] & there[:, :-1]
     most, count, tracks = max(int(both.sum(0).max()), 1), features.shape[-1], len(there)

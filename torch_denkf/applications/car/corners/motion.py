@@ -24,7 +24,7 @@ LEAST = 0.03  # weight of a corner that is not wrong
 
 @dataclass(frozen=True)
 class CornerNoise:
-    """How far corners are off, in pixels: standard deviations.
+    """Standard deviations of corners, in pixels.
 
     Attributes:
         pixel: of a corner's place in the left image, between two rows.
@@ -59,7 +59,7 @@ class CornerNoise:
             check_number(each.name, getattr(self, each.name), least=0, above=above)
 
     def stereo_var(self, corners: Tensor, offset: Tensor, stale: Tensor) -> Tensor:
-        """Variance of the error that stays with a corner, ``[*]`` in pixels^2, before anything is seen of it.
+        """Returns the variance of the error that stays with a corner, ``[*]`` in pixels^2, before it is observed.
 
         Args:
             corners: (u, v, disparity), ``[*, 3]``.
@@ -72,7 +72,7 @@ class CornerNoise:
 
 
 class CornerMotion(NamedTuple):
-    """What :func:`corner_motion` returns.
+    """Result of :func:`corner_motion`.
 
     Attributes:
         motion: points of SE3 ``[*B, 7]``: the pose of the later row, seen from the earlier one.
@@ -102,7 +102,7 @@ def corner_motion(
     start: Tensor | None = None,
     steps: int = 12,
 ) -> CornerMotion:
-    """The most likely motion by Gauss-Newton, on the corners' places and disparities.
+    """Returns the most likely motion by Gauss-Newton, on the corners' places and disparities.
 
     Each corner's place in space is known but for the noise of the earlier row. That noise goes through the motion into
     what the later row should show, so that a far corner says much of the turn and little of the way. Students's t
@@ -195,7 +195,7 @@ def corner_motions(
     steps: int = 6,
     memory: bool = True,
 ) -> CornerMotion:
-    """The motion of each row since the row before; what a corner has shown of its disparity is remembered.
+    """Returns the motion of each row since the row before; what a corner has shown of its disparity is remembered.
 
     A corner that moves shows how far it is. So the error of its disparity, which stays with it, is known better from
     row to row.
@@ -240,7 +240,7 @@ def corner_motions(
 
 
 def _covariance(by_disparity: Tensor, flow2: Tensor, stays: Tensor | float, noise: CornerNoise) -> Tensor:
-    """Of what the later row shows, ``[*, 3, 3]``.
+    """Returns the covariance of the observations in the later row, ``[*, 3, 3]``.
 
     Args:
         by_disparity: by how much it changes with the disparity of the earlier row, ``[*, 3]``.

@@ -36,7 +36,7 @@ class Times(NamedTuple):
 
 
 def read_times(file: Path, rows: int) -> Times:
-    """Read the frames' times, or make nominal ones where there is no file.
+    """Reads the frames' times, or makes nominal ones if there is no file.
 
     A warning counts the stamps that do not increase, which are not used, and the gaps.
 
@@ -66,7 +66,7 @@ def read_times(file: Path, rows: int) -> Times:
     if len(wrong) > MOST_WRONG * len(times):
         raise ValueError(
             f"{file}:{wrong[0] + 1}: the time {times[wrong[0]]:g} s does not increase, nor do {len(wrong) - 1} others "
-            f"of {len(times)}; expected increasing seconds, one a frame: write them anew, or take the file away "
+            f"of {len(times)}; expected increasing seconds, one a frame: write them again, or take the file away "
             f"(frames are then {KITTI_DT} s apart)"
         )
     if len(wrong):

@@ -71,7 +71,7 @@ def read_kitti_drive(
     cache: str | Path | bool | None = True,
     progress: Callable[[int], object] | None = None,
 ) -> TensorDict:
-    """Read one drive: images of one size, and the planar state in Kloss et al.'s convention.
+    """Reads one drive: images of one size, and the planar state in Kloss et al.'s convention.
 
     Row k is frame ``first + k``, from the first to the last frame that has both an image and a pose. Frames that lack
     an image, or whose file is damaged (a warning names it), keep their row. So do frames whose time does not increase,
@@ -95,7 +95,7 @@ def read_kitti_drive(
     exactly them. The first pose of the file has none and takes that of the next. v is signed: negative in reverse.
     After a gap both are means over it, and no image pair reaches over it.
 
-    Reading a drive anew decodes each image; the result is kept as a memory-mapped TensorDict, whose key covers the
+    Reading a drive again decodes each image; the result is kept as a memory-mapped TensorDict, whose key covers the
     folder, the options, and the names, times and sizes of all files read. Old entries may be deleted at any time.
 
     Args:
@@ -162,7 +162,7 @@ def read_kitti_drive(
 
 
 def choose_camera(folder: Path, camera: str | None) -> str:
-    """Name of the folder of a drive's images: the one that is asked for, or the first that there is."""
+    """Returns the name of the folder of a drive's images: the one that is asked for, or the first that there is."""
     if not folder.is_dir():
         names = sorted(e.name for e in folder.parent.iterdir() if e.is_dir()) if folder.parent.is_dir() else []
         raise FileNotFoundError(
@@ -183,7 +183,7 @@ def choose_camera(folder: Path, camera: str | None) -> str:
 
 
 def _frame_files(folder: Path) -> dict[int, Path]:
-    """Images by frame number, in order."""
+    """Returns images by frame number, in order."""
     if not folder.is_dir():
         return {}
     names = sorted(entry.name for entry in os.scandir(folder) if re.fullmatch(r"\d+\.png", entry.name))
@@ -249,7 +249,7 @@ def _read(
             pool.shutdown(wait=False, cancel_futures=True)  # without it, thousands of images would still be decoded
             raise
     if native is None:
-        raise ValueError(f"none of the {len(numbers)} images in {folder / camera} can be read; download them anew")
+        raise ValueError(f"none of the {len(numbers)} images in {folder / camera} can be read; download them again")
     calibration = scale_calibration(read_calibration(folder / "calib.txt", camera), native, size)
     return TensorDict(
         {
@@ -275,6 +275,6 @@ def _is_colour(files) -> bool:
 
 
 def _read_image(file: Path, size: tuple[int, int], colour: bool) -> tuple[np.ndarray | None, tuple[int, int]]:
-    """Pixels ``[C, H, W]``, RGB or grey, and the file's own (H, W)."""
+    """Returns pixels ``[C, H, W]``, RGB or grey, and the file's own (H, W)."""
     pixels = _decode(file, cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE)
     return (None, (0, 0)) if pixels is None else (scaled(pixels, size), pixels.shape[:2])

@@ -39,7 +39,7 @@ class KITTIReplayEnv(RowsEnv):
     ============ ================ ====================================================================================
 
     An episode shows ``length`` frames, the one at reset included: ``length - 1`` steps, then it is truncated. Rows may
-    end at different steps; a reset starts anew only the rows that ``"_reset"`` marks. The difference at reset is that
+    end at different steps; a reset restarts only the rows that ``"_reset"`` marks. The difference at reset is that
     to the frame before, where there is one. Rewards are zero.
 
     A replay has no actions. TorchRL's batched environments and rollouts work with an empty action spec, but its
@@ -61,7 +61,7 @@ class KITTIReplayEnv(RowsEnv):
         camera: folder of the images.
         colour: True for three channels, False for a grey one, None for what the files have.
         cache: where the decoded drive is kept.
-        seed: of the random starts; by default drawn from torch's generator. ``set_seed`` sets it anew, and gives each
+        seed: of the random starts; by default drawn from torch's generator. ``set_seed`` sets it again, and gives each
             worker of a ParallelEnv its own.
         device: of all that is emitted; the whole drive is moved there. By default where the drive is.
 

@@ -1,4 +1,4 @@
-"""Which drives and cameras a data set of KITTI drives consists of, and how they are opened."""
+"""Episodes of a KITTI data set: one for each drive and camera, and opening them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class KITTIEpisode(Episode):
 
     @property
     def split_name(self) -> str:
-        """The drive: its cameras and mirror images are on the same side of a split."""
+        """Returns the drive: its cameras and mirror images are on the same side of a split."""
         return self.drive
 
 
@@ -104,7 +104,7 @@ def read_drives(
     flow: bool | Callable[[TensorDictBase], TensorDictBase],
     progress: bool,
 ) -> list[TensorDict]:
-    """Read drives one after another, with flow if asked for: ``flow`` True is :func:`with_motion`, with the same cache.
+    """Reads drives one after another, with flow if asked for: True is :func:`with_motion`, with the same cache.
 
     Raises:
         ValueError: if ``flow`` returns something else than the drive with ``"flow"``, or if drives differ in what a

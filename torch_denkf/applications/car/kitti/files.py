@@ -21,7 +21,7 @@ FASTEST = 300.0  # m/s: no robot that takes pictures of its road is faster
 
 
 def read_poses(file: Path) -> np.ndarray:
-    """Read a pose file.
+    """Reads a pose file.
 
     Args:
         file: ``poses/NN.txt``.
@@ -80,7 +80,7 @@ def _check_poses(file: Path, poses: np.ndarray) -> None:
 
 
 def check_speeds(file: Path, poses: np.ndarray, dt: np.ndarray) -> None:
-    """Refuses poses that no robot goes through.
+    """Raises for poses that no robot goes through.
 
     Args:
         file: that they are from.
@@ -96,7 +96,7 @@ def check_speeds(file: Path, poses: np.ndarray, dt: np.ndarray) -> None:
         row = int(wrong[0])
         raise ValueError(
             f"{file}:{row + 2}: the position is {ways[row]:g} m from that of the row before, {dt[row]:g} s earlier; "
-            f"expected metres, and at most {FASTEST:g} m/s. Correct the row, or write the poses anew"
+            f"expected metres, and at most {FASTEST:g} m/s. Correct the row, or write the poses again"
         )
 
 
@@ -113,13 +113,13 @@ def _numbers(words: list[str], count: int | None, where: str, meaning: str) -> n
 
 
 def write_poses(file: Path, poses: np.ndarray) -> None:
-    """Write camera-to-world matrices ``[N, 3, 4]``, in metres, to a pose file."""
+    """Writes camera-to-world matrices ``[N, 3, 4]``, in metres, to a pose file."""
     with replacing(file) as beside:
         np.savetxt(beside, poses.reshape(len(poses), 12), fmt="%.9e")
 
 
 def read_calibration(file: Path, camera: str) -> np.ndarray:
-    """Read a camera's focal lengths and principal point.
+    """Reads a camera's focal lengths and principal point.
 
     Args:
         file: ``sequences/NN/calib.txt``, with rows ``P0:`` to ``P3:`` of 3x4 projection matrices.
@@ -158,7 +158,7 @@ def read_calibration(file: Path, camera: str) -> np.ndarray:
 
 
 def scale_calibration(calibration: np.ndarray, native: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
-    """Scale fx, fy, cx, cy from ``native`` to ``size``, both (H, W), with pixel centres at whole numbers."""
+    """Scales fx, fy, cx, cy from ``native`` to ``size``, both (H, W), with pixel centres at whole numbers."""
     vertical, horizontal = size[0] / native[0], size[1] / native[1]
     fx, fy, cx, cy = calibration
     return np.array([fx * horizontal, fy * vertical, (cx + 0.5) * horizontal - 0.5, (cy + 0.5) * vertical - 0.5])

@@ -1,4 +1,4 @@
-"""What a network sees of a drive: frames with the difference to the frame before, the same for training and replay.
+"""Input frames of a network with the difference to the frame before, the same for training and replay.
 
 :class:`torch_denkf.applications.car.KITTIReplayEnv` and the training data both come from :func:`frames_at`.
 """
@@ -17,7 +17,7 @@ MOTION_KEYS = ("flow", "road", "two_view")  # what with_motion adds
 
 
 def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
-    """Frames of a drive by row number.
+    """Returns frames of a drive by row number.
 
     ============ ================ ====================================================================================
     key          shape            content
@@ -75,7 +75,7 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
 
 
 def drive_frames(drive: TensorDictBase) -> TensorDict:
-    """All frames of a drive as training data: what a replay from its first row emits.
+    """Returns all frames of a drive as training data: what a replay from its first row emits.
 
     Args:
         drive: as :func:`torch_denkf.applications.car.read_kitti_drive` gives it, batch size ``[N]``.
@@ -91,7 +91,7 @@ def drive_frames(drive: TensorDictBase) -> TensorDict:
 
 
 def mark_start(frames: TensorDict) -> TensorDict:
-    """Frames ``[*B, T]`` with ``"is_init"``, true in the first of each row."""
+    """Returns frames ``[*B, T]`` with ``"is_init"``, true in the first of each row."""
     is_init = torch.zeros(*frames.batch_size, 1, dtype=torch.bool, device=frames.device)
     is_init[..., 0, :] = True
     return frames.set("is_init", is_init)

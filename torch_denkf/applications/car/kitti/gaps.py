@@ -50,7 +50,7 @@ def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
 
 
 def after_gap(drive: TensorDictBase) -> Tensor | None:
-    """Rows that come after a gap in time, bool ``[N]``; ``None`` where there is none."""
+    """Masks rows that come after a gap in time, bool ``[N]``; ``None`` where there is none."""
     dt = drive.get("dt", None)
     if dt is None or not dt.numel():
         return None
@@ -73,7 +73,7 @@ def steps_between(valid: Tensor, longest: int) -> Tensor:
 
 
 def steps_at(drive: TensorDictBase, index: Tensor) -> Tensor:
-    """How many steps before each frame its pair begins, ``[*B, 1]``; 0 for none.
+    """Returns the number of steps between a frame and the first frame of its pair, ``[*B, 1]``; 0 for none.
 
     Without :func:`bridge_gaps` a pair is of neighbours.
     """

@@ -45,7 +45,7 @@ def render_drives(
     overwrite: bool = False,
     progress: Callable[[int], object] | None = None,
 ) -> list[str]:
-    """Render drives along recorded or invented poses, with hills and moving cars, in KITTI's layout.
+    """Renders drives along recorded or invented poses, with hills and moving cars, in KITTI's layout.
 
     The camera takes the poses' full motion, with pitch, roll and climbs (without those that its attitude contradicts,
     because recorded altitudes drift while a car stands); the road lies 1.65 m under it and follows its
@@ -172,7 +172,7 @@ def write_drives(
     seed: int = 0,
     overwrite: bool = False,
 ) -> list[str]:
-    """Render simple drives: random roads on level ground, with a level camera and without moving cars.
+    """Renders simple drives: random roads on level ground, with a level camera and without moving cars.
 
     Written in the layout that :func:`torch_denkf.applications.car.read_kitti_drive` reads. A drive follows from its
     name, the seed and the options alone, so one that is already there with the same options is kept. Writing 300 frames

@@ -45,7 +45,7 @@ class KITTIOdometryExperienceReplay(EpisodeReplay):
     sampled, from the drives' memory-mapped frames, so that neither float images nor mirrored copies are kept. All of
     KITTI takes 0.5 GB on disk at 50 x 150 in colour for each camera.
 
-    Poses are those of the left grey camera, as in the benchmark; the others are beside it, at most 0.5 m.
+    Poses are those of the left grey camera, as in the benchmark; the others are next to it, at most 0.5 m.
 
     ``drives`` names the drives of the split ``"train"``, the default: none is for tests unless ``test_share`` says so.
     All cameras and mirror images of a drive are on the same side.
@@ -131,11 +131,11 @@ class KITTIOdometryExperienceReplay(EpisodeReplay):
         )
 
     def _number_statistics(self, rows: TensorDictBase) -> dict[str, Any]:
-        """Also of ``"velocity"`` ``[2]``, v m/s and θ_dot rad/s; θ_dot's mean is 0 if mirrored."""
+        """Adds those of ``"velocity"`` ``[2]``, v m/s and θ_dot rad/s; θ_dot's mean is 0 if mirrored."""
         return {**super()._number_statistics(rows), "velocity": mean_and_std(rows["state"][:, 3:])}
 
     def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:
-        """Of frames over rows whose frame is there, and of differences over rows that are observed."""
+        """Returns statistics of frames over rows that have one, and of differences over observed rows."""
         if "image" not in self._drives[0]:
             return None
         copies = len(self._all_episodes) // len(self._drives)  # a mirror image has the same figures
@@ -152,7 +152,7 @@ class _Frames:
         self._starts = torch.tensor([episode.start for episode in episodes])
 
     def __call__(self, row: Tensor) -> dict[str, Tensor]:
-        """Of rows ``[m]`` of the whole data set."""
+        """Returns the pictures of rows ``[m]`` of the whole data set."""
         number = torch.searchsorted(self._starts, row, right=True) - 1
         out: dict[str, Tensor] = {}
         for episode in number.unique().tolist():
@@ -167,7 +167,7 @@ class _Frames:
 
 
 def _rows(drive: TensorDictBase, mirrored_width: int | None) -> TensorDict:
-    """What the buffer stores of an episode."""
+    """Returns the rows of an episode as the buffer stores them."""
     row = torch.arange(len(drive))
     rows = drive.select("state", "time", "dt", "frame", "calibration")
     if mirrored_width is not None:

@@ -93,7 +93,7 @@ def _array(values: Tensor | np.ndarray) -> np.ndarray:
 
 
 def _poses(trajectory: np.ndarray) -> np.ndarray:
-    """Camera-to-world matrices, ``[T, 3, 4]``."""
+    """Returns camera-to-world matrices, ``[T, 3, 4]``."""
     if trajectory.ndim == 3 and trajectory.shape[1:] in ((3, 4), (4, 4)) and len(trajectory):
         return trajectory[:, :3]
     if trajectory.ndim == 2 and trajectory.shape[1] >= 3 and len(trajectory):
@@ -104,7 +104,7 @@ def _poses(trajectory: np.ndarray) -> np.ndarray:
 
 
 def _quaternions(rotations: np.ndarray) -> np.ndarray:
-    """Unit quaternions (x, y, z, w) of rotations ``[T, 3, 3]``.
+    """Returns unit quaternions (x, y, z, w) of rotations ``[T, 3, 3]``.
 
     Each is the eigenvector of the largest eigenvalue of a symmetric matrix, which is accurate for all rotations and
     finds the nearest one to a matrix with rounding errors. Source: Bar-Itzhack 2000, "New method for extracting the

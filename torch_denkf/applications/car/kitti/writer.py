@@ -25,7 +25,7 @@ from torch_denkf.deployment.workers import follow_parent
 
 FORMAT = 3  # raise it when drives of the same options come out differently
 MARKER = "drive.json"
-STRETCH = 500  # frames that a process draws at a time; another process would have to make the scene anew
+STRETCH = 500  # frames that a process draws at a time; another process would have to make the scene again
 REPORTED = 40  # frames after which the only process says how far it is
 GRAIN = 1.5  # grey values: standard deviation of the images' noise
 
@@ -56,11 +56,11 @@ class Job:
 
     @property
     def target(self) -> Path:
-        """Where the drive will be."""
+        """Returns the folder that the drive is written to."""
         return self.root / "sequences" / self.name
 
     def is_there(self, overwrite: bool) -> bool:
-        """Whether the drive is there already.
+        """Returns True if the drive exists already.
 
         Raises:
             FileExistsError: if another one is, which may not be replaced.
@@ -82,14 +82,14 @@ class Job:
         return False
 
     def renderer(self) -> Renderer:
-        """The drive's scene, from its name and seed."""
+        """Returns the drive's scene, from its name and seed."""
         rng = np.random.default_rng([self.options["seed"], zlib.crc32(self.name.encode()), 1])
         ground = self.poses[:, 1, 3] + self.camera.height
         scene = roadside_scene(poses_to_state(self.poses, KITTI_DT), rng, ground=ground, traffic_on=self.traffic)
         return Renderer(scene, self.camera)
 
     def draw(self, renderer: Renderer, start: int, stop: int) -> None:
-        """Write the images of frames ``start`` to ``stop``."""
+        """Writes the images of frames ``start`` to ``stop``."""
         folder = self.beside / self.folder
         folder.mkdir(parents=True, exist_ok=True)
         grey = self.folder in ("image_0", "image_1")
@@ -105,7 +105,7 @@ class Job:
                 file.write_bytes(data.tobytes())
 
     def finish(self) -> None:
-        """Write the text files and rename: a drive that is there is complete.
+        """Writes the text files and renames: a drive that exists is complete.
 
         After a power failure an image may be missing all the same: its reader says so. To wait for thousands of
         images to be on the disk would take as long as to draw them.
@@ -129,7 +129,7 @@ class Job:
 
 
 def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | None = None) -> None:
-    """Draw and write drives; what comes out does not depend on the number of processes.
+    """Draws and writes drives; the result does not depend on the number of processes.
 
     Args:
         jobs: the drives, all of one root.

@@ -9,7 +9,7 @@ from torch_denkf.functional.angles import wrap_angles
 
 
 def check_paths(estimated: Tensor, truth: Tensor) -> None:
-    """Raise ``ValueError`` unless both are paths ``[*B, T, 3]`` of one shape."""
+    """Raises ``ValueError`` unless both are paths ``[*B, T, 3]`` of one shape."""
     if truth.ndim < 2 or truth.shape[-1] != 3 or estimated.shape != truth.shape:
         raise ValueError(
             "estimated and truth must both be [*B, T, 3] = (x, y, theta), got "
@@ -18,12 +18,12 @@ def check_paths(estimated: Tensor, truth: Tensor) -> None:
 
 
 def step_lengths(path: Tensor) -> Tensor:
-    """Distances in m between the rows of a path ``[*B, T, 3]``, ``[*B, T-1]``."""
+    """Returns distances in m between the rows of a path ``[*B, T, 3]``, ``[*B, T-1]``."""
     return torch.linalg.vector_norm(path[..., 1:, :2] - path[..., :-1, :2], dim=-1)
 
 
 def relative_pose_error(start: Tensor, end: Tensor, true_start: Tensor, true_end: Tensor) -> tuple[Tensor, Tensor]:
-    """How far two motions end from each other when they begin at the same pose.
+    """Returns the error of the relative pose: how far two motions end from each other if they begin at the same pose.
 
     Args:
         start: estimated poses (x m, y m, θ rad) where the motions begin, ``[*B, 3]``.

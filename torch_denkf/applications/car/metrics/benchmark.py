@@ -34,7 +34,7 @@ class WindowErrors(NamedTuple):
 def kitti_pathlength_error(
     estimated: Tensor, truth: Tensor, *, windows: Sequence[int] = (100, 200, 400, 800)
 ) -> WindowErrors:
-    """Errors as in the DEnKF reference script, behind the paper's table: lengths of paths, not their ends.
+    """Returns errors as in the DEnKF reference script, behind the paper's table: lengths of paths, not their ends.
 
     Over the first N steps of a run: the difference between the lengths of both paths, and the difference between both
     headings at step N as they are, each divided by the length of the true path.
@@ -44,7 +44,7 @@ def kitti_pathlength_error(
     errors on the way may cancel; it is not wrapped, so that an estimate that is right but for a whole turn scores
     360 deg, and wrapped angles must be unwrapped first. One run counts, from its first row. Report
     the mean of :func:`~torch_denkf.applications.car.metrics.odometry.kitti_endpoint_error` over the same windows
-    beside it, which is what the other papers' numbers are.
+    next to it, which is what the other papers' numbers are.
 
     Args:
         estimated: poses (x m, y m, θ rad), θ unwrapped, ``[*B, T, 3]``.

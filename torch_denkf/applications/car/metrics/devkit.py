@@ -15,7 +15,7 @@ __all__ = ["DevkitError", "kitti_devkit_error"]
 
 
 class DevkitError(NamedTuple):
-    """What :func:`kitti_devkit_error` returns; ``*B`` are the batch dims of the paths, L the number of lengths.
+    """Result of :func:`kitti_devkit_error`; ``*B`` are the batch dims of the paths, L the number of lengths.
 
     Attributes:
         translation: t_rel, mean over all segments of all lengths, in %, ``[*B]``.
@@ -39,7 +39,7 @@ def kitti_devkit_error(
     lengths: Sequence[float] = (100, 200, 300, 400, 500, 600, 700, 800),
     step: int = 10,
 ) -> DevkitError:
-    """Relative pose error of all segments of 100, 200, ..., 800 **metres**, for each metre.
+    """Returns the relative pose error of all segments of 100, 200, ..., 800 **metres**, for each metre.
 
     As KITTI's development kit does: a segment begins at every tenth frame and ends with the first frame that lies more
     than its length further along the true path; the estimate is laid on the truth at its start; its error is divided by
@@ -109,7 +109,7 @@ def kitti_devkit_error(
 
 
 def _spatial_error(start: Tensor, end: Tensor, start_true: Tensor, end_true: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance in m, and angle in rad, of what is left between the moves of both paths; points of SE3 ``[*, 7]``."""
+    """Returns distance in m and angle in rad between the motions of both paths; points of SE3 ``[*, 7]``."""
     space = SE3()
     moved, moved_true = (space.compose(space.inverse(a), b) for a, b in ((start, end), (start_true, end_true)))
     left = space.compose(space.inverse(moved), moved_true)
@@ -117,6 +117,6 @@ def _spatial_error(start: Tensor, end: Tensor, start_true: Tensor, end_true: Ten
 
 
 def _rows(path: Tensor, index: Tensor) -> Tensor:
-    """Rows ``[*B, F, L]`` of a path ``[*B, T, N]``, each path its own."""
+    """Returns rows ``[*B, F, L]`` of a path ``[*B, T, N]``, each path its own."""
     flat = index.flatten(-2).unsqueeze(-1).expand(*index.shape[:-2], -1, path.shape[-1])
     return path.gather(-2, flat).reshape(*index.shape, path.shape[-1])

@@ -22,7 +22,7 @@ __all__ = ["EndpointError", "dead_reckoning", "kitti_endpoint_error"]
 
 
 class EndpointError(NamedTuple):
-    """What :func:`kitti_endpoint_error` returns; ``*B`` are the batch dims of the paths, W the number of windows.
+    """Result of :func:`kitti_endpoint_error`; ``*B`` are the batch dims of the paths, W the number of windows.
 
     Attributes:
         translation: mean end point error over the windows that count, in m/m, ``[*B]``.
@@ -48,7 +48,7 @@ def kitti_endpoint_error(
     align: bool = True,
     min_length: float = 1.0,
 ) -> EndpointError:
-    """End point error of every window of ``window`` steps, for each metre of the true path.
+    """Returns the end point error of every window of ``window`` steps, for each metre of the true path.
 
     Window i compares rows i and i + ``window``, so a path of T rows has ``(T - window - 1) // stride + 1`` windows.
     The car stands still in some: windows whose true path is shorter than ``min_length`` are left out, because an
@@ -116,7 +116,7 @@ def kitti_endpoint_error(
 
 
 def dead_reckoning(velocities: Tensor, initial: Tensor, dt: float | Tensor) -> Tensor:
-    """Integrate speed and turn rate to a path: what odometry alone gives, without a filter.
+    """Integrates speed and turn rate to a path: what odometry alone gives, without a filter.
 
     Row t moves along the heading half way between rows t-1 and t, ``θ_{t-1} + θ_dot_t dt / 2``, which is exact for the
     chord of a circular arc. Differentiable in all arguments.

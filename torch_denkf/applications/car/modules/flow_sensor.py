@@ -106,7 +106,7 @@ class _MotionTrunk(nn.Module):
 
     @staticmethod
     def _corner_cues(two_view: torch.Tensor, turned: torch.Tensor, pitch: torch.Tensor) -> list[torch.Tensor]:
-        """How sure corners are of the turn and the pitch, and how far they agree with the flow; zeros without any."""
+        """Returns the confidence of corners in turn and pitch, and their agreement with the flow; zeros without."""
         left, *_, down, turn_std, pitch_std, inliers = two_view.unbind(1)
         seen = inliers > 0
         doubts = [(turn_std / _TURN_UNIT).clamp_min(1e-4).log() + 4, (pitch_std / _PITCH_UNIT).clamp_min(1e-4).log()]
@@ -191,7 +191,7 @@ class FlowSensor(StochasticSensor):
         self.dt, self.ensemble_size, self.encoding_features = float(dt), ensemble_size, trunk.out_features
 
     def compute(self, *values, noise, batch_size):
-        """The learned observations of every member, and the encoding if it is asked for."""
+        """Returns the learned observations of every member, and the encoding if it is asked for."""
         *inputs, observed = values
         inputs = [self._frames(value, index, observed, batch_size) for index, value in enumerate(inputs)]
         moved, turned, encoding = self.module["trunk"](*inputs)
@@ -204,7 +204,7 @@ class FlowSensor(StochasticSensor):
         return (samples, encoding) if len(self.out_keys) > 1 else samples
 
     def _frames(self, value: torch.Tensor, index: int, observed: torch.Tensor | None, batch_size) -> torch.Tensor:
-        """An input as ``[N, *event]``; zeros where nothing was observed."""
+        """Returns an input as ``[N, *event]``; zeros where nothing was observed."""
         expected = (FLOW_SHAPE, ROAD_SHAPE, TWO_VIEW_SHAPE)[index]
         if tuple(value.shape) != (*batch_size, *expected):
             raise ValueError(
@@ -220,13 +220,13 @@ class FlowSensor(StochasticSensor):
 
 
 def _grid(height: int, width: int) -> torch.Tensor:
-    """Where a cell lies: two channels from -1 to 1, ``[1, 2, height, width]``."""
+    """Returns the coordinates of cells: two channels from -1 to 1, ``[1, 2, height, width]``."""
     rows, columns = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
     return torch.stack([columns, rows]).unsqueeze(0)
 
 
 def _median_turn(flow: torch.Tensor) -> torch.Tensor:
-    """Like :func:`torch_denkf.applications.car.vision.flow.median_turn`, to the left, on a batch of coarse flows."""
+    """Estimates the turn to the left from a batch of coarse flows, as ``median_turn`` of ``vision/flow.py`` does."""
     height, width = flow.shape[-2:]
     side = int(0.375 * width)  # as much on both sides: where things come nearer, their flows cancel
     ahead = flow[:, 0, int(0.33 * height) : int(0.5 * height), side : width - side].flatten(1)

@@ -18,7 +18,7 @@ __all__ = ["MemberGain"]
 class MemberGain(SubModel):
     r"""Multiplies the sensor's samples by factors that belong to the members: :math:`\tilde y^i e^{\sigma z^i}`.
 
-    A camera that is mounted a little lower reads all speeds a little too high, today and tomorrow. Drawn anew for each
+    A camera that is mounted a little lower reads all speeds a little too high, today and tomorrow. Drawn again for each
     frame, such an error averages out over time, and the filter becomes too sure of itself; or its noise model takes the
     error for white noise, and the filter follows too slowly. Here the :math:`z^i` are the normal quantiles of E
     members, always the same: each member keeps its calibration, the ensemble its doubt. Put it behind the sensor.
@@ -66,7 +66,7 @@ class MemberGain(SubModel):
         self.register_buffer("quantiles", torch.stack([quantiles[order] for order in orders], -1))
 
     def compute(self, samples):
-        """The samples, each with its member's gain."""
+        """Returns the samples, each with its member's gain."""
         if samples.shape[-2:] != self.quantiles.shape:
             raise ValueError(
                 f"MemberGain was made for samples [*B, {self.quantiles.shape[0]}, {self.quantiles.shape[1]}], "

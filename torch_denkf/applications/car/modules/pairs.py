@@ -1,7 +1,7 @@
 r"""Readings that span several steps: where frames are missing, a sensor can compare a frame with the last that arrived.
 
 What it reads then is the way over the whole gap. A filter that is to learn from it must remember its own velocities of
-the past steps, "clones" in the words of Roumeliotis & Burdick (2002): either beside the state (:func:`with_history`,
+the past steps, "clones" in the words of Roumeliotis & Burdick (2002): either next to the state (:func:`with_history`,
 for :class:`torch_denkf.applications.car.UnicycleMotion`) or in it (:class:`ClonedPrior`, :class:`ClonedTransition`, for
 filters whose covariance or weights carry the pose along).
 """
@@ -33,7 +33,7 @@ def with_history(
     ensemble_key: NestedKey = ("belief", "ensemble"),
     history_key: NestedKey = ("belief", "history"),
 ) -> AugmentedBelief:
-    """An initial belief with a past: each member has had its present velocities all along.
+    """Returns an initial belief with a past: each member has had its present velocities all along.
 
     Args:
         initial: the initial belief; writes an ensemble ``[*B, E, 5]``, see :class:`UnicycleTransition`.
@@ -62,13 +62,13 @@ def _same_velocities(ensemble_key: NestedKey, lags: int, belief: Entries, _: tor
 
 
 class PairObservation(SubModel):
-    r"""What a sensor reads from a pair of frames that are n steps apart: the velocities of all n, added up.
+    r"""Observation of a pair of frames n steps apart: the sum of the velocities of all n steps.
 
     .. math:: H x^i_t = h\Big(\sum_{k=0}^{n-1} (v, \dot\theta)^i_{t-k}\Big)
 
     Where frames are missing, a pair of the last frame that arrived and the present one still measures the whole way
     between them. The members carry their velocities of the past steps, and the analysis corrects those, too
-    ("stochastic cloning"); :class:`UnicycleMotion` then moves the pose over the gap anew. Use with
+    ("stochastic cloning"); :class:`UnicycleMotion` then moves the pose over the gap again. Use with
     ``EnsembleAnalysis(forecast_key=("forecast", "clone"), observed_key=("forecast", "observed"),
     belief_prefix="analysis")`` and an initial belief :func:`with_history`.
 
@@ -122,12 +122,12 @@ class PairObservation(SubModel):
         check_values("reach", self.reach, above=0, infinite=True)
 
     def compute(self, forecast, *rest):
-        """The predicted observations, the ensemble that the analysis is to update, and the mask."""
+        """Returns the predicted observations, the ensemble that the analysis is to update, and the mask."""
         *history, steps, observed = rest
         history = history[0] if history else forecast[..., 5:].unflatten(-1, (-1, 2))
         past = within_pair(steps, history)
         way = forecast[..., 3:5] + torch.where(past, history, 0.0).sum(-2)
-        # Neighbours are always read, and so is what the forecast knows little of: a filter that believes itself too
+        # Neighbours are always read, and so is what the forecast knows little of: a filter whose belief is too
         # fast would otherwise stay blind.
         least = way.mean(-2).abs()
         if way.shape[-2] > 1:  # an extended Kalman filter asks at one point
@@ -170,7 +170,7 @@ class ClonedPrior(AroundInitial):
         self.register_buffer("copies", torch.cat([eye, *[eye[3:]] * lags]))
 
     def on_entries(self, entries, call):
-        """The belief."""
+        """Returns the belief."""
         written = self.run_inside(entries, call)
         for key, value in written.items():
             name, copies = key[-1] if isinstance(key, tuple) else key, self.copies.to(value.dtype)
@@ -207,7 +207,7 @@ class ClonedTransition(Wrapper, Transition):
         self.history_key = self_made
 
     def on_entries(self, entries, call):
-        """The forecast ensemble."""
+        """Returns the forecast ensemble."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state = self.required(entries, key)
         work = {**entries, key: state[..., :5], self.history_key: state[..., 3:].unflatten(-1, (-1, 2))}
@@ -216,7 +216,7 @@ class ClonedTransition(Wrapper, Transition):
 
 
 def within_pair(steps: torch.Tensor | None, history: torch.Tensor) -> torch.Tensor:
-    """Which past steps lie between the two frames of a pair: ``[*B, 1, L, 1]``."""
+    """Returns a mask of the past steps between the two frames of a pair: ``[*B, 1, L, 1]``."""
     lags = torch.arange(1, history.shape[-2] + 1, device=history.device)
     steps = torch.ones(1, dtype=torch.int64, device=history.device) if steps is None else steps
     return (lags < steps)[..., None, :, None]

@@ -77,7 +77,7 @@ class UnicycleTransition(MemberNetwork, Transition):
         register_location_and_scale(self, loc, scale)
 
     def compute(self, state, *others, noise):
-        """The forecast ensemble."""
+        """Returns the forecast ensemble."""
         *history, dt = others if keys_of_dt(self.dt) else (*others, self.dt)
         if state.shape[-1] != 5:
             raise ValueError(
@@ -157,7 +157,7 @@ class UnicycleMotion(SubModel):
         self.dt, self.history_key, self.smooth = dt, history_key, smooth
 
     def compute(self, before, analysis, *others):
-        """The belief, and its history."""
+        """Returns the belief, and its history."""
         pose, velocity = before[..., :3], analysis[..., 3:5]
         dt = for_members(others[0] if keys_of_dt(self.dt) else self.dt)
         histories: tuple[torch.Tensor, ...] = ()

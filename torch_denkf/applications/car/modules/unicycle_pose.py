@@ -61,7 +61,7 @@ class UnicyclePose(SubModel):
         self.dt = dt
 
     def compute(self, mean, cov, velocity, velocity_cov, dt=None):
-        """The belief."""
+        """Returns the belief."""
         pose, dt = mean[..., :3], self.dt if dt is None else dt
         by_pose, by_velocity = unicycle_jacobians(pose, velocity, dt)
         cross = by_velocity @ velocity_cov

@@ -33,7 +33,7 @@ class PairSampler:
         self.neighbours = torch.tensor([drive.steps == 1 for drive in drives])
 
     def frames(self, generator: torch.Generator, batch: int = 64) -> TensorDict:
-        """Frames ``[batch]``, every second group of them mirrored."""
+        """Returns frames ``[batch]``, every second group of them mirrored."""
         chosen: list[TensorDict] = []
         for number in torch.multinomial(self.weight, _GROUPS, replacement=True, generator=generator).tolist():
             data = self.data[number]
@@ -43,7 +43,7 @@ class PairSampler:
         return TensorDict.cat(chosen)
 
     def windows(self, generator: torch.Generator, length: int | None, start_std: Tensor) -> TensorDict:
-        """Windows ``[8, length]`` that start from a wrong velocity."""
+        """Returns windows ``[8, length]`` that start from a wrong velocity."""
         weight = self.weight * self.neighbours
         chosen: list[TensorDict] = []
         for number in torch.multinomial(weight, _GROUPS, replacement=True, generator=generator).tolist():
@@ -88,7 +88,7 @@ class ReadingSampler:
         self.starts, self.weight = torch.cat(starts), torch.cat(weight)
 
     def windows(self, generator: torch.Generator, start_std: Tensor, batch: int = 48) -> TensorDict:
-        """Windows ``[batch, length]``, faster or slower than they were, of which up to half of the frames are lost."""
+        """Resamples windows ``[batch, length]`` to be faster or slower, and drops up to half of the frames."""
         start = self.starts[torch.multinomial(self.weight, batch, replacement=True, generator=generator)]
         windows = self.readings[start.unsqueeze(-1) + torch.arange(self.length)]
         # Few drives have few speeds, and the transition would learn to return to those.
@@ -105,6 +105,6 @@ class ReadingSampler:
 
 
 def with_start(windows: TensorDict, start_std: Tensor, generator: torch.Generator) -> TensorDict:
-    """Windows that begin at a wrong velocity: a filter that begins at the truth learns to hold on to it."""
+    """Returns windows that begin at a wrong velocity: a filter that begins at the truth learns to hold on to it."""
     windows["start"] = windows["state"] + start_std * torch.randn(len(windows), 1, 5, generator=generator)
     return mark_start(windows)

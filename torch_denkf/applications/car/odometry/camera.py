@@ -30,7 +30,7 @@ _PITCH_MARGIN = 0.01  # rad
 
 
 def check_frame(frame: object, number: int) -> None:
-    """Raise unless this is an image as OpenCV has it.
+    """Raises unless this is an image as OpenCV has it.
 
     Raises:
         ValueError: if it is no array, or one of another shape or dtype; names the frame.
@@ -94,16 +94,16 @@ class CarCamera:
             )
 
     def image(self, frame: np.ndarray, number: int) -> np.ndarray:
-        """Grey, at the training's resolution."""
+        """Returns the grey image at the training's resolution."""
         if frame.shape[:2] != self.shape:
             raise ValueError(f"frame {number} is {list(frame.shape[:2])}, the first one {list(self.shape)}")
         grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
         return grey if self.size == grey.shape[::-1] else cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA)
 
     def motion(self, previous: np.ndarray, current: np.ndarray) -> tuple[dict[str, Tensor], float]:
-        """Flow and road of a pair, rounded as for the training; and how corners moved, where they are tracked.
+        """Returns flow and road of a pair, rounded as for the training; and how corners moved, where they are tracked.
 
-        Beside it the share of the picture that stands still.
+        Next to it the share of the picture that stands still.
         """
         static = static_region(previous, current)
         hidden = {"hidden": static} if self.repair and static.any() else {}
@@ -117,14 +117,14 @@ class CarCamera:
 
 
 class _Watch:
-    """Warns, once each, where the readings contradict what is said about the camera."""
+    """Warns, once each, where the readings contradict the given calibration."""
 
     def __init__(self, pitch: float):
         self.pitch, self.said = pitch, False
         self.seen: deque[tuple[float, float, float]] = deque(maxlen=_WATCHED)
 
     def __call__(self, flow: Tensor, road: Tensor) -> None:
-        """Look at one pair."""
+        """Looks at one pair."""
         if self.said:
             return
         if float(flow[:2].norm(dim=0).mean()) < _MOVING:
@@ -155,6 +155,6 @@ class _Watch:
             )
 
     def say(self, text: str) -> None:
-        """Warn, and then no more."""
+        """Warns, and then no more."""
         self.said = True
         warnings.warn(text, UserWarning, stacklevel=6)

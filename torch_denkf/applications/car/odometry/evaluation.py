@@ -1,4 +1,4 @@
-"""Errors of a car filter on drives with known poses, beside dead reckoning on the same readings."""
+"""Errors of a car filter on drives with known poses, next to dead reckoning on the same readings."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def _rows(name: str, car: CarFilter, out: TensorDict, runs: Sequence[TensorDict]
 
 
 def path_errors(path: Tensor, truth: Tensor, window: int) -> dict[str, float]:
-    """Errors of one path ``[N, 3]`` against the true one."""
+    """Returns errors of one path ``[N, 3]`` against the true one."""
     end = kitti_endpoint_error(path, truth, window=window)
     errors = {"translation_m_per_m": float(end.translation), "rotation_deg_per_m": float(end.rotation)}
     try:
@@ -172,7 +172,7 @@ def path_errors(path: Tensor, truth: Tensor, window: int) -> dict[str, float]:
 
 
 def _held(reading: TensorDict, car: CarFilter) -> Tensor:
-    """The sensor's mean velocities ``[N, 2]``; where it is blind the last ones, at the start the first ones.
+    """Returns the sensor's mean velocities ``[N, 2]``; where it is blind the last ones, at the start the first ones.
 
     A pair over a gap gives the mean over its steps, unless it is farther apart than the sensor can read.
     """
@@ -186,7 +186,7 @@ def _held(reading: TensorDict, car: CarFilter) -> Tensor:
 
 
 def markdown_table(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows of :func:`evaluate_car_filter` as a Markdown table, with the mean over the drives."""
+    """Returns rows of :func:`evaluate_car_filter` as a Markdown table, with the mean over the drives."""
     lines = [
         "| drive | method | steps | m/m | deg/m | devkit % | devkit deg/m | coverage v | coverage theta_dot |",
         "|---|---|---|---|---|---|---|---|---|",

@@ -20,7 +20,7 @@ __all__ = ["drive_scores", "track_failing_drive", "usual_failures"]
 
 
 def usual_failures(frames: int) -> list[CameraFailure]:
-    """A missing stretch, a black one and one with a box, of a drive of so many frames.
+    """Returns a missing stretch, a black one and one with a box, of a drive of so many frames.
 
     Example:
         >>> [(failure.kind, failure.first, failure.last) for failure in usual_failures(100)]
@@ -111,7 +111,7 @@ def track_failing_drive(
 
 
 def drive_scores(tracked: TensorDict, level: float = 0.9) -> dict[str, float]:
-    """What :func:`track_failing_drive` found, in numbers.
+    """Returns the scores of a result of :func:`track_failing_drive`.
 
     Returns:
         ``way_m``; ``filter_end_m`` and ``reckoned_end_m``, distances from the truth at the end, and ``filter_mean_m``
@@ -132,7 +132,7 @@ def drive_scores(tracked: TensorDict, level: float = 0.9) -> dict[str, float]:
 
 
 def _for_opencv(image: Tensor) -> np.ndarray:
-    """Grey ``[H, W]``, or ``[H, W, 3]`` in OpenCV's order."""
+    """Returns a grey image ``[H, W]``, or ``[H, W, 3]`` in OpenCV's order."""
     array = image.permute(1, 2, 0).numpy()
     return array[..., 0] if array.shape[-1] == 1 else np.ascontiguousarray(array[..., ::-1])
 
@@ -145,7 +145,7 @@ def _counted(frames, progress):
 
 
 def _from_first_pose(state: Tensor) -> Tensor:
-    """States as seen from the first of them."""
+    """Returns states as seen from the first of them."""
     state = state.double()
     x, y = (state[:, :2] - state[0, :2]).unbind(-1)
     cos, sin = state[0, 2].cos(), state[0, 2].sin()

@@ -15,7 +15,7 @@ __all__ = ["CameraFailure", "fail_frames"]
 
 
 class CameraFailure(NamedTuple):
-    """What happens to a stretch of frames.
+    """Failure of the camera over a stretch of frames.
 
     Attributes:
         kind: ``"missing"`` (the frames do not arrive, and that is known), ``"black"`` (they arrive, black) or
@@ -30,12 +30,12 @@ class CameraFailure(NamedTuple):
 
     @property
     def announced(self) -> bool:
-        """Whether the camera says itself that it fails."""
+        """Returns True if the camera itself reports the failure."""
         return self.kind == "missing"
 
 
 def fail_frames(frames: Iterable[np.ndarray | None], failures: Sequence[CameraFailure]) -> Iterator[np.ndarray | None]:
-    """The frames of a camera that fails.
+    """Yields the frames of a camera that fails.
 
     Args:
         frames: images ``[H, W]`` or ``[H, W, 3]``, uint8; ``None`` for one that is missing.

@@ -79,19 +79,19 @@ class CarSettings:
 
     @property
     def unit(self) -> Tensor:
-        """What counts as an error of one, in (m/s, rad/s): ``[2]``."""
+        """Returns the unit of the error, in (m/s, rad/s): ``[2]``."""
         return torch.tensor(self.velocity_std) * torch.tensor(_UNITS)
 
     @property
     def start_std(self) -> Tensor:
-        """Doubt about the first state ``[5]``: its pose is given, its velocities come from the first reading."""
+        """Returns the standard deviation of the first state ``[5]``: a given pose, velocities of the first reading."""
         return torch.cat([torch.zeros(3), _START * torch.tensor(self.velocity_std)])
 
 
 def velocity_analysis(
     lags: int, scheme: Literal["sensor", "perturbed", "sakov"] = "sensor", threshold: float | None = None
 ) -> EnsembleAnalysis:
-    """The update of a car's velocities, and of those of the last ``lags`` steps, by what was read of a pair of frames.
+    """Returns the update of a car's velocities, and those of the last ``lags`` steps, by readings of frame pairs.
 
     Errors of speed and of turn rate have nothing to do with each other; few members would see correlations. Inflation
     multiplies the present velocities alone: those of past steps would be multiplied again in each step. A threshold
@@ -162,7 +162,7 @@ class CarFilter(Filter):
 
     @property
     def settings(self) -> CarSettings:
-        """All numbers that it is built from, with the inflation as it is now."""
+        """Returns all numbers that it is built from, with the inflation as it is now."""
         return replace(self._settings, inflation=self.inflation)
 
     @property
@@ -172,7 +172,7 @@ class CarFilter(Filter):
 
     @property
     def inflation(self) -> float:
-        """The factor on the belief's spread in each step."""
+        """Returns the factor on the belief's spread in each step."""
         return self._ensemble_analysis.inflation
 
     @inflation.setter
@@ -184,13 +184,13 @@ class CarFilter(Filter):
         return next(module for module in self.modules() if isinstance(module, EnsembleAnalysis))
 
     def without_sensor(self) -> Filter:
-        """The same filter for readings that the sensor has made before: it shares all parameters but the sensor's."""
+        """Returns this filter for precomputed readings of its sensor: it shares all parameters but the sensor's."""
         names = [name for name in self.module if name != "sensor"]
         return Filter(OrderedDict((name, self[name]) for name in names), initial=self.initial)
 
 
 def car_filter(settings: CarSettings | None = None, **changes) -> CarFilter:
-    """A DEnKF for a car with one camera, untrained.
+    """Returns a DEnKF for a car with one camera, untrained.
 
     :class:`torch_denkf.applications.car.FlowSensor` reads speed and turn rate from optical flow and the road's
     correlation; the pose moves by the known motion of a unicycle; an ensemble analysis corrects the velocities, and the

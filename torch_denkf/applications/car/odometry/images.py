@@ -112,7 +112,7 @@ def read_times(file: str | Path) -> list[float]:
 
 
 class FrameSource:
-    """Frames of a folder or a video, one at a time, each time anew; see :func:`read_frames`.
+    """Frames of a folder or a video, one at a time, each time again; see :func:`read_frames`.
 
     Attributes:
         first: number of the first frame: that of its name in a folder of numbered images, else 0.
@@ -153,7 +153,7 @@ class FrameSource:
         return (np.interp(numbers, numbers[there], stamps[there]) - stamps[there][0]).tolist()
 
     def _video(self, pictures: bool = True) -> Iterator[tuple[float | None, np.ndarray | None]]:
-        """Times in s and, if asked for, frames; ``None`` where a frame is missing."""
+        """Yields times in s and, if asked for, frames; ``None`` where a frame is missing."""
         video = cv2.VideoCapture(name_for_c(self.path))
         try:
             # A failed read is the end, which comes before or after the guessed count, or a damaged frame before it.

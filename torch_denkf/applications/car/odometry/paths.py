@@ -1,4 +1,4 @@
-"""A tracked path as a file: what is believed at each frame, and how sure that is."""
+"""A tracked path as a file: mean and covariance at each frame."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PATH_COLUMNS = ("frame", "time_s", "observed", *_STATE, *(f"std_{name}" for name
 def write_path(beliefs: Iterable[TrackedBelief], file: str | Path) -> Iterator[TrackedBelief]:
     """Writes beliefs to a CSV file as they come, and hands them on.
 
-    Rows are in a hidden file beside ``file`` while they come, each when its belief does. That takes the place of
+    Rows are in a hidden file next to ``file`` while they come, each when its belief does. That takes the place of
     ``file`` at the end, or when the work is broken off: what was written is there, and what was there before is not
     lost to a full disk. What a killed process left goes when the next file is written there. Numbers have nine digits,
     which float32 needs to be exact.

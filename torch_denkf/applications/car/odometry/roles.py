@@ -20,7 +20,7 @@ _PITCH = 0.03  # rad: rendered cameras look at most so far up or down
 
 
 def assign_roles(names: Sequence[str]) -> dict[str, list[str]]:
-    """Who trains what: a tenth of the drives validates, a quarter trains the filter, the others train the sensor.
+    """Assigns drives to roles: a tenth validates, a quarter trains the filter, the others train the sensor.
 
     A single drive trains the filter; of two, the second trains the sensor.
 
@@ -95,7 +95,7 @@ def rendered_drives(
 
 
 def drives_by_role(*kinds: Sequence[Drive]) -> dict[str, list[Drive]]:
-    """The drives of all kinds by role; in each role every drive has the same weight.
+    """Returns the drives of all kinds by role; in each role every drive has the same weight.
 
     Args:
         *kinds: recorded drives, rendered drives.

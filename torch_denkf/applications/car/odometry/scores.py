@@ -1,4 +1,4 @@
-"""What a car filter's training minimises, and what is measured on whole drives."""
+"""Loss of a car filter, and its scores on whole drives."""
 
 from __future__ import annotations
 
@@ -52,21 +52,21 @@ class SensorLoss(nn.Module):
 
 
 def belief_loss(model: Filter, unit: Tensor) -> DEnKFLoss:
-    """CRPS of belief and forecast, in units of a good sensor's errors; the pose follows from the velocities."""
+    """Returns the CRPS of belief and forecast, in units of a good sensor's errors; poses follow from velocities."""
     scale = torch.cat([torch.full((3,), torch.inf), unit])
     share = len(VELOCITIES) / len(scale)  # a score is the mean over what counts: two of five
     return DEnKFLoss(model, state=share, transition=share, sensor=0.0, state_scale=scale)
 
 
 class EndToEndLoss(nn.Module):
-    """The filter's loss, and the sensor's own beside it."""
+    """The filter's loss, and the sensor's own next to it."""
 
     def __init__(self, belief: nn.Module, sensor: SensorLoss):
         super().__init__()
         self.belief, self.sensor = belief, sensor
 
     def forward(self, frames: TensorDict) -> dict[str, Tensor]:
-        """All terms."""
+        """Returns all terms."""
         own = {f"loss_sensor_{name[5:]}": 0.5 * value for name, value in self.sensor(frames.copy()).items()}
         return {**self.belief(frames), **own}
 
@@ -75,7 +75,7 @@ class EndToEndLoss(nn.Module):
 
 
 def sensor_error(sensor: FlowSensor, drives: Sequence[TensorDict], unit: Tensor, longest: int) -> dict[str, float]:
-    """CRPS of a sensor where it observes, mean of v and theta_dot in units of a good sensor's errors."""
+    """Returns CRPS of a sensor where it observes, mean of v and theta_dot in units of a good sensor's errors."""
     scores = []
     for data in drives:
         read = read_sensor(sensor, data, longest)
@@ -85,7 +85,7 @@ def sensor_error(sensor: FlowSensor, drives: Sequence[TensorDict], unit: Tensor,
 
 
 def gain_of(readings: TensorDict) -> Tensor:
-    """Logarithm of how many times too far a sensor's readings of a whole drive lead."""
+    """Returns the logarithm of how many times too far a sensor's readings of a whole drive lead."""
     drive = all_frames(readings)[1:]
     read, driven = drive["sensor", "ensemble"].mean(-2)[..., 0], drive["state"][..., 3]
     return (read.sum() / driven.sum()).clamp(0.5, 2.0).log()
@@ -112,7 +112,7 @@ def filter_readings(car: CarFilter, readings: Sequence[TensorDict], *, seed: int
 
 
 def first_state(reading: TensorDict) -> Tensor:
-    """The true first pose and the first velocities that the sensor reads, ``[5]``; zero where it reads none."""
+    """Returns the true first pose and the first velocities that the sensor reads, ``[5]``; zero where it reads none."""
     start = reading["state"][0].clone()
     seen = reading["observed"].squeeze(-1).nonzero()
     row = int(seen[0]) if len(seen) else 0
@@ -122,12 +122,12 @@ def first_state(reading: TensorDict) -> Tensor:
 
 
 def belief_error(car: CarFilter, readings: Sequence[TensorDict]) -> dict[str, float]:
-    """CRPS of the belief's (v, theta_dot), in units of a good sensor's errors, with and without missing frames."""
+    """Returns the CRPS of (v, theta_dot), in units of a good sensor's errors, with and without missing frames."""
     return {"crps": _crps(car, _all(car, readings))}
 
 
 def calibrate(car: CarFilter, readings: Sequence[TensorDict]) -> float:
-    """The inflation with the least CRPS of the velocities times the path's distance from the true one.
+    """Returns the inflation with the least CRPS of the velocities times the path's distance from the true one.
 
     By the coverage of the velocities alone an inflation is chosen that makes the path worse, which no reading sets
     right. The filter's own inflation stays as it is.
@@ -150,7 +150,7 @@ def _crps(car: CarFilter, runs: Sequence[TensorDict]) -> float:
 
 
 def _all(car: CarFilter, readings: Sequence[TensorDict]) -> list[TensorDict]:
-    """Beliefs on each reading as it is and with missing frames; those of one length side by side, ``[K, N]``."""
+    """Filters each reading as it is and with missing frames; those of one length side by side, ``[K, N]``."""
     groups: dict[int, list[TensorDict]] = defaultdict(list)
     for seed, reading in enumerate(readings):
         groups[len(reading)] += [all_frames(reading), lose_frames(reading, seed)]
@@ -158,7 +158,7 @@ def _all(car: CarFilter, readings: Sequence[TensorDict]) -> list[TensorDict]:
 
 
 def _velocities(out: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
-    """Means and variances of the belief's (v, theta_dot), and the truth ``[*K, N - 1, 2]``: the first row is given."""
+    """Returns means and variances of (v, theta_dot), and the truth ``[*K, N - 1, 2]``: the first row is given."""
     values = out["belief", "mean"], out["belief", "var"], out["state"]
     mean, variance, truth = (value[..., 1:, VELOCITIES] for value in values)
     return mean, variance.clamp_min(1e-8), truth

@@ -1,4 +1,4 @@
-"""What a car filter is trained and tested on: the flow of whole drives, and a frozen sensor's readings of them."""
+"""Training and test data of a car filter: the flow of whole drives, and a frozen sensor's readings of them."""
 
 from __future__ import annotations
 
@@ -77,20 +77,20 @@ class Drive:
     two_view: bool = False
 
     def disturbed(self) -> list[Drive]:
-        """This drive clean, and with half as much weight in all disturbances together."""
+        """Returns this drive clean, and with half as much weight in all disturbances together."""
         share = 0.5 * self.weight / len(_DISTURBANCES)
         return [self, *(replace(self, condition=name, weight=share) for name in _DISTURBANCES)]
 
     def longer(self, longest: int) -> list[Drive]:
-        """This drive in pairs of 2 to ``longest`` steps, with less weight, for the training of a sensor."""
+        """Returns this drive in pairs of 2 to ``longest`` steps, with less weight, for the training of a sensor."""
         return [replace(self, steps=steps, weight=0.5**steps * self.weight) for steps in range(2, longest + 1)]
 
     def spans(self, longest: int) -> list[Drive]:
-        """This drive in pairs of 1 to ``longest`` steps; a disturbed one in pairs of neighbours alone."""
+        """Returns this drive in pairs of 1 to ``longest`` steps; a disturbed one in pairs of neighbours alone."""
         return [replace(self, steps=steps) for steps in range(1, (longest if self.condition == "clean" else 1) + 1)]
 
     def read(self) -> TensorDict:
-        """Flow, road and the truth, ``[N]``, memory-mapped."""
+        """Returns flow, road and the truth, ``[N]``, memory-mapped."""
         drive = read_kitti_drive(
             self.root, self.name, camera=self.camera, size=self.size, colour=False, cache=self.cache
         )
@@ -110,7 +110,7 @@ class Drive:
 
 
 def rows(data: TensorDict, index: Tensor, longest: int) -> TensorDict:
-    """Rows of a drive as the sensor reads them, and what it should read.
+    """Returns rows of a drive as the sensor reads them, and what it should read.
 
     ``"target_observation"`` ``[*B, 2]`` is the sum of the true velocities over all steps of the pair.
     """
@@ -121,14 +121,14 @@ def rows(data: TensorDict, index: Tensor, longest: int) -> TensorDict:
 
 
 def mirror(frames: TensorDict) -> TensorDict:
-    """What a mirrored world would have shown: sideways motion and turns change sign."""
+    """Mirrors frames: sideways motion and turns change sign."""
     mirrored = mirror_drive(frames)
     return mirrored.set("target_observation", frames["target_observation"] * torch.tensor([1.0, -1.0]))
 
 
 @torch.no_grad()
 def read_sensor(sensor: FlowSensor, data: TensorDict, longest: int, *, mirrored: bool = False) -> TensorDict:
-    """A sensor's readings of a whole drive ``[N]``, on the CPU, from the same random numbers each time."""
+    """Returns a sensor's readings of a whole drive ``[N]``, on the CPU, from the same random numbers each time."""
     readings, was_training, device = [], sensor.training, next(sensor.parameters()).device
     sensor.eval()
     with torch.random.fork_rng(devices=[]):
@@ -142,7 +142,7 @@ def read_sensor(sensor: FlowSensor, data: TensorDict, longest: int, *, mirrored:
 
 
 def read_spans(sensor: FlowSensor, drives: Sequence[TensorDict], longest: int, *, mirrored: bool = False) -> TensorDict:
-    """A sensor's readings of one drive in pairs of 1, 2, ... steps.
+    """Returns a sensor's readings of one drive in pairs of 1, 2, ... steps.
 
     Args:
         sensor: the sensor.
@@ -168,7 +168,7 @@ def read_spans(sensor: FlowSensor, drives: Sequence[TensorDict], longest: int, *
 
 
 def take_spans(readings: TensorDict, steps: Tensor) -> TensorDict:
-    """Of readings of pairs of 1, 2, ... steps ``[*B]``, those of ``steps`` ``[*B]``; none where that is 0.
+    """Selects readings of pairs ``steps`` apart, ``[*B]``, from those of 1, 2, ... steps; missing where that is 0.
 
     Returns:
         A copy, as a filter without its sensor reads it: ``"observed"`` and ``"steps"`` ``[*B, 1]``, ``"sensor"``.
@@ -188,17 +188,17 @@ def take_spans(readings: TensorDict, steps: Tensor) -> TensorDict:
 
 
 def lose_frames(readings: TensorDict, seed: int, share: float = MISSING) -> TensorDict:
-    """What the sensor reads where some frames did not arrive: pairs of those that did."""
+    """Drops random frames: returns the sensor's readings of pairs of the remaining ones."""
     kept = torch.rand(len(readings), generator=torch.Generator().manual_seed(seed)) >= share
     return take_spans(readings, steps_between(kept, readings["spans"].shape[-1]))
 
 
 def shortest_spans(readings: TensorDict) -> TensorDict:
-    """What the sensor reads of the shortest pair that is observed, for each frame."""
+    """Returns the sensor's reading of the shortest observed pair, for each frame."""
     seen = readings["spans", "observed"].squeeze(-1)
     return take_spans(readings, torch.where(seen.any(-1), seen.int().argmax(-1) + 1, 0))
 
 
 def all_frames(readings: TensorDict) -> TensorDict:
-    """What the sensor reads of neighbours."""
+    """Returns the sensor's readings of neighbouring frames."""
     return take_spans(readings, torch.ones(len(readings), dtype=torch.int64))

@@ -26,7 +26,7 @@ _EARLY = 0.25  # steps that a frame may come before its time
 
 
 class TrackedBelief(NamedTuple):
-    """What :func:`track` knows when a frame has been seen.
+    """Belief of :func:`track` after a frame.
 
     Attributes:
         frame: number of the frame among those given, from 0.
@@ -96,7 +96,7 @@ def track(
         Beliefs, one for each frame that is used, from the first pair on.
 
     Raises:
-        ValueError: if calibration, height, times or images are not as said above.
+        ValueError: if calibration, height, times or images are not as above.
 
     Example:
         >>> from torch_denkf.applications.car.odometry.filter import car_filter
@@ -123,7 +123,7 @@ def track(
 
 
 def _seen(frames: Iterable[np.ndarray | None], black_level: int | None) -> Iterator[np.ndarray | None]:
-    """The frames, ``None`` for those that are missing, black or of one colour."""
+    """Yields the frames, ``None`` for those that are missing, black or of one colour."""
     for number, frame in enumerate(frames):
         if frame is not None:
             check_frame(frame, number)
@@ -193,7 +193,7 @@ class _Seen(NamedTuple):
 
 
 def _clock(times: Iterable[float] | None, fps: float | None, dt: float) -> tuple[_Clock, Iterator[float]]:
-    """A clock, and the times for it."""
+    """Returns a clock, and the times for it."""
     if times is None:
         period = dt if fps is None else 1 / fps
         return _Clock(dt, period), (number * period for number in count())
@@ -238,7 +238,7 @@ class _Clock:
         self._first: float | None = None
 
     def __call__(self, time: float) -> int | None:
-        """The step of a frame."""
+        """Returns the step of a frame."""
         self._first = time if self._first is None else self._first
         reached = int((time - self._first) / self.step + _EARLY)
         if reached <= self._taken:
@@ -269,7 +269,7 @@ class _Run:
             self.carry = car.initialise(self._noisy(self.carry))
 
     def step(self, reading: dict[str, Tensor] | None, between: int) -> None:
-        """One step of the filter; without a reading the belief is the forecast."""
+        """Runs one step of the filter; without a reading the belief is the forecast."""
         blank = {"flow": torch.zeros(FLOW_SHAPE), "road": torch.zeros(ROAD_SHAPE)}
         if self.car.settings.two_view:
             blank["two_view"] = torch.zeros(TWO_VIEW_SHAPE)
@@ -280,7 +280,7 @@ class _Run:
             self.carry = self.car.step(self._noisy(frame))
 
     def belief(self, frame: int, time: float, observed: bool, between: int = 1) -> TrackedBelief:
-        """The belief, in the units of real time."""
+        """Returns the belief, in the units of real time."""
         belief = self.carry["belief"]
         mean, var, ensemble = (belief[name] for name in ("mean", "var", "ensemble"))
         reading = None

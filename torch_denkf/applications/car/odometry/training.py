@@ -35,7 +35,7 @@ __all__ = ["Updates", "train_car_filter"]
 
 @dataclass(frozen=True)
 class Updates:
-    """How long each stage of the training is.
+    """Number of updates of each training stage.
 
     Attributes:
         sensor: updates of the sensor alone.
@@ -156,7 +156,7 @@ def train_car_filter(
 
 
 def _read(drives: Sequence[Drive], progress: bool) -> dict[Drive, TensorDict]:
-    """Flow, road and truth of each drive; 10 to 30 ms a frame the first time."""
+    """Returns flow, road and truth of each drive; 10 to 30 ms a frame the first time."""
     data = {}
     with progress_bar("optical flow", len(drives), unit=" drives", shown=progress) as bar:
         for drive in drives:
@@ -169,12 +169,12 @@ def _read(drives: Sequence[Drive], progress: bool) -> dict[Drive, TensorDict]:
 
 
 def _groups(drives: Sequence[Drive], data: dict[Drive, TensorDict], longest: int) -> list[list[TensorDict]]:
-    """Each drive under each condition, as a list of its spans."""
+    """Returns each drive under each condition, as a list of its spans."""
     return [[data[each] for each in part.spans(longest)] for drive in drives for part in drive.disturbed()]
 
 
 def _settings(drives: Sequence[Drive], data: dict[Drive, TensorDict]) -> CarSettings:
-    """Statistics of the drives that train the sensor, each counted mirrored, too: turns have the mean zero."""
+    """Returns statistics of the drives that train the sensor, each counted mirrored, too: turns have the mean zero."""
     clean = [data[drive] for drive in drives if drive.condition == "clean" and drive.steps == 1]
     v, theta_dot = torch.cat([each["state"][:, VELOCITIES] for each in clean]).unbind(-1)
     focal = max(float(each["calibration"][0, 0]) for each in clean)

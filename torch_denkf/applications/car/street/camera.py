@@ -30,12 +30,12 @@ class Camera:
 
     @classmethod
     def kitti(cls, size: tuple[int, int]) -> Camera:
-        """KITTI's left colour camera of the raw drives (1242 x 375), scaled to ``size``; for level poses."""
+        """Returns KITTI's left colour camera of the raw drives (1242 x 375), scaled to ``size``; for level poses."""
         return cls._scaled(size, (375, 1242), 721.5, 610.1, 173.4)
 
     @classmethod
     def odometry(cls, size: tuple[int, int], focal: float = KITTI_FOCAL) -> Camera:
-        """The left camera of the odometry drives (1241 x 376), scaled to ``size``; its poses look down by about 1°.
+        """Returns the left camera of the odometry drives (1241 x 376), scaled to ``size``; its poses look down by 1°.
 
         Args:
             size: (H, W) in pixels.
@@ -49,7 +49,7 @@ class Camera:
         return cls(size, focal * across, focal * down, cx * across - 0.5, cy * down - 0.5)
 
     def supersampled(self, down: int, across: int) -> Camera:
-        """The same camera with ``down`` x ``across`` pixels for each one."""
+        """Returns this camera with ``down`` x ``across`` pixels for each one."""
         return dataclasses.replace(
             self,
             size=(self.size[0] * down, self.size[1] * across),
@@ -61,5 +61,5 @@ class Camera:
 
     @property
     def matrix(self) -> np.ndarray:
-        """Intrinsics, ``[3, 3]``."""
+        """Returns intrinsics, ``[3, 3]``."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])

@@ -28,7 +28,7 @@ class Path:
 
     @classmethod
     def of(cls, state: np.ndarray, ground: np.ndarray) -> Path:
-        """The path of a car.
+        """Returns the path of a car.
 
         Args:
             state: x and y in m and θ in rad in its first three columns, ``[N, 3]`` or more.
@@ -66,16 +66,16 @@ class Path:
 
     @property
     def ahead(self) -> np.ndarray:
-        """Unit vectors along the line, (x, z), ``[M, 2]``."""
+        """Returns unit vectors along the line, (x, z), ``[M, 2]``."""
         return np.stack([-np.sin(self.heading), np.cos(self.heading)], -1)
 
     @property
     def left(self) -> np.ndarray:
-        """Unit vectors to its left, (x, z), ``[M, 2]``."""
+        """Returns unit vectors to its left, (x, z), ``[M, 2]``."""
         return np.stack([-np.cos(self.heading), -np.sin(self.heading)], -1)
 
     def at(self, along: np.ndarray, aside: np.ndarray | float = 0.0) -> np.ndarray:
-        """Places on or beside the line.
+        """Places on or next to the line.
 
         Args:
             along: m from the line's first point, ``[T]``.
@@ -91,7 +91,7 @@ class Path:
 
 
 def check_length(name: str, points: np.ndarray) -> None:
-    """Refuses paths that are too long to lay a scene out along them.
+    """Raises for paths that are too long to lay a scene out along them.
 
     Args:
         name: of the path, for the message.
@@ -112,7 +112,7 @@ def check_length(name: str, points: np.ndarray) -> None:
 
 
 def _end_slopes(travelled: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """Slope of the first and of the last 10 m."""
+    """Returns the slope of the first and of the last 10 m."""
     if travelled[-1] < 10:
         return np.zeros(2)
     near = travelled < 10, travelled > travelled[-1] - 10

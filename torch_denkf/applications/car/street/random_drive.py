@@ -10,7 +10,7 @@ LOOKS_DOWN = 0.0185  # rad: the odometry drives' cameras against the road
 
 
 def random_drive(frames: int, rng: np.random.Generator, dt: float = KITTI_DT) -> np.ndarray:
-    """A smooth random drive.
+    """Returns a smooth random drive.
 
     Speed is 0 to 15 m/s with few stops, accelerates by about 1 m/s² and brakes by at most 2, and is low where the
     road is sharply bent: the turn rate stays below 0.5 rad/s and the acceleration to the side about 2.5 m/s².
@@ -63,7 +63,7 @@ def _knots(rng: np.random.Generator, end: float, gap: tuple[float, float], draw)
 
 
 def hilly_poses(state: np.ndarray, rng: np.random.Generator, dt: float = KITTI_DT) -> np.ndarray:
-    """Camera poses of a drive over hills, in a car that pitches and rolls.
+    """Returns camera poses of a drive over hills, in a car that pitches and rolls.
 
     Slopes are up to about 6 %; the body pitches by 0.3° and rolls by 0.5° (standard deviations), and the camera looks
     down by 1.06° as those of KITTI's odometry drives do.

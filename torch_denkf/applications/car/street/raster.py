@@ -6,13 +6,13 @@ import numpy as np
 
 
 def hats(pixels: int, step: int) -> np.ndarray:
-    """Weights that interpolate linearly between pixels 0, ``step``, 2 ``step`` ...: ``[nodes, pixels]``."""
+    """Returns weights that interpolate linearly between pixels 0, ``step``, 2 ``step`` ...: ``[nodes, pixels]``."""
     nodes = np.arange(0, pixels + step, step)
     return np.maximum(1 - np.abs(np.arange(pixels) - nodes[:, None]) / step, 0).astype(np.float32)
 
 
 def region(corners: np.ndarray, shape: tuple[int, ...]) -> tuple[int, int, int, int] | None:
-    """The part of a picture that holds some points, with x0, y0, x1, y1; None where it is empty.
+    """Returns the part of a picture that holds some points, with x0, y0, x1, y1; None where it is empty.
 
     Args:
         corners: pixels (x, y), ``[n, 2]``.
@@ -25,12 +25,12 @@ def region(corners: np.ndarray, shape: tuple[int, ...]) -> tuple[int, int, int, 
 
 
 def level(minification: float, levels: int) -> int:
-    """The level of a pyramid whose pixels are nearest in size to the picture's."""
+    """Returns the level of a pyramid whose pixels are nearest in size to the picture's."""
     return int(np.clip(np.round(np.log2(max(minification, 1e-6))), 0, levels - 1))
 
 
 def hidden(pixels: np.ndarray, ahead: np.ndarray, solid: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Which things are outside the picture or wholly behind nearer solid ones.
+    """Masks things that are outside the picture or fully occluded by nearer solid ones.
 
     Args:
         pixels: of the feet and the heads of things on the ground, the nearest first, ``[n, 2, 4, 2]``.

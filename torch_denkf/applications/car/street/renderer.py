@@ -49,7 +49,7 @@ class Renderer:
         self._pyramid: list[np.ndarray] = []
 
     def render(self, pose: np.ndarray, frame: int | None = None) -> np.ndarray:
-        """Draw one picture.
+        """Draws one picture.
 
         Args:
             pose: camera-to-world matrix, ``[3, 4]``.
@@ -87,7 +87,7 @@ class Renderer:
             self._things.settle(self._relief, terrain.line[stretch])
 
     def _ground_depth(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """One over the ground's depth at each pixel, and the row of its upper end in each column.
+        """Returns one over the ground's depth at each pixel, and the row of its upper end in each column.
 
         In each of some columns the ground is looked up at all depths and projected; between them one over the depth
         is linear in row and column, exactly so on a plane.
@@ -164,7 +164,7 @@ class Renderer:
         picture[start:end][above] = sky[above]
 
     def _shown(self, region: tuple[int, int, int, int], depth: float) -> np.ndarray | None:
-        """Where no crest of the road hides what is at a depth, uint8; None for everywhere."""
+        """Masks pixels at a depth that no crest of the road occludes, uint8; None if none is occluded."""
         if not self._hides:
             return None
         x0, y0, x1, y1 = region

@@ -1,4 +1,4 @@
-"""Lays out a random scene along a path: the road's surface, and what stands beside it."""
+"""Lays out a random scene along a path: the road's surface, and what stands next to it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HOUSE, TREE, POLE, CAR, HEDGE = range(5)
 def roadside_scene(
     path: np.ndarray, rng: np.random.Generator, *, ground: np.ndarray | None = None, traffic_on: bool = False
 ) -> Scene:
-    """Put a road under a path, and houses, hedges, trees, poles and parked cars beside it.
+    """Puts a road under a path, and houses, hedges, trees, poles and parked cars next to it.
 
     Nothing stands on the road, whichever stretch of it: where a path crosses or repeats itself, one scene serves all
     visits.
@@ -84,13 +84,13 @@ def roadside_scene(
 
 
 def _exposure(frames: int, rng: np.random.Generator) -> np.ndarray:
-    """A gain that wanders by some 8 % within seconds."""
+    """Returns a gain that wanders by some 8 % within seconds."""
     knots = np.arange(0, frames + 40, 40)
     return np.interp(np.arange(frames), knots, np.exp(0.08 * rng.standard_normal(len(knots))))
 
 
 def _first_visit(line: np.ndarray) -> np.ndarray:
-    """Where a line is at a place for the first time, and not within 6 m of another stretch."""
+    """Masks the points of a line at a place for the first time, and not within 6 m of another stretch."""
     # A pixel a metre keeps the number of the last point painted: painted backwards, the first one stays.
     low = line.min(0) - 8
     shape = np.ceil(line.max(0) - low + 8).astype(int) + 1
@@ -119,7 +119,7 @@ class _Roadside:
         return np.round((points - self.low) / self.cell * 16).astype(np.int32)
 
     def _take(self, corners: np.ndarray, distance: float) -> bool:
-        """Whether a footprint is clear of all roads and of what is there; if so it is taken."""
+        """Reserves a footprint if it is clear of all roads and things; returns True if it is."""
         x, z = np.round((corners - self.low) / self.cell).astype(int).T
         if x.min() < 0 or z.min() < 0 or x.max() >= self.taken.shape[1] or z.max() >= self.taken.shape[0]:
             return False
@@ -133,7 +133,7 @@ class _Roadside:
         return True
 
     def fill(self, cars: list[list[list[np.ndarray]]], fast: bool) -> list[Box | Card]:
-        """Everything that stands beside the road, on both sides."""
+        """Returns everything that stands next to the road, on both sides."""
         rng, way = self.rng, self.way
         make = self._makers(cars)
         kinds = rng.dirichlet([0.5, 5, 3, 0.1, 3] if fast else [4, 4, 2, 3, 2])  # this drive's share of each kind

@@ -1,4 +1,4 @@
-"""What stands and moves in the world of a rendered drive, and the ground's picture from above.
+"""Static and moving things of a rendered drive, and the ground's picture from above.
 
 Everything is fixed in the world but the cars of ``Scene.traffic``, in KITTI's axes: x right, y down, z forward,
 metres. Places are (x, z): things stand on the ground, whose height :mod:`torch_denkf.applications.car.street.terrain`
@@ -59,7 +59,7 @@ class Mover:
     faces: list[list[np.ndarray]]
 
     def at(self, frame: int) -> Box | None:
-        """The car in a frame, or None where it is not there."""
+        """Returns the car in a frame, or None where it is not there."""
         if not 0 <= frame - self.first < len(self.track):
             return None
         x, z, ahead, up = self.track[frame - self.first]
@@ -70,7 +70,7 @@ class Mover:
 
 @dataclass
 class Scene:
-    """What there is in the world.
+    """Content of the rendered world.
 
     Attributes:
         road: the centre line of the road, (x, z) in m, ``[M, 2]``.
@@ -115,7 +115,7 @@ class Scene:
         self.marks = self.dashes.mean(1) if len(self.dashes) else np.zeros((0, 2))
 
     def draw_ground(self, origin: np.ndarray) -> np.ndarray:
-        """Picture of the ground from above, ``[PATCH, PATCH, 3]``; pixel (0, 0) is at ``origin`` (x, z) in m."""
+        """Draws the ground from above, ``[PATCH, PATCH, 3]``; pixel (0, 0) is at ``origin`` (x, z) in m."""
         offset = np.round(origin / RESOLUTION).astype(int) % textures.TILE
         rows, columns = slice(offset[1], offset[1] + PATCH), slice(offset[0], offset[0] + PATCH)
         grass, pavement, asphalt = (texture[rows, columns] for texture in self.ground)

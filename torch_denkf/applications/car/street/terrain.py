@@ -26,7 +26,7 @@ class Relief:
     grid: np.ndarray
 
     def at(self, x: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Height of the ground at (x, z), any shape; outside the grid that of its edge."""
+        """Returns the height of the ground at (x, z), any shape; outside the grid that of its edge."""
         rows, columns = self.grid.shape
         u = np.clip((x - self.origin[0]) / CELL, 0, columns - 1.001)
         v = np.clip((z - self.origin[1]) / CELL, 0, rows - 1.001)
@@ -54,7 +54,7 @@ class Terrain:
         self.heights = np.convolve(padded, kernel / kernel.sum(), mode="valid")
 
     def around(self, metre: int) -> Relief:
-        """The ground as it is from 40 m behind to 220 m ahead of a point of the path.
+        """Returns the ground as it is from 40 m behind to 220 m ahead of a point of the path.
 
         Args:
             metre: number of the point.
@@ -68,7 +68,7 @@ class Terrain:
         ticks = CELL * np.arange(nodes)
         x, z = ((origin[k] + ticks)[:, None] - self.line[piece, k] for k in (0, 1))
         x, z = x.astype(np.float32) ** 2, z.astype(np.float32) ** 2
-        # Weights fall with the twelfth power of the distance: on the path the height is the path's, beside it the
+        # Weights fall with the twelfth power of the distance: on the path the height is the path's, next to it the
         # nearest points', and there is no step anywhere.
         weight = z[:, None] + (x + 6.0)
         weight *= weight * weight

@@ -11,7 +11,7 @@ TILE = 512  # pixels after which ground textures repeat
 
 
 def noise(rng: np.random.Generator, shape: tuple[int, int], cells: dict[int, float]) -> np.ndarray:
-    """Smooth noise of several scales that repeats at its edges.
+    """Returns smooth noise of several scales that repeats at its edges.
 
     Args:
         rng: source of randomness.
@@ -33,12 +33,12 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], cells: dict[int, flo
 
 
 def tinted(values: np.ndarray, colour: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Grey values around 1 times a BGR colour, as uint8."""
+    """Returns grey values around 1 times a BGR colour, as uint8."""
     return np.clip(values[..., None] * np.array(colour, np.float32), 0, 255).astype(np.uint8)
 
 
 def pyramid(texture: np.ndarray, levels: int) -> list[np.ndarray]:
-    """The texture and its halves; pixel i of level k lies at pixel ``2**k i`` of the first."""
+    """Returns the texture and its halves; pixel i of level k lies at pixel ``2**k i`` of the first."""
     stack = [texture]
     while len(stack) < levels and min(stack[-1].shape[:2]) > 2:
         stack.append(cv2.pyrDown(stack[-1]))
@@ -66,7 +66,7 @@ def ground(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def facade(rng: np.random.Generator, rows: int = 96, columns: int = 160) -> np.ndarray:
-    """A house's wall of 12 x 20 m at 8 pixels a metre: plaster or brick, windows, doors."""
+    """Returns a house's wall of 12 x 20 m at 8 pixels a metre: plaster or brick, windows, doors."""
     colour = np.array([100, 120, 135]) + rng.normal(0, 12, 3) + rng.normal(0, 40)
     wall = tinted(1 + noise(rng, (96, 160), {1: 0.04, 8: 0.06, 32: 0.1}), np.clip(colour, 40, 210))
     wall = wall[:rows, :columns].copy()
@@ -81,7 +81,7 @@ def facade(rng: np.random.Generator, rows: int = 96, columns: int = 160) -> np.n
 
 
 def tree(rng: np.random.Generator) -> np.ndarray:
-    """Premultiplied BGRA, 128 x 96."""
+    """Returns a tree, premultiplied BGRA, 128 x 96."""
     rows, columns = 128, 96
     alpha = np.zeros((rows, columns), np.uint8)
     for _ in range(14):
@@ -99,7 +99,7 @@ def tree(rng: np.random.Generator) -> np.ndarray:
 
 
 def pole(rng: np.random.Generator) -> np.ndarray:
-    """A lamp post or a sign, premultiplied BGRA, 128 x 32."""
+    """Returns a lamp post or a sign, premultiplied BGRA, 128 x 32."""
     alpha = np.zeros((128, 32), np.uint8)
     picture = np.full((128, 32, 3), int(rng.integers(50, 130)), np.uint8)
     cv2.rectangle(alpha, (14, 4), (17, 128), 255, -1)
@@ -119,7 +119,7 @@ def _premultiplied(picture: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def hedge(rng: np.random.Generator) -> np.ndarray:
-    """A hedge or a fence, 24 x 160 at 8 pixels a metre."""
+    """Returns a hedge or a fence, 24 x 160 at 8 pixels a metre."""
     if rng.random() < 0.7:
         colour = np.array([40, 80, 55]) * rng.uniform(0.6, 1.3)
         return tinted(1 + noise(rng, (24, 160), {2: 0.15, 8: 0.25}), colour)
@@ -128,7 +128,7 @@ def hedge(rng: np.random.Generator) -> np.ndarray:
 
 
 def car(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Side (48 x 128), rear and front (48 x 56) of a car."""
+    """Returns side (48 x 128), rear and front (48 x 56) of a car."""
     paint = np.clip(rng.normal(110, 60) + rng.normal(0, 22, 3), 15, 230)
     views = []
     for columns, margin in ((128, 22), (56, 6), (56, 6)):
@@ -151,7 +151,7 @@ def car(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def panorama(rng: np.random.Generator, haze: np.ndarray, rows: int = 160, columns: int = 1440) -> np.ndarray:
-    """Sky with clouds, hills at the horizon, all around: four pixels a degree; the horizon is the last row."""
+    """Returns sky with clouds, hills at the horizon, all around: four pixels a degree; the horizon is the last row."""
     rise = np.linspace(1, 0, rows, dtype=np.float32)[:, None, None]
     blue = np.array([235, 190, 150]) * rng.uniform(0.7, 1.0)
     sky = haze + (blue - haze) * np.minimum(1.6 * rise, 1)

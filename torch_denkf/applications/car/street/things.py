@@ -34,14 +34,14 @@ class Things:
         self._sun = scene.sun / max(np.linalg.norm(scene.sun), 1e-9) * (1 - scene.shade)
 
     def settle(self, relief: Relief, place: np.ndarray) -> None:
-        """Let what is near a place (x, z) stand on the ground."""
+        """Places what is near (x, z) on the ground."""
         self.relief = relief
         sight = FAR * np.hypot(1, self.camera.size[1] / (2 * self.camera.fx)) + 40
         near = np.linalg.norm(self.scene.places - place, axis=-1) < sight
         self.feet[near] = relief.at(self.corners[near, :, 0], self.corners[near, :, 1])
 
     def draw(self, picture: np.ndarray, pose: np.ndarray, cars: list[Box], shown: Shown) -> None:
-        """Draw all that is seen.
+        """Draws all that is seen.
 
         Args:
             picture: BGR, drawn in.
@@ -163,7 +163,7 @@ class Things:
         view[:] = view * (1 - alpha) + colour
 
     def _car_shadow(self, picture, box: Box, pose, shown: Shown) -> None:
-        """Darken the ground under a moving car."""
+        """Darkens the ground under a moving car."""
         middle = box.corners.mean(0)
         corners = middle + 1.08 * (box.corners - middle)
         points = np.column_stack([corners[:, 0], self.relief.at(*corners.T), corners[:, 1]])
@@ -180,7 +180,7 @@ class Things:
 
 
 def project(camera: Camera, points: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels ``[..., 2]`` and depths ``[...]`` of points of the world, ``[..., 3]``; 5 cm is the least depth."""
+    """Projects points of the world ``[..., 3]`` to pixels ``[..., 2]`` and depths ``[...]``, at least 5 cm."""
     local = (points - pose[:, 3]) @ pose[:, :3]
     depth = local[..., 2]
     scaled = local[..., :2] / np.maximum(depth, 0.05)[..., None]

@@ -17,7 +17,7 @@ FAST = 17.0  # m/s: of a motorway, whose other lane goes the same way
 
 
 def traffic(path: Path, cars: list[list[list[np.ndarray]]], rng: np.random.Generator) -> list[Mover]:
-    """Random traffic of a drive.
+    """Returns random traffic of a drive.
 
     Args:
         path: the path.
@@ -54,7 +54,7 @@ def traffic(path: Path, cars: list[list[list[np.ndarray]]], rng: np.random.Gener
 
 
 def _leader(path: Path, time: np.ndarray, length: float, faces, rng: np.random.Generator) -> list[Mover]:
-    """A car ahead, which comes nearer, stays for a while at varying distance and pulls away."""
+    """Returns a car ahead, which comes nearer, stays for a while at varying distance and pulls away."""
     knots = [0.0, *np.arange(rng.uniform(6, 10), length - 6, 5.0), length]
     gaps = [SIGHT, *rng.uniform(8, 40, len(knots) - 2), SIGHT]
     gap = np.interp(time, knots, gaps, left=np.inf, right=np.inf)
@@ -68,7 +68,7 @@ def _leader(path: Path, time: np.ndarray, length: float, faces, rng: np.random.G
 
 
 def _seen(path: Path, along: np.ndarray, aside: float, pace: float, faces, rng: np.random.Generator) -> list[Mover]:
-    """The part of a car's way in which it is near the camera; its passes, if it is near several times."""
+    """Returns the part of a car's way in which it is near the camera; its passes, if it is near several times."""
     ahead = along - path.along
     near = np.flatnonzero((ahead > -BACK) & (ahead < SIGHT) & (along > 0) & (along < len(path.line) - 1))
     size = rng.uniform(3.8, 4.9), rng.uniform(1.65, 1.9), rng.uniform(1.4, 1.75)

@@ -34,7 +34,7 @@ class CanonicalCamera:
 
     @classmethod
     def near(cls, calibration) -> CanonicalCamera:
-        """The one whose resolution fits a real camera's ``(fx, fy, cx, cy)``, in pixels.
+        """Returns the one whose resolution fits a real camera's ``(fx, fy, cx, cy)``, in pixels.
 
         Small images are enlarged to a focal length of 120 pixels, below which dense optical flow loses the road, and
         large ones reduced to 240, beyond which it only costs time.
@@ -43,16 +43,16 @@ class CanonicalCamera:
 
     @property
     def width(self) -> int:
-        """Columns."""
+        """Returns the number of columns."""
         return round(2 * _HALF_WIDTH * self.focal) + 1
 
     @property
     def height(self) -> int:
-        """Rows."""
+        """Returns the number of rows."""
         return round(2 * _HALF_HEIGHT * self.focal) + 1
 
     def view(self, image: np.ndarray, calibration) -> np.ndarray:
-        """What this camera sees of a real camera's image; what that has not seen repeats its border.
+        """Resamples a real camera's image for this camera; outside of it, the border is repeated.
 
         Args:
             image: ``[H, W]``, uint8.
@@ -77,7 +77,7 @@ class CanonicalCamera:
         return cv2.warpAffine(image, to_real, (self.width, self.height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
     def pixels(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and rows (float32, fractional) of image coordinates."""
+        """Returns columns and rows (float32, fractional) of image coordinates."""
         columns = x * self.focal + (self.width - 1) / 2
         rows = y * self.focal + (self.height - 1) / 2
         return columns.astype(np.float32), rows.astype(np.float32)

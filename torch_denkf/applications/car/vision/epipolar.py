@@ -27,7 +27,7 @@ _STEP = 1e-5  # of finite differences
 
 
 class TwoView(NamedTuple):
-    """How a camera moved between two frames.
+    """Motion of a camera between two frames.
 
     Attributes:
         turn: to the left, up and anticlockwise around the axis, in rad, ``[3]``.
@@ -68,7 +68,7 @@ def track_corners(
 
 
 def _track(previous: np.ndarray, current: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where corners ``[K, 1, 2]`` are in the other image, and whether they were found ``[K, 1]``."""
+    """Tracks corners ``[K, 1, 2]`` into the other image; returns positions and a mask of those found ``[K, 1]``."""
     moved, found, _ = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]  # cv2 does not say that None is to make
         previous, current, corners, None, winSize=_WINDOW, maxLevel=_LEVELS, criteria=(3, 30, 0.01)
     )
@@ -134,7 +134,7 @@ def fit_two_view(first: np.ndarray, second: np.ndarray) -> TwoView:
 
 
 def _sampson(motion: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Distances of point pairs ``[K, 3]`` from a motion: rotation vector and focus, ``[5]``."""
+    """Returns distances of point pairs ``[K, 3]`` from a motion: rotation vector and focus, ``[5]``."""
     x, y = motion[3:]
     essential = np.array([[0, -1, y], [1, 0, -x], [-y, x, 0]]) @ cv2.Rodrigues(motion[:3])[0]
     before, after = second @ essential, first @ essential.T
@@ -145,7 +145,7 @@ def _sampson(motion: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.nd
 def two_view_motion(
     previous: np.ndarray, current: np.ndarray, calibration, *, hidden: np.ndarray | None = None
 ) -> np.ndarray:
-    """The turn and the direction of travel between two images of one calibrated camera.
+    """Returns the turn and the direction of travel between two images of one calibrated camera.
 
     Corners are tracked on the images as they are: a median filter over all pixels, as the dense flow has it, or
     resampling make the turn's error a tenth to a quarter larger. So only single black and white pixels are replaced,
@@ -189,6 +189,6 @@ def two_view_motion(
 
 
 def _without_specks(image: np.ndarray) -> np.ndarray:
-    """An image whose single black and white pixels have the median of their neighbours."""
+    """Returns an image whose single black and white pixels have the median of their neighbours."""
     median = cv2.medianBlur(image, 3)
     return np.where((cv2.absdiff(image, median) > _SPECK) & ((image < 3) | (image > 252)), median, image)

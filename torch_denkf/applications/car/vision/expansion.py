@@ -1,4 +1,4 @@
-"""Where a camera moves to: the point that a coarse optical flow expands from, and the turn between the two frames."""
+"""Focus of expansion of a coarse optical flow, and the turn between the two frames."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def focus_of_expansion(flow: Tensor) -> Expansion:
 
 
 def _across(right: Tensor, down: Tensor, x: Tensor, y: Tensor, estimate: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Flow across the rays from the focus ``[N, K]``, its derivatives ``[N, 5, K]``, and where rays are long enough."""
+    """Returns flow across rays from the focus ``[N, K]``, its derivatives ``[N, 5, K]``, and which rays are long."""
     left, up, around, *focus = (value.unsqueeze(-1) for value in estimate.unbind(1))
     from_x, from_y = x - focus[0], y - focus[1]
     distance = (from_x**2 + from_y**2).sqrt().clamp_min(0.5 * _NEAR)

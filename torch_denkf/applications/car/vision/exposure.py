@@ -12,7 +12,7 @@ _GAIN, _OFFSET = 1.15, 8.0  # contrast and grey levels by which neighbouring fra
 
 
 def same_exposure(first: np.ndarray, second: np.ndarray, *, tolerance: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Both images with the quartiles of the one with more contrast; images without any stay as they are.
+    """Returns both images with the quartiles of the one with more contrast; images without any stay as they are.
 
     Args:
         first: grey image ``[H, W]``, uint8.

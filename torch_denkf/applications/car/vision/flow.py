@@ -14,7 +14,7 @@ _RESIDUAL = 40.0  # grey levels that count as a complete mismatch
 
 
 def dense_flow(previous: np.ndarray, current: np.ndarray, camera: CanonicalCamera) -> np.ndarray:
-    """Apparent motion of every pixel of ``current`` since ``previous``.
+    """Computes the dense optical flow: the motion of every pixel of ``current`` since ``previous``.
 
     Args:
         previous: canonical image ``[H, W]``, uint8.
@@ -26,14 +26,14 @@ def dense_flow(previous: np.ndarray, current: np.ndarray, camera: CanonicalCamer
     """
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(0)
-    previous, current = (np.ascontiguousarray(image) for image in (previous, current))  # OpenCV refuses cut-outs
+    previous, current = (np.ascontiguousarray(image) for image in (previous, current))  # OpenCV takes no views
     # Searched from the current image, so that the vectors stand on its grid.
     flow = dis.calc(current, previous, None)  # type: ignore[call-overload]  # cv2 does not say that None is one to make
     return -flow / camera.focal
 
 
 def coarse_flow(flow: np.ndarray, previous: np.ndarray, current: np.ndarray, camera: CanonicalCamera) -> np.ndarray:
-    """Means of the flow over a coarse grid, with a channel that tells how far to trust it.
+    """Returns means of the flow over a coarse grid, with a channel that tells how far to trust it.
 
     Args:
         flow: as :func:`dense_flow` gives it, ``[H, W, 2]``.
@@ -57,7 +57,7 @@ def coarse_flow(flow: np.ndarray, previous: np.ndarray, current: np.ndarray, cam
 
 
 def median_turn(flow: np.ndarray) -> tuple[float, float]:
-    """How far the camera turned to the left and up: the median flow ahead, where things are too far off to approach.
+    """Returns the turn to the left and up: the median flow ahead, where things are too far off to approach.
 
     Args:
         flow: ``[H, W, 2]`` or coarser, in tangents.

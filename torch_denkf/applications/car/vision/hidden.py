@@ -20,14 +20,14 @@ _REACH = 3  # pixels that the continuation looks at
 
 
 def continue_picture(image: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """A canonical picture ``[H, W]``, uint8, without the edges of what hides a part of it ``[H, W]``, bool."""
+    """Returns a canonical picture ``[H, W]``, uint8, without the edges of what hides a part of it ``[H, W]``, bool."""
     return cv2.inpaint(image, grown(hidden, _PICTURE_RIM), _REACH, cv2.INPAINT_TELEA)
 
 
 def continue_flow(
     flow: np.ndarray, coarse: np.ndarray, hidden: np.ndarray, camera: CanonicalCamera
 ) -> tuple[np.ndarray, np.ndarray]:
-    r"""Optical flow behind what hides the street, as its surroundings and the camera's motion say.
+    r"""Returns the optical flow behind what hides the street, as its surroundings and the camera's motion say.
 
     The flow of a point p is that of the turn, plus :math:`\rho(p) (p - e)` with the focus of expansion e and an inverse
     distance :math:`\rho`. Turn and focus are fitted to what is seen. The inverse distance is continued from around the
@@ -62,5 +62,5 @@ def continue_flow(
 
 
 def grown(hidden: np.ndarray, rim: int) -> np.ndarray:
-    """What is hidden ``[H, W]``, bool, with a rim of so many pixels, as uint8."""
+    """Dilates the mask of occluded pixels ``[H, W]``, bool, by a rim of so many pixels; returns uint8."""
     return cv2.dilate(hidden.astype(np.uint8), np.ones((2 * rim + 1, 2 * rim + 1), np.uint8))

@@ -22,7 +22,7 @@ def image_motion(
     height: float = KITTI_HEIGHT,
     hidden: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coarse optical flow and road correlation between two images of one calibrated camera.
+    """Returns coarse optical flow and road correlation between two images of one calibrated camera.
 
     A median over 3 x 3 pixels comes first: it takes single wrong pixels away and leaves edges where they are. Then the
     image with less contrast is brought to the other's exposure, because a camera changes it between frames and what
@@ -66,5 +66,5 @@ def image_motion(
 
 
 def grey_picture(image: np.ndarray) -> np.ndarray:
-    """A picture ``[C, H, W]``, uint8, RGB or grey, as ``[H, W]``."""
+    """Converts a picture ``[C, H, W]``, uint8, RGB or grey, to grey ``[H, W]``."""
     return image[0] if len(image) == 1 else cv2.cvtColor(image.transpose(1, 2, 0), cv2.COLOR_RGB2GRAY)

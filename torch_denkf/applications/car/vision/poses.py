@@ -14,7 +14,7 @@ KITTI_DT = 0.103  # s, the nominal frame time of KITTI's odometry benchmark
 
 
 def poses_to_state(poses: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
-    """Planar state of camera poses, with backward differences.
+    """Returns the planar state of camera poses, with backward differences.
 
     Args:
         poses: camera-to-world matrices, ``[N, 3, 4]``, in m.
@@ -41,7 +41,7 @@ def poses_to_state(poses: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
 
 
 def state_to_poses(state: np.ndarray) -> np.ndarray:
-    """Camera poses of a level camera: the inverse of :func:`poses_to_state`.
+    """Returns camera poses of a level camera: the inverse of :func:`poses_to_state`.
 
     Args:
         state: ``[N, 3]`` or more columns: x and y in m, θ in rad.

@@ -1,4 +1,4 @@
-"""How far the road moved: two images, laid flat on the ground, correlated along the direction of travel.
+"""Motion over the road: two images, projected on the ground, correlated along the direction of travel.
 
 Dense optical flow shrinks on the near road, where motion is large and texture is poor; yet there the ground plane ties
 pixels to metres. Each image is projected on the plane under the car, for several pitches of the camera, and the older
@@ -29,7 +29,7 @@ def road_correlation(
     turn: tuple[float, float],
     height: float = KITTI_HEIGHT,
 ) -> np.ndarray:
-    """Correlation of the road in two images, for each pitch and each distance travelled.
+    """Returns the correlation of the road in two images, for each pitch and each distance travelled.
 
     Args:
         previous: canonical image ``[H, W]``, uint8.
@@ -60,13 +60,13 @@ def road_correlation(
 
 @lru_cache(maxsize=256)
 def _nearest(camera: CanonicalCamera, pitch: float, height: float) -> float:
-    """Where the road enters the image, in m ahead."""
+    """Returns the distance at which the road enters the image, in m ahead."""
     bottom = (camera.height - 4) / 2 / camera.focal
     return max(height / np.tan(np.arctan(bottom) - pitch), _NEAREST)
 
 
 def _plan(image, camera, pitch, height, ahead, left, up) -> np.ndarray:
-    """The road seen from above, ``[len(ahead), lanes]``, by a camera turned by ``left`` and, a little, ``up``."""
+    """Maps the road to a view from above, ``[len(ahead), lanes]``, of a camera turned by ``left`` and ``up``."""
     lanes = np.linspace(-_HALF_WIDTH, _HALF_WIDTH, _LANES)
     right = lanes * np.cos(left) - ahead[:, None] * np.sin(left)
     forward = lanes * np.sin(left) + ahead[:, None] * np.cos(left)
@@ -79,7 +79,7 @@ def _plan(image, camera, pitch, height, ahead, left, up) -> np.ndarray:
 
 
 def _slide(now: np.ndarray, then: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Weighted normalised correlation of ``now`` with every window of its length in ``then``."""
+    """Returns the weighted normalised correlation of ``now`` with every window of its length in ``then``."""
     cells = len(now)
     weight = weight / weight.sum() / now.shape[1]
     now = now - (weight @ now).sum()

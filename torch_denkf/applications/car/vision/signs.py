@@ -29,7 +29,7 @@ _WHITE, _BLACK = 250, 5  # grey levels at which a pixel counts as too bright, or
 
 
 def static_region(previous: np.ndarray, current: np.ndarray, *, noise: int = 0, cells: int = _CELLS) -> np.ndarray:
-    """Where something stands still before a camera that moves: dirt on the lens, a box, a dead part of the chip.
+    """Masks what stands still before a moving camera: dirt on the lens, an occlusion, dead pixels.
 
     The picture is divided into square cells. A cell is static if none of its pixels changed by more than the noise,
     while more than half of the cells did change. Cells that are too bright in both pictures are left out, because an
@@ -74,7 +74,7 @@ def static_region(previous: np.ndarray, current: np.ndarray, *, noise: int = 0, 
 def picture_signs(previous: np.ndarray, current: np.ndarray, *, noise: int = 0) -> np.ndarray:
     """Numbers that are small for two pictures of a sound camera, and large for those of one that fails.
 
-    An :class:`torch_denkf.monitoring.InnovationMonitor` watches them beside the innovations, and a
+    An :class:`torch_denkf.monitoring.InnovationMonitor` watches them besides the innovations, and a
     :class:`torch_denkf.monitoring.SignGate` takes readings out by them; both take from clean data what is large.
 
     ============ ======================================================================================================
@@ -113,7 +113,7 @@ def picture_signs(previous: np.ndarray, current: np.ndarray, *, noise: int = 0) 
 
 
 def _largest(values: np.ndarray, side: int) -> np.ndarray:
-    """The largest value in each cell of so many pixels, those at the right and lower border included."""
+    """Returns the largest value in each cell of so many pixels, those at the right and lower border included."""
     height, width = values.shape
     padded = np.pad(values, ((0, -height % side), (0, -width % side)))
     return padded.reshape(padded.shape[0] // side, side, -1, side).max((1, 3))
@@ -121,10 +121,10 @@ def _largest(values: np.ndarray, side: int) -> np.ndarray:
 
 @torch.no_grad()
 def plane_distance(flow: Tensor, *, height: float = KITTI_HEIGHT) -> Tensor:
-    r"""How far a camera moved over a road, by the flow of all that lies below the horizon: a second opinion.
+    r"""Estimates the distance moved over a road from the flow below the horizon, as a cross-check.
 
     A point of the road at p, in tangents, is :math:`h / y` away, where y is how far it lies below the focus of
-    expansion e. A camera that drives d moves it by :math:`d\, y / h\, (p - e)`, beside its turn. Each cell of the flow
+    expansion e. A camera that drives d moves it by :math:`d\, y / h\, (p - e)`, besides its turn. Each cell of the flow
     gives a distance, and their median stands even where a car hides the lane, which :func:`road_correlation` reads.
 
     It is too small, because dense flow shrinks on the near road: by 11 % on rendered drives, with a scatter of 5 %.

@@ -24,7 +24,7 @@ _CHUNK = 8  # demos that are decoded ahead of what is written
 
 
 def read_entries(root: Path) -> list[Entry]:
-    """The manifest of a folder of demos.
+    """Returns the manifest of a folder of demos.
 
     Raises:
         FileNotFoundError: without the folder, or without a demo in it.
@@ -131,7 +131,7 @@ def _read(
 
 
 def _rows(demo: Demo, shot: int) -> dict[str, np.ndarray]:
-    """The rows of a demo whose first picture has the number ``shot``."""
+    """Returns the rows of a demo whose first picture has the number ``shot``."""
     count = len(demo.state)
     frame = np.full(count, -1)
     frame[demo.steps] = np.arange(shot, shot + len(demo.steps))

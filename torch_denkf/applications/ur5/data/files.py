@@ -91,7 +91,7 @@ class Entry:
 
 
 def write_demo(root: Path, demo: Demo, failures: int = 0) -> Entry:
-    """Write a demo beside its place and rename it, so that a file of that name is complete. Equal demos, equal bytes.
+    """Writes a demo under a temporary name and renames it, so that files are complete. Equal demos, equal bytes.
 
     Raises:
         OSError: if the file cannot be written, as on a full disk; names it and the free space.
@@ -105,7 +105,7 @@ def write_demo(root: Path, demo: Demo, failures: int = 0) -> Entry:
 
 
 def what_is_wrong(root: Path, entry: Entry) -> str | None:
-    """None for a file with the manifest's checksum, or else what is the matter, for a message."""
+    """Returns None for a file with the manifest's checksum, or else what is wrong, for a message."""
     try:
         data = (root / entry.file).read_bytes()
     except OSError as error:
@@ -123,7 +123,7 @@ _HEADERS = threading.Lock()
 
 
 def _read_arrays(data: bytes, entry: Entry) -> dict[str, np.ndarray]:
-    """The arrays of an npz file, by name; what it announces is compared with the manifest before it is unpacked.
+    """Reads the arrays of an npz file, by name; compares its header with the manifest before it is unpacked.
 
     NumPy reads headers with ``ast.literal_eval``, which in Python 3.11 fails now and then where threads do it at a
     time ("AST constructor recursion depth mismatch", CPython issue 106905). So headers are read one after the other,
@@ -131,7 +131,7 @@ def _read_arrays(data: bytes, entry: Entry) -> dict[str, np.ndarray]:
     """
     arrays = {}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        _refuse_other_arrays(archive, entry)
+        _check_arrays(archive, entry)
         for member in archive.namelist():
             stream = io.BytesIO(archive.read(member))
             with _HEADERS:
@@ -139,7 +139,7 @@ def _read_arrays(data: bytes, entry: Entry) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _refuse_other_arrays(archive: zipfile.ZipFile, entry: Entry) -> None:
+def _check_arrays(archive: zipfile.ZipFile, entry: Entry) -> None:
     """Looks at the headers alone: the rest could be of any size.
 
     Raises:
@@ -172,7 +172,7 @@ class _OtherShape(ValueError):
 
 
 def read_demo(root: Path, entry: Entry) -> Demo:
-    """Read a demo and compare it with its line in the manifest.
+    """Reads a demo and compares it with its line in the manifest.
 
     Raises:
         FileNotFoundError: if the file is missing.
@@ -221,7 +221,7 @@ def read_demo(root: Path, entry: Entry) -> Demo:
 
 
 def read_manifest(root: Path, *, skip_damaged: bool = False) -> dict[int, Entry]:
-    """Entries by demo number, ascending; empty without a manifest. A last line that a kill cut off is not written yet.
+    """Returns entries by demo number, ascending; empty without a manifest. A truncated last line is left out.
 
     Args:
         root: folder of the demos.
@@ -279,12 +279,12 @@ def _entry(line: str) -> Entry:
 
 
 def write_manifest(root: Path, entries: Iterable[Entry]) -> None:
-    """Write the whole manifest, in the demos' order, at once."""
+    """Writes the whole manifest, in the demos' order, at once."""
     write_text(root / MANIFEST, "".join(map(_line, sorted(entries, key=lambda entry: entry.demo))))
 
 
 def append_to_manifest(root: Path, entry: Entry) -> None:
-    """Add a demo that was just written.
+    """Adds a demo that was just written.
 
     Raises:
         OSError: if it cannot be added, as on a full disk; the manifest is then as it was.
@@ -304,12 +304,12 @@ def append_to_manifest(root: Path, entry: Entry) -> None:
 
 
 def write_options(root: Path, options: dict) -> None:
-    """Write what all demos of the folder follow from."""
+    """Writes what all demos of the folder follow from."""
     write_text(root / COLLECTION, json.dumps(options, indent=1) + "\n")
 
 
 def read_options(root: Path) -> dict | None:
-    """What :func:`write_options` wrote, or None.
+    """Reads the result of :func:`write_options`, or returns None.
 
     Raises:
         ValueError: if the file is damaged.

@@ -104,7 +104,7 @@ class UR5ExperienceReplay(EpisodeReplay):
         )
 
     def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:
-        """From the sums that the cache keeps of each picture."""
+        """Returns them from the sums that the cache keeps of each picture."""
         shots = self._frame[index]
         shots = shots[shots >= 0]
         if not len(shots):

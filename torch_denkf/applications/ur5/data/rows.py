@@ -27,13 +27,13 @@ class UR5Episode(Episode):
 
 
 def is_for_tests(demo: int) -> bool:
-    """Whether a demo is in the fifth of all numbers that is for tests, by a hash: no option moves a demo."""
+    """Returns True for demos of the test split: a fifth of all numbers, by a hash that no option changes."""
     digest = hashlib.sha256(f"ur5 demo {demo}".encode()).digest()
     return int.from_bytes(digest[:8], "big") % 5 == 0
 
 
 def demo_rows(rows: TensorDictBase) -> TensorDict:
-    """Rows of all demos with the keys of data sets.
+    """Returns rows of all demos with the keys of data sets.
 
     Args:
         rows: see :func:`torch_denkf.applications.ur5.data.cache.read_demos`.
@@ -42,7 +42,7 @@ def demo_rows(rows: TensorDictBase) -> TensorDict:
 
 
 def demo_episodes(rows: TensorDictBase, entries: Sequence[Entry]) -> list[UR5Episode]:
-    """What these rows are."""
+    """Returns the episodes that rows consist of."""
     episodes, start = [], 0
     for entry in entries:
         task = TASKS[int(rows["task"][start])]

@@ -47,7 +47,7 @@ def collect_ur5_demos(
     is left out, and the demo's next seed is drawn; the manifest counts these failures.
 
     Args:
-        root: the folder, made if missing. Another collection's is refused.
+        root: the folder, made if missing. Another collection's raises an error.
         demos: how many the folder shall have. A larger number than before goes on where the last one ended.
         size: (H, W) of the pictures.
         frames: random steps of each demo to draw; 0 for all, None for no pictures (no OpenGL is needed then).

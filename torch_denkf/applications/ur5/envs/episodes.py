@@ -24,7 +24,7 @@ DRAWS = 20  # episodes tried for a demo; the expert seldom fails
 
 @dataclass(frozen=True)
 class Options:
-    """What a demo follows from, besides its number."""
+    """Settings of a demo, besides its number."""
 
     size: tuple[int, int]
     frames: int | None
@@ -50,7 +50,7 @@ class Options:
 
 
 def make_demos(root: Path, options: Options, numbers: list[int], processes: int) -> Iterator[Entry]:
-    """Write demos of these numbers and yield their entries as they get done, in any order.
+    """Writes demos of these numbers and yields their entries as they get done, in any order.
 
     Raises:
         RuntimeError: without OpenGL, if a demo fails again and again, or if a worker is killed.
@@ -106,7 +106,7 @@ def _task(options: Options, number: int) -> TaskName:
 
 
 def _episode(options: Options, number: int, attempt: int) -> Demo | None:
-    """One episode, None if the task is not done at its end."""
+    """Returns one episode, None if the task is not done at its end."""
     task, length = _task(options, number), options.max_steps
     if (options, task) not in _envs:
         _envs[options, task] = UR5TableEnv(

@@ -35,7 +35,7 @@ class UR5TableEnv(Checked, EnvBase):
     ===================== =========== =============================================================================
     ``pixels``            [3,H,W]     float32 in [0, 1] (or uint8), from in front of the table; unless
                                       ``from_pixels=False``
-    ``observed``          [1]         bool, beside ``pixels``: this step was drawn (see ``render_at``); what was not
+    ``observed``          [1]         bool, next to ``pixels``: this step was drawn (see ``render_at``); what was not
                                       is zero
     ``state``             [10]        float32, the truth: J1..J6 rad; J7, the gripper's opening, from 0 (shut) to
                                       0.8 rad (85 mm); x, y, z m of the point between the finger tips, from the
@@ -75,7 +75,7 @@ class UR5TableEnv(Checked, EnvBase):
         from_pixels: whether to emit pixels.
         pixels_dtype: ``torch.float32``, in [0, 1], or ``torch.uint8``.
         render_at: the steps to draw (0 is the reset), for data sets that want few frames of many episodes: all if
-            None, those in a collection, or so many random ones, drawn anew at each reset. An attribute too.
+            None, those in a collection, or so many random ones, drawn again at each reset. An attribute too.
         max_steps: length of an episode. The expert's way takes 320 to 345 steps, however long the episode.
         seed: by default drawn from torch's generator.
         device: of all that is emitted.
@@ -232,7 +232,7 @@ class UR5TableEnv(Checked, EnvBase):
             ghosts = state.new_zeros(*state.shape[:-1], 0, state.shape[-1])
         elif ghosts.ndim != state.ndim + 1 or ghosts.shape[:-2] != state.shape[:-1] or ghosts.shape[-1] < 7:
             raise ValueError(
-                f"ghosts are [*N, G, S] beside a state [*N, S], not {list(ghosts.shape)} beside {list(state.shape)}"
+                f"ghosts are [*N, G, S] next to a state [*N, S], not {list(ghosts.shape)} next to {list(state.shape)}"
             )
         rows = state.detach().cpu().double().reshape(-1, state.shape[-1]).numpy()
         members = ghosts.detach().cpu().double().reshape(len(rows), *ghosts.shape[-2:]).numpy()

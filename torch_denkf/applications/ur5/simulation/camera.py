@@ -1,4 +1,4 @@
-"""What a camera makes of a picture: lens, motion blur and sensor noise."""
+"""Camera model: lens distortion, motion blur and sensor noise of a rendered picture."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["Camera", "distortion_map"]
 
 
 def distortion_map(size: tuple[int, int], k1: float, k2: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where each pixel of the distorted picture lies in the ideal one: x and y in pixels, ``[H, W]`` each.
+    """Maps each pixel of the distorted picture to the ideal one: x and y in pixels, ``[H, W]`` each.
 
     Brown's radial polynomial (1966) from the distorted to the ideal radius, ``r (1 - k1 r^2 - k2 r^4)``, which is the
     usual model's inverse to first order; r is one at the middle of the upper edge. Negative k1 is a barrel. The
@@ -38,13 +38,13 @@ class Camera:
         self._noise = noise
 
     def lens(self, picture: np.ndarray) -> np.ndarray:
-        """The picture ``[H, W, 3]`` as the lens bends it."""
+        """Returns the picture ``[H, W, 3]`` as the lens bends it."""
         if self._map is None:
             return picture
         return cv2.remap(picture, *self._map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def expose(self, pictures: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-        """One frame, uint8 ``[H, W, 3]``: the mean of the pictures, bent by the lens, with the sensor's noise."""
+        """Exposes one frame, uint8 ``[H, W, 3]``: the mean of the pictures, bent by the lens, with sensor noise."""
         if len(pictures) == 1 and self._map is None and not any(self._noise):
             return pictures[0]
         light = self.lens(np.stack(pictures).mean(0, dtype=np.float32) if len(pictures) > 1 else pictures[0])

@@ -1,4 +1,4 @@
-"""Where the UR5 stands: the simulator as it is, or a stand-in for a real laboratory."""
+"""Domains of the UR5: the simulator as it is, or a stand-in for a real laboratory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["DOMAINS", "Domain", "apply_domain", "light_of_episode"]
 
 @dataclass(frozen=True)
 class Domain:
-    """What the arm looks like and how it moves.
+    """Appearance and motion of the arm.
 
     Attributes:
         camera: position of the camera, m from the table's centre.
@@ -114,7 +114,7 @@ def light_of_episode(scene: UR5Scene, domain: Domain, factor: float) -> None:
 
 
 def _smooth(rng: np.random.Generator, height: int, width: int, cells: tuple[int, int]) -> np.ndarray:
-    """Noise in [0, 1] with so many cells down and across, interpolated."""
+    """Returns noise in [0, 1] with so many cells down and across, interpolated."""
     grid = rng.uniform(size=(cells[0] + 1, cells[1] + 1))
     y, x = np.linspace(0, cells[0], height, endpoint=False), np.linspace(0, cells[1], width, endpoint=False)
     i, j, fy, fx = y.astype(int), x.astype(int), (y % 1)[:, None], (x % 1)[None]
@@ -129,7 +129,7 @@ def _wood(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 def _clutter(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """A wall with shelves and posters: rectangles of all sizes and colours on a stained ground."""
+    """Returns a wall with shelves and posters: rectangles of all sizes and colours on a stained ground."""
     picture = 0.55 + 0.25 * (_smooth(rng, height, width, (6, 6))[..., None] - 0.5) + np.zeros(3)
     for _ in range(45):
         y, x = rng.integers(height), rng.integers(width)

@@ -23,7 +23,7 @@ class Unreachable(ValueError):
 
 @dataclass
 class Waypoint:
-    """Where the pinch point goes next: m from the table's centre, quaternion, J7 in rad, control steps it takes."""
+    """Next pose of the pinch point: m from the table's centre, quaternion, J7 in rad, control steps it takes."""
 
     position: np.ndarray
     rotation: np.ndarray
@@ -32,12 +32,12 @@ class Waypoint:
 
 
 def minimum_jerk(tau: np.ndarray) -> np.ndarray:
-    """The share of the way at the share ``tau`` of the time, at rest at both ends (Flash and Hogan 1985, eq. 6)."""
+    """Returns the share of the way at the share ``tau`` of the time, at rest at its ends (Flash and Hogan 1985)."""
     return tau**3 * (10 - 15 * tau + 6 * tau**2)
 
 
 def tool_down(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
-    """Quaternion of a tool that points down, tilted about the fingers' way (pitch) and across it (roll), in rad."""
+    """Returns the quaternion of a tool that points down, tilted about the fingers' way (pitch) and across (roll)."""
     out = np.array([0.0, 1.0, 0.0, 0.0])  # half a turn about x: z down
     for angle, axis in ((roll, (0, 1, 0)), (pitch, (1, 0, 0)), (yaw, (0, 0, 1))):
         turn, product = np.empty(4), np.empty(4)
@@ -86,7 +86,7 @@ def inverse_kinematics(
 
 
 def plan_path(scene: UR5Scene, start: np.ndarray, waypoints: list[Waypoint], steps: int) -> np.ndarray:
-    """Joint targets ``[steps, 7]`` from the joints ``start`` through the waypoints; the last one is held.
+    """Plans joint targets ``[steps, 7]`` from the joints ``start`` through the waypoints; holds the last one.
 
     Each segment is a straight line of the pinch point with a turn at an even rate, at minimum jerk in time.
 

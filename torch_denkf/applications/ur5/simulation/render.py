@@ -25,7 +25,7 @@ def _close_all() -> None:
 
 
 def _context_class() -> type:
-    """MuJoCo's context for ``MUJOCO_GL``; EGL where neither that nor a display is set.
+    """Returns MuJoCo's context for ``MUJOCO_GL``; EGL where neither that nor a display is set.
 
     ``mujoco`` reads the variable once, when it is imported, and torchrl imports it early; here it counts when the
     first picture is made.
@@ -99,7 +99,7 @@ class Renderer:
         ghosts: Iterable[mujoco.MjData] = (),
         groups: Collection[int] = (PLAIN, GHOSTS, SCENERY),
     ) -> np.ndarray:
-        """The picture ``[H, W, 3]``, uint8, of the positions in ``data`` (after ``mj_kinematics``).
+        """Returns the picture ``[H, W, 3]``, uint8, of the positions in ``data`` (after ``mj_kinematics``).
 
         Args:
             data: what is drawn as it is.

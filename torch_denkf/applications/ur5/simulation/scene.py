@@ -49,29 +49,29 @@ class UR5Scene:
     # ------------------------------------------------------------------------------------------------ what is there
 
     def state(self, data: mujoco.MjData | None = None) -> np.ndarray:
-        """The ten numbers: J1..J6 in rad, the opening J7 in rad, the pinch point from the table's centre in m."""
+        """Returns ten numbers: J1..J6 in rad, the opening J7 in rad, the pinch point from the table's centre in m."""
         data = self.data if data is None else data
         opening = data.qpos[self.finger_qpos].mean() * (FULL_OPENING / FINGER_TRAVEL)
         tool = data.site_xpos[self.pinch] - data.site_xpos[self.centre]
         return np.concatenate([data.qpos[self.arm_qpos], [opening], tool])
 
     def object_position(self) -> np.ndarray:
-        """The object's centre from the table's centre, m ``[3]``."""
+        """Returns the object's centre from the table's centre, m ``[3]``."""
         return self.data.xpos[self.object_body] - self.data.site_xpos[self.centre]
 
     def object_upright(self) -> float:
-        """Cosine of the angle between the object's axis and the vertical."""
+        """Returns the cosine of the angle between the object's axis and the vertical."""
         return float(self.data.xmat[self.object_body, 8])
 
     def pose_with(self, joints: np.ndarray) -> np.ndarray:
-        """The present ``qpos`` with other joints ``[7]`` (rad)."""
+        """Returns the present ``qpos`` with other joints ``[7]`` (rad)."""
         qpos = self.data.qpos.copy()
         qpos[self.arm_qpos] = joints[:6]
         qpos[self.finger_qpos] = np.clip(joints[6] / FULL_OPENING, 0, 1) * FINGER_TRAVEL
         return qpos
 
     def posed(self, qpos: np.ndarray) -> mujoco.MjData:
-        """The scratch data in this pose, for kinematics and pictures."""
+        """Returns the scratch data in this pose, for kinematics and pictures."""
         self.scratch.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self.scratch)
         return self.scratch
@@ -112,7 +112,7 @@ class UR5Scene:
             mujoco.mj_resetData(self.model, data)
 
     def reset(self, joints: np.ndarray, position: np.ndarray, rotation: np.ndarray, settle: int = 0) -> None:
-        """Starts anew, at rest, with these joints ``[7]`` and the object there (quaternion).
+        """Resets the scene, at rest, with these joints ``[7]`` and the object there (quaternion).
 
         Args:
             joints: rad, true ones; the commands are theirs less the offset.
@@ -138,7 +138,7 @@ class UR5Scene:
         self.poses = [self.data.qpos.copy()] * CHUNKS
 
     def step(self, action: np.ndarray) -> None:
-        """One control step of 0.08 s towards the commanded joints and opening ``[7]``, no faster than a UR5 can."""
+        """Runs one control step of 0.08 s to the commanded joints and opening ``[7]``, at a UR5's speed at most."""
         low, high = self.target.copy(), self.target.copy()
         low[:6] -= JOINT_SPEED
         high[:6] += JOINT_SPEED

@@ -54,7 +54,7 @@ def draw_episode(scene: UR5Scene, task: TaskName, rng: np.random.Generator, step
 
 
 def succeeded(scene: UR5Scene, task: TaskName, episode: Episode) -> bool:
-    """Pick: lifted by 8 cm. Push: within 3 cm of the goal. Put-down: that too, standing, the gripper 7 cm away."""
+    """Returns True for a pick by 8 cm, a push to 3 cm from the goal, a put-down so, standing, the gripper 7 cm away."""
     position, height = scene.object_position(), episode.half_size[2]
     if task == "pick":
         return bool(position[2] - height > 0.08)
@@ -90,14 +90,14 @@ def _free_pose(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 def _home(scene: UR5Scene, rng: np.random.Generator, opening: float) -> np.ndarray:
     position, rotation = _free_pose(rng)
     start = READY.copy()
-    # The arm's plane lies 109 mm beside the base's axis.
+    # The arm's plane lies 109 mm next to the base's axis.
     x, y = position[0] + 0.55, position[1]
     start[0] = np.arctan2(y, x) - np.arcsin(min(0.9, 0.109 / np.hypot(x, y)))
     return np.append(inverse_kinematics(scene, position, rotation, start), opening)
 
 
 def _grasp(rng: np.random.Generator, kind: str, yaw: float) -> np.ndarray:
-    """A tool that closes on the object; a box is taken by one of its two pairs of sides."""
+    """Returns a tool that closes on the object; a box is taken by one of its two pairs of sides."""
     if kind == "box":
         turned = (yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4
         turned -= np.sign(turned) * rng.integers(2) * np.pi / 2
@@ -197,7 +197,7 @@ def _put_down(scene: UR5Scene, rng: np.random.Generator, steps: int) -> Episode:
 
 
 def _in_hand(scene: UR5Scene, joints: np.ndarray, hold: np.ndarray, half_size: np.ndarray, upright: np.ndarray):
-    """Pose of the object held at these joints, which stands ``upright`` where the tool is turned by ``hold``."""
+    """Returns the pose of the object held at these joints, ``upright`` if the tool is turned by ``hold``."""
     data = scene.posed(scene.pose_with(joints))
     tool, back, turn, rotation, offset = np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(3)
     mujoco.mju_mat2Quat(tool, data.site_xmat[scene.pinch])

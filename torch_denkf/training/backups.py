@@ -1,4 +1,4 @@
-"""Files of an earlier training that nobody can make again."""
+"""Backups of files of an earlier training."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["set_aside"]
+__all__ = ["back_up"]
 
 _LOG = logging.getLogger("torch_denkf")
 
 
-def set_aside(out: Path, files: Sequence[Path]) -> None:
+def back_up(out: Path, files: Sequence[Path]) -> None:
     """Moves files below a training's folder to ``out/earlier-1``, or the next number that is free, and logs it.
 
     Args:
@@ -22,7 +22,7 @@ def set_aside(out: Path, files: Sequence[Path]) -> None:
         >>> import tempfile
         >>> out = Path(tempfile.mkdtemp())
         >>> (out / "best_fit.pt").touch()
-        >>> set_aside(out, [out / "best_fit.pt"])
+        >>> back_up(out, [out / "best_fit.pt"])
         >>> (out / "earlier-1" / "best_fit.pt").is_file()
         True
     """

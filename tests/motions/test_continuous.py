@@ -11,17 +11,15 @@ from torch_denkf.functional import kalman_predict, kalman_update
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import (
     ConstantNoise,
-    ContinuousMotion,
-    ContinuousNoise,
     EnsembleAnalysis,
     GaussianPrior,
     LearnedTransition,
     MappedNoise,
     MomentPrior,
-    NoisePerSecond,
     Select,
     UKFTransition,
 )
+from torch_denkf.motions import ContinuousMotion, ContinuousNoise, NoisePerSecond
 
 DENSITY, R = 0.3, 0.2
 

@@ -4,7 +4,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.functional.checks import assert_compiled_is_eager
-from torch_denkf.functional.continuous import discretise
+from torch_denkf.motions.discretisation import discretise
 
 DRIFT = [[0.0, 1.0], [0.0, 0.0]]
 

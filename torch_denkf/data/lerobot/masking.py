@@ -1,4 +1,4 @@
-"""Rows of a recording that are not sound: kept in their place, masked and counted."""
+"""Masks invalid rows of a recording: they stay in their place, and are counted."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torch import Tensor
 
 from torch_denkf.data.times import MOST_WRONG, filled, sound
 
-__all__ = ["mask_rows", "sound_times"]
+__all__ = ["mask_invalid_rows", "repaired_times"]
 
 OFF = 0.25  # a share of 1 / fps, by which the usual step may be off
 _NUMBERS = ("state", "action")
 
 
-def sound_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times of an episode with values for those that are wrong, s, and which were right, bool; ``[n]`` each.
+def repaired_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray, np.ndarray]:
+    """Returns times of an episode with values for those that are wrong, s, and which were right, bool; ``[n]`` each.
 
     Args:
         times: as they are stored, s.
@@ -31,25 +31,25 @@ def sound_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray,
     try:
         times = np.asarray(times, np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{source}: a timestamp is no number ({error}); download it anew") from error
+        raise ValueError(f"{source}: a timestamp is no number ({error}); download it again") from error
     good = sound(times)
     wrong = np.flatnonzero(~good)
     if len(wrong) > MOST_WRONG * len(times):
         raise ValueError(
             f"{source}: the timestamp {times[wrong[0]]:g} of frame {wrong[0]} does not increase, nor do "
-            f"{len(wrong) - 1} others of {len(times)}; expected seconds that count frames, k / fps: download it anew, "
-            "or write them anew"
+            f"{len(wrong) - 1} others of {len(times)}; expected seconds that count frames, k / fps: download it again, "
+            "or write them again"
         )
     step = float(np.median(np.diff(times[good]))) if good.sum() > 1 else 1 / fps
     if abs(step * fps - 1) > OFF:
         raise ValueError(
             f"{source}: timestamps are {step:.4g} s apart, but fps in meta/info.json is {fps:g}, which makes "
-            f"{1 / fps:.4g} s; correct fps there, or write the timestamps anew"
+            f"{1 / fps:.4g} s; correct fps there, or write the timestamps again"
         )
     return (filled(times, good, 1 / fps) if len(wrong) else times), good
 
 
-def mask_rows(rows: TensorDict, stamped: Tensor | None, source: str) -> TensorDict:
+def mask_invalid_rows(rows: TensorDict, stamped: Tensor | None, source: str) -> TensorDict:
     """Masks rows whose numbers or times are not sound, where there are any.
 
     ``state`` and ``action`` of a row that are not finite hold those of the last row of the episode that are. The row is
@@ -87,7 +87,7 @@ def mask_rows(rows: TensorDict, stamped: Tensor | None, source: str) -> TensorDi
 
 
 def _last_sound(episode: Tensor, finite: Tensor, name: str, source: str) -> Tensor:
-    """For each row the last one of its episode that is finite, itself included, or else the next, ``[N]``."""
+    """Returns for each row the last one of its episode that is finite, itself included, or else the next, ``[N]``."""
     row = torch.arange(len(episode))
     lengths = torch.unique_consecutive(episode, return_counts=True)[1]
     first = (lengths.cumsum(0) - lengths).repeat_interleave(lengths)
@@ -99,7 +99,7 @@ def _last_sound(episode: Tensor, finite: Tensor, name: str, source: str) -> Tens
     if bool(empty.any()):
         number = int(episode[empty][0])
         raise ValueError(
-            f"{source}: no row of episode {number} has a {name!r} that is finite; download it anew, or leave the "
+            f"{source}: no row of episode {number} has a {name!r} that is finite; download it again, or leave the "
             "episode out"
         )
     return index

@@ -9,7 +9,7 @@ from torch_denkf._checks import check_one_dtype, check_shape
 
 
 def discretise(drift: Tensor, density: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
-    r"""The step of :math:`dx = A x\,dt + d\beta`, where :math:`\beta` is a Brownian motion of spectral density D.
+    r"""Discretises :math:`dx = A x\,dt + d\beta`, where :math:`\beta` is a Brownian motion of spectral density D.
 
     .. math:: F = e^{A \Delta t}, \quad Q = \int_0^{\Delta t} e^{A s} D e^{A^T s} ds
 

@@ -1,4 +1,4 @@
-"""The rows that lie between a recording's pictures and its states."""
+"""Estimates the latency between a recording's pictures and its states, in rows."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def lag_errors(
     components: int = 150,
     folds: int = 5,
 ) -> dict[int, float]:
-    """How well pictures predict the states that are recorded some rows later, for each of some lags.
+    """Returns the error of predicting, from pictures, states that are recorded some rows later, for each lag.
 
     The camera and the joints of a robot reach the recorder by different ways, and one may be later than the other. The
     lag is where the error is smallest: ``lag = min(errors, key=errors.get)``, which
@@ -91,13 +91,13 @@ def lag_errors(
 
 
 def _small_pictures(data: LeRobotReplay, index: Tensor) -> Tensor:
-    """Grey pictures of some rows, ``[n, pixels]``."""
+    """Returns grey pictures of some rows, ``[n, pixels]``."""
     parts = [adaptive_avg_pool2d(data[rows]["pixels"].mean(1, keepdim=True), _SMALL) for rows in index.split(256)]
     return torch.cat(parts).flatten(1)
 
 
 def _principal_components(pictures: Tensor, count: int) -> Tensor:
-    """Of variance one, ``[n, count or less]``."""
+    """Returns principal components with variance one, ``[n, count or less]``."""
     pictures = pictures - pictures.mean(0)
     count = min(count, len(pictures) // 2, pictures.shape[-1])
     values, vectors = torch.linalg.eigh((pictures.mT @ pictures).double() / len(pictures))

@@ -8,9 +8,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_covariance, check_square, check_values
-from torch_denkf.functional.continuous import discretise
 from torch_denkf.modules.around import Wrapper
 from torch_denkf.modules.tensors import as_floating, register_constant
+from torch_denkf.motions.discretisation import discretise
 from torch_denkf.submodel import SubModel, Transition
 
 __all__ = ["ContinuousMotion", "ContinuousNoise", "NoisePerSecond"]
@@ -53,7 +53,7 @@ class ContinuousMotion(Transition):
         register_constant(self, "drift", drift, trainable=trainable)
 
     def compute(self, ensemble, dt):
-        """The forecast ensemble."""
+        """Returns the forecast ensemble."""
         motion, _ = discretise(self.drift, torch.zeros_like(self.drift), dt.to(self.drift.dtype))
         return ensemble @ motion.mT
 
@@ -93,7 +93,7 @@ class ContinuousNoise(SubModel):
         register_constant(self, "density", density)
 
     def compute(self, dt):
-        """The covariance."""
+        """Returns the covariance."""
         drift = self.module.drift
         return discretise(drift, self.density, dt.to(drift.dtype))[1]
 
@@ -123,7 +123,7 @@ class NoisePerSecond(Wrapper):
         self.dt_key = dt_key
 
     def on_entries(self, entries, call):
-        """The variances or the covariance of the step."""
+        """Returns the variances or the covariance of the step."""
         written, key = self.run_inside(entries, call), self.out_keys[0]
         noise, dt = written[key], self.required(entries, self.dt_key)
         return {**written, key: noise * (dt if noise.ndim == dt.ndim else dt.unsqueeze(-1)).to(noise.dtype)}

@@ -1,0 +1,217 @@
+"""The belief of a later moment. Oracle: the Kalman filter's forecast in closed form, with known inputs."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import RenameTransform, TransformedEnv, check_env_specs
+from torchrl.modules.utils import get_env_transforms_from_module
+
+from tests.filters.factories import assert_equal, linear_system, toy_denkf
+from tests.objectives.test_kept_noise import log_ratio, make_policy, toy_fused, toy_particles
+from tests.transforms.envs_for_tests import toy_base_env
+from torch_denkf import DEnKF, DEnKFTransform, KalmanFilter, LinearGaussianEnv
+from torch_denkf.envs import LateActions
+from torch_denkf.fusion import BeliefAhead, FusedFilter, FusedSensor
+from torch_denkf.modules import (
+    ConstantNoise,
+    GaussianPrior,
+    LearnedTransition,
+    LinearObservation,
+    LinearTransition,
+    MomentPrior,
+    Select,
+)
+
+pytestmark = pytest.mark.usefixtures("float64")
+
+K = 3
+B_ = [[0.5], [-1.0]]
+NEXT = ("under_way", "action")
+
+
+def kalman(**options):
+    F, Q, H, R = linear_system()
+    start = {"mean": torch.tensor([0.5, -0.25]), "cov": torch.eye(2)}
+    return KalmanFilter(F, H, process_noise_cov=Q, noise=R.sqrt(), control=torch.tensor(B_), **start, **options)
+
+
+def ensemble(**options):
+    F, Q, H, R = linear_system()
+    motion = LearnedTransition(
+        lambda x: x @ torch.cat([F, torch.tensor(B_)], -1).mT, residual=False, action_key="action"
+    )
+    start = GaussianPrior([0.5, -0.25], [1.0, 1.0], ensemble_size=12)
+    noise = ConstantNoise(R.sqrt(), in_key="observation")
+    parts = {"initial": start, "process_noise": Q.diagonal().sqrt().tolist(), "observation_key": "observation"}
+    return DEnKF(motion, None, LinearObservation(H), noise, **parts, **options)
+
+
+def fused(**options):
+    """The second reading is two steps late."""
+    F, Q, H, R = linear_system()
+    sensors = {
+        "observation": FusedSensor(LinearObservation(H), R.sqrt()),
+        "late": FusedSensor(Select([0]), [0.3], delay=2),
+    }
+    start = MomentPrior(torch.tensor([0.5, -0.25]), torch.eye(2))
+    return FusedFilter(LinearTransition(F, Q, control=torch.tensor(B_)), sensors, initial=start, **options)
+
+
+def recorded(steps=6):
+    data = TensorDict({"observation": torch.randn(4, steps, 2), "late": torch.randn(4, steps, 1)}, [4, steps])
+    actions = torch.randn(4, steps + K, 1)
+    return data.set("action", actions[:, :steps]).set(
+        NEXT, torch.stack([actions[:, k : k + steps] for k in range(K)], 2)
+    )
+
+
+def moments(filter, out):
+    mean = out["belief", "mean"]
+    if "cov" in out["belief"]:
+        return mean, out["belief", "cov"]
+    away = out["belief", "ensemble"] - mean.unsqueeze(-2)
+    return mean, away.mT @ away / (away.shape[-2] - 1)
+
+
+def closed_form(mean, cov, actions, noise):
+    """F m + B a and F P F^T + Q, so many times."""
+    F, B = linear_system()[0], torch.tensor(B_)
+    for a in actions.unbind(-2):
+        mean, cov = mean @ F.mT + a @ B.mT, F @ cov @ F.mT + noise
+    return mean, cov
+
+
+@pytest.mark.parametrize("make", [kalman, ensemble, fused])
+def test_a_forecast_through_known_inputs(make):
+    """From each element of a sequence; of the members, whose draws are exact, mean and variances."""
+    filter, Q = make(), linear_system()[1]
+    noise = Q.diagonal().diag() if make is ensemble else Q
+    out = BeliefAhead(filter, K)(filter.sequence(recorded()))
+    mean, cov = moments(filter, out)
+    expected, wide = closed_form(mean, cov, out[NEXT], noise)
+    tolerance = {"rtol": 0, "atol": 2e-3 if make is ensemble else 1e-12}
+    torch.testing.assert_close(out["ahead", "belief", "mean"], expected, **tolerance)
+    torch.testing.assert_close(out["ahead", "belief", "var"], wide.diagonal(dim1=-2, dim2=-1), **tolerance)
+
+
+def test_beliefs_of_a_chunk_and_rows_that_look_less_far():
+    filter = kalman()
+    out = filter.sequence(recorded())
+    each = BeliefAhead(filter, K, each=True)(out.copy())["ahead", "belief", "mean"]
+    steps = torch.randint(K + 1, (4, 6, 1))
+    found = BeliefAhead(filter, "delay", most=K)(out.copy().set("delay", steps))["ahead", "belief", "mean"]
+    in_seconds = BeliefAhead(filter, "delay", most=0.3, dt=0.1)(out.copy().set("delay", 0.1 * steps))
+    all_means = torch.cat([out["belief", "mean"].unsqueeze(2), each], 2)
+    expected = all_means.gather(2, steps.unsqueeze(-1).expand(4, 6, 1, 2)).squeeze(2)
+    torch.testing.assert_close(found, expected, rtol=0, atol=0)
+    torch.testing.assert_close(in_seconds["ahead", "belief", "mean"], expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("seconds", [0.2, 0.25])
+def test_a_transition_that_knows_the_length_of_its_step(seconds):
+    """x' = x + dt (speed): .25 s are two steps of .1 s and a half one."""
+    moves = torch.nn.Linear(1, 1)
+    moves.weight.data, moves.bias.data = torch.zeros(1, 1), torch.tensor([2.0])
+    filter = DEnKF(
+        LearnedTransition(moves, dt_key="dt"),
+        None,
+        Select([0]),
+        ConstantNoise([0.5], in_key="observation"),
+        initial=GaussianPrior([0.0], [1.0], ensemble_size=4),
+        observation_key="observation",
+    )
+    now = filter.initialise({"dt": [0.04], "observation": [0.0]})
+    out = BeliefAhead(filter, seconds, dt=0.1, dt_key="dt")(now)
+    torch.testing.assert_close(out["ahead", "belief", "mean"], out["belief", "mean"] + 2 * seconds)
+
+
+def late_world(filter, **transform):
+    F, Q, H, R = linear_system()
+    stds = Q.diagonal().sqrt(), R.sqrt()
+    env = LinearGaussianEnv(F, H, *stds, control=torch.tensor(B_), batch_size=[3], max_steps=[4, 9, 9])
+    env = TransformedEnv(env, LateActions(K))
+    if filter is not None:
+        env.append_transform(DEnKFTransform(filter, ahead=BeliefAhead(filter, K), **transform))
+    return env
+
+
+def test_an_environments_actions_run_late_and_rows_start_anew():
+    """The state itself follows the actions of K steps before, without noise."""
+    F, _, H, _ = linear_system()
+    env = LinearGaussianEnv(F, H, [0.0] * 2, [0.0] * 2, control=torch.tensor(B_), batch_size=[3], max_steps=[4, 9, 9])
+    data = TransformedEnv(env, LateActions(K)).rollout(9, break_when_any_done=False)
+    ran = torch.cat([torch.zeros(3, K, 1), data["action"][:, :-K]], 1)
+    ran[0, 4 : 4 + K] = ran[0, 8] = 0  # begins anew, without the actions of before
+    assert data[NEXT][:, :, 0].equal(ran)
+    expected = data["state"] @ F.mT + ran @ torch.tensor(B_).mT
+    torch.testing.assert_close(data["next", "state"], expected)
+
+
+@pytest.mark.parametrize("options", [{}, {"prefix": "imu"}])
+def test_the_transform_looks_ahead_as_a_sequence_does(options):
+    filter = kalman(update_at_reset=True, **options)
+    env = late_world(filter)
+    check_env_specs(env)
+    data = env.rollout(9, break_when_any_done=False)  # a row starts anew within it, twice
+    rows = data.select("observation", "observed", NEXT, ("next", "done")).set("action", data[NEXT][:, :, 0])
+    expected = BeliefAhead(filter, K)(filter.sequence(rows))
+    keys = [("ahead", *filter.outer(("belief", name))) for name in ("mean", "var")]
+    assert_equal(data, expected, keys, atol=1e-12)
+    assert_equal(data[1:, :-1]["next"], expected[1:, 1:], keys, atol=1e-12)
+
+
+def test_members_need_not_be_stored():
+    data = late_world(ensemble(), store_ensemble=False).rollout(4)
+    assert data["ahead", "belief", "mean"].isfinite().all()
+
+
+@pytest.mark.parametrize("make", [toy_denkf, toy_particles, toy_fused])
+def test_a_policy_that_reads_it_has_a_log_ratio_of_zero(make):
+    """Its draws are kept, too; slices begin anywhere, rows reset inside."""
+    filter = make()
+    ahead = BeliefAhead(filter, 2, keep=[("belief", "mean")])
+    policy = make_policy(filter, ahead, key=("ahead", "belief", "mean"))
+    env = toy_base_env(batch_size=[3], max_steps=[4, 6, 20])
+    env = TransformedEnv(env, RenameTransform(["observation"], ["measurement"]))
+    env.append_transform(LateActions(2))
+    with torch.no_grad():
+        env = TransformedEnv(env, get_env_transforms_from_module(policy))
+        data = env.rollout(12, policy, break_when_any_done=False)
+    assert log_ratio(policy, data.reshape(-1, 4)).abs().max() < 1e-9
+    anew = data.exclude(("ahead", "drawn"))
+    assert log_ratio(policy, anew.reshape(-1, 4)).std() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"ahead": "delay"}, "say its largest value"),
+        ({"ahead": 0.25, "dt": 0.1}, "2.50 steps"),
+        ({"ahead": 2, "dt_key": "dt"}, "give the usual one"),
+        ({"ahead": 0}, "ahead"),
+    ],
+)
+def test_numbers_that_do_not_fit_raise(options, match):
+    with pytest.raises(ValueError, match=match):
+        BeliefAhead(kalman(), **options)
+
+
+def test_what_is_missing_is_named():
+    filter = kalman()
+    out = filter.sequence(recorded())
+    with pytest.raises(KeyError, match="under_way"):
+        BeliefAhead(filter, K)(out.exclude("under_way"))
+    with pytest.raises(ValueError, match="3 actions"):
+        BeliefAhead(filter, K + 1)(out)
+    with pytest.raises(ValueError, match="from 0 to most=2"):
+        BeliefAhead(filter, "delay", most=2)(out.set("delay", torch.full((4, 6, 1), 3)))
+    with pytest.raises(KeyError, match="keep names"):
+        BeliefAhead(filter, K, keep=["ensemble"])
+
+
+def test_an_analysis_of_samples_can_do_without_them():
+    """``predict`` with the scheme ``"sensor"``: the belief is the forecast."""
+    filter = toy_denkf()
+    row = filter.initialise(TensorDict({"measurement": torch.randn(3, 4), "action": torch.randn(3, 2)}, [3]))
+    out = filter.predict(row)
+    torch.testing.assert_close(out["belief", "ensemble"], out["forecast", "ensemble"], rtol=0, atol=0)
