@@ -42,6 +42,12 @@ COLUMNS = Columns(
 )
 IMU, PLACE = "gyro, accelerometer", "and that it stays about a place"
 COMPASS, FEET = "and a magnetometer", "and the standing foot"
+#: Name, kind and members of the filters of several sensors.
+FUSED = (
+    ("FusedFilter, EKF", "EKF", 64),
+    ("FusedFilter, DEnKF, 32 members", "etkf", 32),
+    ("FusedFilter, DEnKF, 64 members", "etkf", 64),
+)
 
 
 @dataclass(frozen=True)
@@ -160,32 +166,29 @@ def library_rows(
         for label, options in (("", {}), (", significance", significance)):
             model = attitude_filter("etkf", gyro, up_noise, members=members, **options)
             yield scored(IMU, f"DEnKF, {members} members{label}", model, **up)
-    model = attitude_filter("etkf", gyro, learned, **significance)
-    yield scored(IMU, "DEnKF, 64 members, significance, learned noise", model)
+    yield scored(IMU, "DEnKF, 64 members, learned noise", attitude_filter("etkf", gyro, learned))
     yield scored(IMU, "RTS smoother", RTSSmoother(attitude_filter("EKF", gyro, up_noise)), "smoothed", **up)
     yield scored(IMU, "RTS smoother, learned noise", RTSSmoother(learns), "smoothed")
     if smoke:
         return
-    model = EnRTS(attitude_filter("etkf", gyro, up_noise, **significance))
-    yield scored(IMU, "EnRTS, 64 members, significance", model, "smoothed", **up)
+    yield scored(IMU, "EnRTS, 64 members", EnRTS(attitude_filter("etkf", gyro, up_noise)), "smoothed", **up)
     rest = {"setting": rest_noise}
-    models = {kind: inertial_filter(kind, gyro, rest_noise) for kind in ("EKF",)}
-    models["DEnKF, 64 members, significance"] = inertial_filter("etkf", gyro, rest_noise, **significance)
-    for kind, model in models.items():
-        yield scored(PLACE, f"FusedFilter, {kind}", model, **rest)
-    yield scored(PLACE, "RTS smoother", RTSSmoother(models["EKF"]), "smoothed", **rest)
+    for label, kind, members in FUSED:
+        yield scored(PLACE, label, inertial_filter(kind, gyro, rest_noise, members=members), **rest)
+    model = RTSSmoother(inertial_filter("EKF", gyro, rest_noise))
+    yield scored(PLACE, "RTS smoother", model, "smoothed", **rest)
     if "magnetometer" in data:
-        for kind, label, options in (("EKF", "EKF", {}), ("etkf", "DEnKF, 64 members, significance", significance)):
-            model = attitude_filter(kind, gyro, up_noise, magnetometer=True, **options)
-            yield scored(COMPASS, f"FusedFilter, {label}", model, **up)
-        model = inertial_filter("EKF", gyro, rest_noise, magnetometer=True)
-        yield scored(f"{PLACE}, {COMPASS}", "FusedFilter, EKF", model, **rest)
+        for label, kind, members in FUSED:
+            model = attitude_filter(kind, gyro, up_noise, members=members, magnetometer=True)
+            yield scored(COMPASS, label, model, **up)
+        for label, kind, members in FUSED:
+            model = inertial_filter(kind, gyro, rest_noise, members=members, magnetometer=True)
+            yield scored(f"{PLACE}, {COMPASS}", label, model, **rest)
     if "leg" in data:
-        model = inertial_filter("EKF", gyro, rest_noise, feet=True)
-        yield scored(FEET, "FusedFilter, EKF", model)
-        yield scored(FEET, "RTS smoother", RTSSmoother(model), "smoothed")
-        model = inertial_filter("etkf", gyro, rest_noise, feet=True, **significance)
-        yield scored(FEET, "FusedFilter, DEnKF, 64 members, significance", model)
+        for label, kind, members in FUSED:
+            yield scored(FEET, label, inertial_filter(kind, gyro, rest_noise, members=members, feet=True))
+        model = RTSSmoother(inertial_filter("EKF", gyro, rest_noise, feet=True))
+        yield scored(FEET, "RTS smoother", model, "smoothed")
 
 
 def chosen(make: Callable, noises: Sequence[float], data: TensorDict, rows: slice) -> float:

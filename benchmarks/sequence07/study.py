@@ -27,7 +27,9 @@ LEVEL = 0.9  # of the intervals
 STEPS = (1, 10, 100)  # rows over which a relative motion is claimed
 EVERY = 40  # rows from one start of a relative motion to the next
 HELD = tuple(f"held_{step}" for step in STEPS)
-SCORES = ("translation", "rotation", *HELD, "ms")
+DRAWS = 5  # of an ensemble
+SPREADS = ("translation_spread", "rotation_spread")  # standard deviation over draws
+SCORES = ("translation", "rotation", *HELD, "ms", *SPREADS)
 COLUMNS = Columns(
     names=("condition", "filter", *SCORES),
     text=("condition", "filter"),
@@ -121,8 +123,12 @@ def and_one_more(data: TensorDict) -> TensorDict:
 def filter_rows(
     label: str, kind: str, data: TensorDict, poses: Tensor, smoother: str = "", **options
 ) -> Iterator[tuple[dict, Tensor, Claim]]:
-    """Of one filter, and of its smoother if it has a name: a row for each condition, its path ``[T, 7]``, its claim."""
+    """Of one filter, and of its smoother if it has a name: a row for each condition, its path ``[T, 7]``, its claim.
+
+    An ensemble's row is the mean over ``DRAWS``; the path is that of the first.
+    """
     around = EnRTS if kind == "DEnKF" else RTSSmoother
+    draws = DRAWS if kind == "DEnKF" else 1
     models = [car_filter(kind, again=again, **options) for again in (False, True)]
     some = prepared(data[:1, :50])
     began = time.process_time()
@@ -131,15 +137,24 @@ def filter_rows(
     if smoother:
         models = [around(model) for model in models]
     named = {"belief": label, "smoothed": smoother} if smoother else {"belief": label}
+    data = torch.cat([data] * draws)
     out = run(models[0], prepared(and_one_more(data)))
     part, true = windows(data, out["belief", "mean"], poses)
     found = run(models[1], part.flatten(0, 1)).unflatten(0, part.shape[:2])
     for number, condition in enumerate(CONDITIONS):
         for prefix, name in named.items():
-            path, claim = pose_of(out[number], prefix)[0], claimed(found[number], true, prefix)
-            row = {"condition": condition, "filter": name, **drift(path, poses)}
+            each = slice(number, None, len(CONDITIONS))
+            paths, claim = (
+                pose_of(out[each], prefix)[0],
+                claimed(found[each].flatten(0, 1), true.repeat(draws, 1, 1), prefix),
+            )
+            drifts = torch.tensor([list(drift(path, poses).values()) for path in paths])
+            row = {"condition": condition, "filter": name}
+            row |= dict(zip(("translation", "rotation"), drifts.mean(0).tolist(), strict=True))
+            if draws > 1:
+                row |= dict(zip(SPREADS, drifts.std(0).tolist(), strict=True))
             row |= dict(zip(HELD, claim.held().tolist(), strict=True))
-            yield row if prefix == "smoothed" else {**row, "ms": ms}, path, claim
+            yield row if prefix == "smoothed" else {**row, "ms": ms}, paths[0], claim
 
 
 def drift(path: Tensor, poses: Tensor) -> dict[str, float]:
@@ -168,7 +183,8 @@ def page(rows: Sequence[dict], seconds: float, count: int) -> str:
         "",
         f"Odometry sequence 07, {count} rows: stereo corners and turn rates. Errors are KITTI's own, in six "
         f"dimensions, over 100 to 800 m. *Held*: the share of errors within the {LEVEL:.0%} intervals, of the six "
-        f"numbers of the motion over 1, 10 and 100 rows; a start every {EVERY} rows.",
+        f"numbers of the motion over 1, 10 and 100 rows; a start every {EVERY} rows. Rows of ensembles are means over "
+        f"{DRAWS} draws, with their standard deviation.",
     ]
     titles = ("filter", "translation, %", "rotation, deg/100 m", *(f"held, {step}" for step in STEPS), "ms a row")
     for condition in CONDITIONS:
@@ -177,6 +193,8 @@ def page(rows: Sequence[dict], seconds: float, count: int) -> str:
             if row["condition"] == condition:
                 digits = {"translation": 2, "rotation": 2, **dict.fromkeys(HELD, 2), "ms": 1}
                 numbers = [f"{row[key]:.{places}f}" if key in row else "" for key, places in digits.items()]
+                for at, spread in enumerate(SPREADS):
+                    numbers[at] += f" ± {row[spread]:.2f}" if spread in row else ""
                 lines.append(line(row["filter"], *numbers))
     lines += [
         "",
@@ -205,8 +223,7 @@ def main() -> None:
     if study.ukf:
         models.append(("UKF", "UKF", "", {}))
     for members, smoother in ((32, ""), (64, "EnRTS, 64 members")):
-        options = {"members": members, "localisation": "significance"}
-        models.append((f"DEnKF, {members} members", "DEnKF", smoother, options))
+        models.append((f"DEnKF, {members} members", "DEnKF", smoother, {"members": members}))
     for row, path in alone(study, data, poses, count):
         rows.append(row)
         paths[row["condition"], row["filter"]] = path
