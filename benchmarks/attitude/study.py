@@ -174,16 +174,15 @@ def library_rows(
         yield scored(IMU, kind, attitude_filter(kind, gyro, up_noise), **up)
     learns = attitude_filter("EKF", gyro, learned)
     yield scored(IMU, "EKF, learned noise", learns)
-    significance = {"localisation": "significance"}
     for members in (32,) if smoke else (32, 64):
-        for label, options in (("", {}), (", significance", significance)):
-            model = attitude_filter("etkf", gyro, up_noise, members=members, **options)
-            yield scored(IMU, f"DEnKF, {members} members{label}", model, **up)
+        yield scored(IMU, f"DEnKF, {members} members", attitude_filter("etkf", gyro, up_noise, members=members), **up)
     yield scored(IMU, "RTS smoother", RTSSmoother(attitude_filter("EKF", gyro, up_noise)), "smoothed", **up)
     yield scored(IMU, "RTS smoother, learned noise", RTSSmoother(learns), "smoothed")
     if smoke:
         return
-    yield scored(IMU, "EnRTS, 64 members", EnRTS(attitude_filter("etkf", gyro, up_noise)), "smoothed", **up)
+    yield scored(
+        IMU, "EnRTS of the DEnKF, 64 members", EnRTS(attitude_filter("etkf", gyro, up_noise)), "smoothed", **up
+    )
     rest = {"setting": rest_noise}
     for label, kind, members in FUSED:
         yield scored(PLACE, label, inertial_filter(kind, gyro, rest_noise, members=members), **rest)
