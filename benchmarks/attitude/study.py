@@ -181,7 +181,7 @@ def library_rows(
     if smoke:
         return
     yield scored(
-        IMU, "EnRTS of the DEnKF, 64 members", EnRTS(attitude_filter("etkf", gyro, up_noise)), "smoothed", **up
+        IMU, "EnRTS, 64 members", EnRTS(attitude_filter("etkf", gyro, up_noise)), "smoothed", **up
     )
     rest = {"setting": rest_noise}
     for label, kind, members in FUSED:
