@@ -10,7 +10,6 @@ from benchmarks.lorenz96.learned import (
     forcing_of,
     learn,
     make_filter,
-    noise_of,
     observe,
     on_circle,
     simulate,
@@ -46,13 +45,6 @@ def test_a_large_ensemble_has_the_likelihood_and_the_gradient_of_the_kalman_filt
     # Seven steps, to each of which sampling adds a relative error of sqrt(2 / 40,000) = 0.007 of S.
     torch.testing.assert_close(-value, log_likelihood, rtol=0, atol=0.1)
     assert (estimate.grad + exact.grad).norm() < 0.03 * exact.grad.norm()
-
-
-def test_only_the_likelihood_counts():
-    loss = DEnKFLoss.ad_enkf(linear_denkf(), detach_every=5)
-    assert (loss.weights, loss.detach_every, loss.out_keys) == ({"nll": 1.0}, 5, ["loss_nll"])
-    assert "state" not in loss.in_keys
-    assert DEnKFLoss.ad_enkf(linear_denkf(), kl=0.1).weights == {"nll": 1.0, "kl": 0.1}
 
 
 # ------------------------------------------------------------------------------------------------------ tapering
@@ -127,13 +119,3 @@ def test_forcing_is_learned_from_observations_alone(start):
     # Of four seeds the largest error was 0.19: 400 steps do not tell F better.
     assert abs(path[-1] - 8.0) < 0.4
     assert abs(path[10] - 8.0) < abs(start - 8.0) / 2
-
-
-def test_model_noise_is_learned_towards_the_truth():
-    rng = torch.Generator().manual_seed(0)
-    record = observe(simulate(40, 400, 1, rng), 1, rng)
-    filter = make_filter(40, 1, 30, climate=climate_of(record), radius=5.0, learn_noise=True)
-    with torch.no_grad():
-        forcing_of(filter).fill_(8.0)
-    learn(filter, record, updates=60, rng=rng, batch=4, warm_up=5, window=10, detach_every=5, rate=0.3)
-    assert 0.1 < noise_of(filter).mean() < 0.3  # 0.2 is true, 1.0 was the start; four seeds gave 0.16 to 0.18

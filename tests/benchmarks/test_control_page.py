@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.control.page import ahead, page
+from benchmarks.control.page import ahead
 
 
 def row(arm, seed, value=0.0, steps=1000, seconds=1.0):
@@ -18,16 +18,3 @@ def test_arms_are_compared_with_each_seed_that_both_have(order):
     rows = own + others[::order]
     assert ahead(rows, "hike", "noise 0", "belief mean", "LSTM") == [9.0, 35.0]
     assert ahead(rows, "hike", "noise 0", "LSTM", "belief mean") == [-9.0, -35.0][::order]
-
-
-def test_seconds_of_an_arm_are_the_median_of_its_runs():
-    """Whole runs took 1, 2 and 9 s, and 3, 40 and 5 s; what they had taken at an earlier test does not count."""
-    taken = {"LSTM": (1.0, 2.0, 9.0), "belief mean": (3.0, 40.0, 5.0)}
-    rows = [
-        row(arm, seed, steps=steps, seconds=share * seconds)
-        for arm, all_seconds in taken.items()
-        for seed, seconds in enumerate(all_seconds)
-        for steps, share in ((500, 0.1), (1000, 1.0))
-    ]
-    below = page(rows).partition("Seconds of one core for a run")[2].splitlines()
-    assert [line for line in below if line.startswith("| ")] == ["| LSTM | belief mean |", "| 2 | 5 |"]

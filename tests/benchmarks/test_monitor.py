@@ -1,17 +1,12 @@
 """The study's scores, against closed forms and scikit-free counts."""
 
-from dataclasses import asdict
-from pathlib import Path
-
 import pytest
 import torch
 from tensordict import TensorDict
 
-from benchmarks.monitor.arm import ArmGuard
 from benchmarks.monitor.car import CarGuard, gates_of
-from benchmarks.monitor.drives import believed_spans, stretches
+from benchmarks.monitor.drives import believed_spans
 from benchmarks.monitor.scores import Run, afterwards, auroc, detection, false_alarms, spans_of
-from benchmarks.monitor.study import COLUMNS, Study, page
 from torch_denkf.applications.car.vision.poses import KITTI_DT
 from torch_denkf.applications.car.vision.signs import PICTURE_SIGNS, flow_signs
 
@@ -45,12 +40,6 @@ def test_detection_leaves_out_what_follows_a_fault():
     silent = detection([Run(torch.rand(40), torch.zeros(40, dtype=torch.bool), fault)])
     assert silent["delay_steps"] == float("inf")
     assert afterwards(torch.arange(40.0).unsqueeze(0), fault, 5).tolist() == [[30, 31, 32, 33, 34]]
-
-
-def test_faults_end_before_the_drive_does():
-    hit = stretches(200)
-    assert spans_of(hit) == [(40, 60), (100, 120), (160, 180)]
-    assert not stretches(51).any()
 
 
 def test_the_shortest_pair_that_is_believed():
@@ -96,22 +85,3 @@ def test_the_flow_takes_the_road_s_place_where_the_two_contradict():
     changed = (untouched["sensor", "ensemble"] != clean["sensor", "ensemble"]).flatten(1).any(-1)
     assert changed.float().mean() <= 0.011
     assert not gates.answered(reading(speed, plane, 0.9))["observed"].any()  # what the pictures show says no
-
-
-def test_a_page_of_every_kind_of_row(tmp_path):
-    rows = [
-        {"task": "ur5", "fault": "none", "false_alarms_per_1000": 0.5, "error": 1.0, "error_gated": 1.1},
-        {"task": "kitti-real", "fault": "black", "auroc": 0.98, "delay_steps": 1.0, "found": 1.0},
-    ]
-    rows[1] |= {"false_alarms_per_1000": 0.5, "error_ratio": 1.02, "false_steps_per_1000": 0.5}
-    COLUMNS.write(rows, tmp_path / "monitor.csv")
-    assert sorted(COLUMNS.read(tmp_path / "monitor.csv"), key=COLUMNS.order) == sorted(rows, key=COLUMNS.order)
-    text = page(rows, Study())
-    assert "| kitti-real | black | 0.98 | 1 | 1 | 0.5 | 1.020 |" in text
-
-
-def test_the_settings_are_those_that_the_trials_chose():
-    page = (Path(__file__).parents[2] / "benchmarks/monitor/results/choice.md").read_text()
-    for task, guard in (("car", CarGuard()), ("arm", ArmGuard())):
-        chosen = ", ".join(f"{name} {value:g}" for name, value in asdict(guard).items())
-        assert f"| {task}: chosen | {chosen} |" in page

@@ -1,6 +1,5 @@
 """The bars of the pages of results: their numbers are those of the studies' tables."""
 
-import cv2
 import pytest
 
 from benchmarks.common import overview
@@ -24,10 +23,3 @@ def test_bars_are_those_of_the_tables(study, bar, series, page, begins, column):
     row = next(line for line in lines if line.startswith(f"| {begins}"))
     written = row.split("|")[column].split()[0]
     assert study()[1][bar][series] == pytest.approx(float(written), abs=0.6 * 10 ** -len(written.partition(".")[2]))
-
-
-def test_draws_a_picture_for_each_page(tmp_path):
-    overview.main(tmp_path)
-    for study in overview.DRAWN:
-        assert (overview.PAGES / f"{study.__name__}.md").exists()
-        assert cv2.imread(str(tmp_path / f"{study.__name__}.png")).shape[1] == 600

@@ -9,10 +9,8 @@ from tensordict import TensorDict
 from benchmarks.ur5.demos import Roles
 from benchmarks.ur5.evaluation import blackout, errors, sensor_rows
 from benchmarks.ur5.motion import SIZE, with_rates
-from benchmarks.ur5.pictures import draw_all
 from benchmarks.ur5.readings import BLACK, Windows, blackouts, fail
 from benchmarks.ur5.sensors import SENSORS, TurnedWrist
-from benchmarks.ur5.tables import COLUMNS, markdown
 from tests.benchmarks.ur5_for_tests import states
 
 
@@ -21,11 +19,6 @@ def test_who_is_tested_is_not_trained_on():
         Roles({1}, [2, 3], [4], [3, 5])
     with pytest.raises(ValueError, match="its sensor has not seen"):
         Roles({1, 2}, [2], [4], [5])
-
-
-def test_pictures_need_beliefs(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no beliefs in"):
-        next(draw_all(tmp_path))
 
 
 # ------------------------------------------------------------------------------------------------ failing cameras
@@ -97,25 +90,3 @@ def test_a_perfect_sensor_has_no_error_where_it_sees():
 
 
 # ---------------------------------------------------------------------------------------------------------- tables
-
-
-def test_the_table_keeps_what_it_was_given(tmp_path):
-    scores = {"joint_mae_deg": 1.25, "ee_mae_cm": 0.25, "coverage90": 0.9, "ms_per_step": 2.0, "parameters": 7}
-    scores |= {f"J{i}_deg": 1.0 for i in range(1, 8)}
-    names = {"filter": "denkf", "sensor": "glimpse", "domain": "sim", "training": "sim", "seed": 0, "demos": 43}
-    rows = [{**names, **scores, "condition": c, "ensemble_size": 32} for c in ("clean", "black20", "missing")]
-    rows[1] |= {"blackout_joint_mae_deg": 2.0, "std_before_deg": 1.0, "std_blind_deg": 3.0, "std_after_deg": 1.1}
-    rows.append({**names, **scores, "condition": "clean", "ensemble_size": 8, "joint_mae_deg": 4.5})
-    rows[-1]["validation_crps"] = 1.5
-    COLUMNS.write(rows, tmp_path / "table.csv")
-
-    def place(row):
-        return row["condition"], row["ensemble_size"]
-
-    assert sorted(COLUMNS.read(tmp_path / "table.csv"), key=place) == sorted(rows, key=place)
-    assert (tmp_path / "table.csv").read_text().splitlines()[0] == ",".join(COLUMNS.names)
-    text = markdown(rows, "header")
-    assert "| sim | glimpse | denkf | 1.25 / 0.25 / 90 % |" in text
-    assert "| 8 | 1.500 | 4.50 | 0.250 | 90 % | 2.00 |" in text
-    assert "| 32 |  | 1.25 | 0.250 | 90 % | 2.00 |" in text
-    assert "| sim | sim | glimpse | denkf | 2.00 | 1.00 | 3.00 | 1.10 |" in text
