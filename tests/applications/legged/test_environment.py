@@ -11,8 +11,7 @@ from torch_denkf.applications.legged import QUADRUPED, LeggedErrors, quadruped_e
 from torch_denkf.applications.legged.environment import LeggedEnv
 from torch_denkf.applications.legged.humanoid import humanoid_env
 from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.applications.legged.motion import LeggedSpace
-from torch_denkf.functional.manifolds import SE3, SO3, rotate
+from torch_denkf.functional.manifolds import SO3, rotate
 from torch_denkf.motions.inertial import move_inertially
 
 PERFECT = LeggedErrors(*[0.0] * 9)
@@ -83,11 +82,6 @@ def test_seeds_repeat_and_errors_are_there():
     assert (one["joints"] - other["joints"]).abs().mean() == pytest.approx(0.01, rel=0.5)
 
 
-def test_the_space_is_that_of_its_feet():
-    assert (LeggedSpace(4).point_dim, LeggedSpace(4).tangent_dim) == (28, 27)
-    assert SE3().point_dim == 7
-
-
 def test_feet_slide_on_ice():
     """How far standing feet move along the floor, of the robot's own way."""
     slides = []
@@ -112,28 +106,6 @@ def test_a_soft_floor_gives_way():
         env.reset()
         heights.append(env.data.geom_xpos[[env.model.geom(foot).id for foot in QUADRUPED["feet"]], 2].mean())
     assert heights[1] < heights[0] - 0.01
-
-
-def test_pushes_are_level_and_come_once_a_second():
-    env = quadruped_env(PERFECT, pushes=300.0, seed=5)
-    td, forces = env.reset(), []
-    for _ in range(1000):
-        td = env.step(td.set("action", torch.zeros(12)))["next"]
-        forces.append(torch.tensor(env.data.xfrc_applied[1].copy()))
-    forces = torch.stack(forces)
-    pushed = forces[:, 0] != 0
-    assert not forces[:, 2:].any()
-    begins = pushed[1:] & (forces[1:, 0] != forces[:-1, 0])
-    assert begins.sum() == pytest.approx(9, abs=6)
-    assert pushed.sum() / begins.sum() == pytest.approx(10, abs=2)
-    assert forces[pushed][:, :2].square().mean().sqrt() == pytest.approx(300, rel=0.5)
-    assert not quadruped_env(PERFECT).rollout(5)["action"].isnan().any()
-
-
-@pytest.mark.parametrize("name", ["friction", "softness"])
-def test_a_floor_without_friction_is_refused(name):
-    with pytest.raises(ValueError, match=name):
-        quadruped_env(**{name: 0.0})
 
 
 @pytest.mark.parametrize("make", [quadruped_env, humanoid_env])

@@ -75,11 +75,6 @@ def test_the_sensor_feels_the_harness(log):
     assert (change - velocity[99:299] - by_readings).norm(dim=-1).max() < 0.06
 
 
-def test_seeds_repeat():
-    one, same = (walking(humanoid_env(seed=3), 10) for _ in range(2))
-    assert torch.equal(one["imu"], same["imu"])
-
-
 @pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
 def test_a_filter_follows_it(kind):
     env = humanoid_env(seed=1)

@@ -118,13 +118,6 @@ def test_feet_in_the_air_do_not_count_in_the_mean(model):
             assert_close(mean[one, :, row], expected.expand(4, 3), rtol=0, atol=1e-5)
 
 
-def test_the_newest_row_comes_last_and_the_first_stands_for_those_before(log):
-    last = with_last_rows(log, 3)["last", "imu"].unflatten(-1, (3, 6))
-    assert torch.equal(last[:, :, 2], log["imu"])
-    assert torch.equal(last[:, 5, 0], log["imu"][:, 3])
-    assert torch.equal(last[:, 1, 0], log["imu"][:, 0])
-
-
 @pytest.mark.parametrize("every", [1, 2])
 def test_an_environment_keeps_the_rows_of_a_log(every):
     env = TransformedEnv(quadruped_env(seed=4), last_rows(3, every))
@@ -233,20 +226,6 @@ def test_a_filter_moves_a_foot_that_slides(model):
     assert found[1] > 0.1
 
 
-@pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
-def test_the_time_step_may_be_an_entry(kind, model, log):
-    contacts, velocities = contacts_of(model), []
-    torch.nn.init.normal_(list(contacts.mean.parameters())[-1])
-    rows = with_last_rows(log, 10)
-    rows["dt"] = torch.full((*rows.shape, 1), 0.01)
-    for dt in (0.01, "dt"):
-        filter = legged_filter(model, **QUADRUPED, dt=dt, kind=kind, ensemble_size=16, contacts=contacts)
-        torch.manual_seed(0)
-        with torch.no_grad():
-            velocities.append(filter.sequence(rows.clone())["belief", "velocity"])
-    assert_close(*velocities, rtol=0, atol=1e-4)
-
-
 def test_they_learn_through_the_filter(model, log):
     contacts = contacts_of(model)
     filter = legged_filter(model, **QUADRUPED, dt=0.01, kind="EKF", contacts=contacts)
@@ -263,11 +242,6 @@ def test_they_learn_through_the_filter(model, log):
 def test_without_rates_they_are_refused(model):
     with pytest.raises(ValueError, match="rates_key"):
         legged_filter(model, **QUADRUPED, dt=0.01, rates_key=None, contacts=contacts_of(model))
-
-
-def test_errors_last_for_a_row_at_least(model):
-    with pytest.raises(ValueError, match="lasts"):
-        LearnedContacts(model, **QUADRUPED, lasts=0.5)
 
 
 def test_rows_without_a_standing_foot_teach_nothing(model, log):

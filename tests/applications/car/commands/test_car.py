@@ -102,34 +102,6 @@ def test_odometry_leaves_the_belief_in_all_files(kitti, checkpoint, tmp_path, ca
     assert (tmp_path / "pictures/bands.png").is_file()
 
 
-def test_odometry_of_a_video_and_of_a_folder_of_ones_own(kitti, checkpoint, tmp_path, capsys):
-    images = list(read_frames(kitti / "sequences/b/image_2"))
-    (tmp_path / "own").mkdir()
-    for number, image in enumerate(images):  # 10 comes after 9
-        cv2.imwrite(str(tmp_path / f"own/left{number}.png"), image)
-    video = cv2.VideoWriter(str(tmp_path / "drive.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, SIZE[::-1])
-    for image in images:
-        video.write(image)
-    video.release()
-    fx, fy, cx, cy = read_camera(kitti / "sequences/b/calib.txt")
-    (tmp_path / "camera.yaml").write_text(f"fx: {fx}\nfy: {fy}\ncx: {cx}\ncy: {cy}\n")
-    common = ["--calibration", str(tmp_path / "camera.yaml"), "--checkpoint", str(checkpoint), "--no-pictures"]
-    folder, drive = str(tmp_path / "own"), str(tmp_path / "drive.avi")
-    assert main(["odometry", folder, *common, "--fps", "10", "--out", str(tmp_path / "a")]) == 0
-    assert main(["odometry", drive, *common, "--out", str(tmp_path / "b")]) == 0
-    assert not (tmp_path / "a/path.png").exists()
-    one, other = (read_path(tmp_path / name / "path.csv") for name in "ab")
-    assert one["time"].flatten().tolist() == pytest.approx([0.1 * n for n in range(12)])
-    torch.testing.assert_close(one["time"], other["time"])
-    way = one["belief", "mean"][-1, 0]
-    assert way > 1
-    assert other["belief", "mean"][-1, 0] == pytest.approx(float(way), rel=0.2)  # JPEG
-    capsys.readouterr()
-    assert main(["odometry", folder, *common, "--out", str(tmp_path / "c")]) == 2
-    err = capsys.readouterr().err
-    assert "does not say when its frames were taken; pass --fps NUMBER or --times FILE" in err
-
-
 def test_a_video_of_uneven_frames_is_the_folder_with_its_times(kitti, checkpoint, tmp_path, capsys):
     """Lossless, so that both see the same pixels; the sixth frame comes 0.3 s late, and all after it."""
     av = pytest.importorskip("av")

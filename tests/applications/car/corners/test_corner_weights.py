@@ -69,7 +69,7 @@ def test_a_disparity_is_held_above_half_a_pixel():
     assert found.weight[-1].item() == pytest.approx((5 + 3) / (5 + nis), rel=1e-3)
 
 
-@pytest.mark.parametrize("hidden", [0.0, 1e6, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("hidden", [1e6, float("nan")])
 def test_corners_that_are_not_seen_do_not_matter(hidden):
     """Neither their numbers nor the gradients by those."""
     before = corners()

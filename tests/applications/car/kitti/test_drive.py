@@ -14,7 +14,7 @@ import torch_denkf.applications.car.kitti.drive as module
 from tests.real_data import KITTI
 from torch_denkf.applications.car import dead_reckoning, read_kitti_drive
 from torch_denkf.applications.car.kitti.drive import list_kitti_drives
-from torch_denkf.applications.car.kitti.files import read_calibration, read_poses
+from torch_denkf.applications.car.kitti.files import read_poses
 from torch_denkf.applications.car.vision.poses import poses_to_state, state_to_poses
 from torch_denkf.data import cache_entry
 from torch_denkf.data.cache_entry import CachedTensor
@@ -101,14 +101,6 @@ def test_speed_changes_belong_to_the_pair_that_shows_them():
     np.testing.assert_allclose(state[7, 3], moved[6] / dt)
 
 
-def test_reverse_is_negative_and_standing_is_nought():
-    path = np.zeros((5, 3))
-    path[:, 2] = 2.0
-    path[:, :2] = np.array([0, 1, 1, 0.5, 0.5])[:, None] * [math.cos(2.0), math.sin(2.0)]
-    state = poses_to_state(state_to_poses(path), 0.5)
-    np.testing.assert_allclose(state[:, 3], [2, 2, 0, -1, 0], atol=1e-12)
-
-
 def test_dead_reckoning_undoes_the_differences():
     rng = np.random.default_rng(0)
     velocities = torch.tensor(np.stack([rng.uniform(-3, 15, 200), rng.uniform(-0.5, 0.5, 200)], -1))
@@ -185,12 +177,6 @@ def test_grey_and_colour(tmp_path):
     assert calibration[0, 0] == 40  # that of image_3
 
 
-def test_images_of_any_size_are_scaled(tmp_path):
-    make(tmp_path, size=(37, 122))
-    drive = read_kitti_drive(tmp_path, "00", size=(10, 30), cache=None)
-    assert drive["image"][3, :, 5, 5].tolist() == [103, 53, 3]
-
-
 def test_a_drive_has_one_size(tmp_path):
     """An image of another size would have another calibration; a damaged one has no size."""
     make(tmp_path)
@@ -200,15 +186,6 @@ def test_a_drive_has_one_size(tmp_path):
     with pytest.warns(UserWarning, match="000000.png is not a complete PNG"), pytest.raises(ValueError, match=message):
         read_kitti_drive(tmp_path, "00", size=(10, 30), cache=tmp_path / "cache")
     assert not list(tmp_path.glob("cache/*"))
-
-
-def test_progress_counts_the_images_that_are_decoded(tmp_path):
-    make(tmp_path, images=[0, 1, 3, 5])
-    seen = []
-    read_kitti_drive(tmp_path, "00", cache=tmp_path / "cache", progress=seen.append)
-    assert sum(seen) == 4
-    read_kitti_drive(tmp_path, "00", cache=tmp_path / "cache", progress=seen.append)
-    assert sum(seen) == 4
 
 
 def test_times_are_nominal_without_a_file(tmp_path):
@@ -249,28 +226,6 @@ def test_the_cache(tmp_path, monkeypatch):
     assert not [entry for entry in cache.iterdir() if entry.name.startswith(".")]
     assert not [entry for entry in root.rglob("*") if entry.suffix == ".bin"]
     assert not isinstance(read_kitti_drive(root, "00", cache=None)["image"], CachedTensor)
-
-
-def test_a_cache_that_is_cut_short_is_never_seen(tmp_path, monkeypatch):
-    root, cache = make(tmp_path / "kitti"), tmp_path / "cache"
-
-    def killed(folder, content):
-        (folder / "image.bin").write_bytes(b"half")
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(cache_entry, "seal_entry", killed)
-        with pytest.raises(KeyboardInterrupt):
-            read_kitti_drive(root, "00", cache=cache)
-    assert list(cache.iterdir()) == []
-    assert len(read_kitti_drive(root, "00", cache=cache)) == 6
-
-
-def test_a_cache_that_cannot_be_written_says_what_to_do(tmp_path):
-    root = make(tmp_path / "kitti")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match=r"cannot write the cache at .*file.*pass cache=FOLDER or cache=None"):
-        read_kitti_drive(root, "00", cache=tmp_path / "file")
 
 
 def test_drives_are_listed(tmp_path):
@@ -429,9 +384,3 @@ def test_real_poses_have_the_state_of_kloss(sequence, mean_step):
     bend = np.arctan2(ten[:-10, 0] * ten[10:, 1] - ten[:-10, 1] * ten[10:, 0], (ten[:-10] * ten[10:]).sum(-1))
     fast = np.linalg.norm(ten[:-10], axis=-1) > 3
     assert np.corrcoef(bend[fast], (state[15:-5, 2] - state[5:-15, 2])[fast])[0, 1] > 0.95
-
-
-def test_the_calibration_of_each_camera(tmp_path):
-    make(tmp_path)
-    file = tmp_path / "sequences/00/calib.txt"
-    assert [read_calibration(file, f"image_{k}")[0] for k in range(4)] == [10, 20, 30, 40]

@@ -53,18 +53,6 @@ def test_a_missing_frame_blinds_two_rows():
     assert (drive_frames(drive)["pixels"] == frames["pixels"]).all()
 
 
-def test_rows_in_any_shape():
-    drive = make_drive()
-    frames, index = drive_frames(drive), torch.tensor([[1, 5, 2], [0, 7, 7]])
-    picked = frames_at(drive, index)
-    assert picked.batch_size == (2, 3)
-    for key in ("pixels", "state", "observed", "time"):
-        assert (picked[key] == frames[key][index]).all()
-    single = frames_at(drive, torch.tensor(4))
-    assert single.batch_size == ()
-    assert (single["pixels"] == frames["pixels"][4]).all()
-
-
 def test_motion_comes_along():
     """Flow and road as float32, zero where the row is not observed; without images there are no pixels."""
     drive = make_drive(missing=[3])

@@ -6,9 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
-from torchrl.envs.transforms import ObservationNorm
 
 import torch_denkf.applications.car.kitti.drive as kitti_module
 from tests.data import replay_for_tests as shared
@@ -80,20 +78,6 @@ def test_slices_are_contiguous_and_in_one_episode(root, options):
     shared.check_slices(open_dataset(root, mirrored=True, **{"batch_size": 24, **options}), options, "step", KEYS)
 
 
-def test_single_rows(root):
-    data = open_dataset(root, ["town", "lane"], batch_size=8, sampler=SamplerWithoutReplacement())
-    seen = torch.cat([batch["index"] for batch in data])
-    assert sorted(seen.flatten().tolist()) == list(range(23 + 9))
-    rows = data[:]
-    batch = data.sample()
-    assert (batch["pixels"] == rows["pixels"][batch["index"].flatten()]).all()
-    # The gap blinds two rows; row 8 has a frame, but no difference.
-    assert (~rows["observed"][:23]).flatten().nonzero().flatten().tolist() == [0, 7, 8]
-    assert not rows["pixels"][7].any()
-    assert rows["pixels"][8, :3].any()
-    assert not rows["pixels"][8, 3:].any()
-
-
 def test_statistics_by_hand(root):
     """Of the training drives alone: numpy, from the PNGs of those two drives."""
     data = open_dataset(root, ["hill", "town"])
@@ -119,29 +103,6 @@ def test_statistics_by_hand(root):
     assert statistics["pixels", "mean"].shape == (6, 1, 1)
     others = open_dataset(root).statistics
     assert abs(others["velocity", "mean"][0] - statistics["velocity", "mean"][0]) > 0.01  # the lane would count
-
-
-def test_statistics_of_mirrored_drives(root):
-    plain, mirrored = open_dataset(root).statistics, open_dataset(root, mirrored=True).statistics
-    assert abs(plain["velocity", "mean"][1]) > 1e-3
-    assert abs(mirrored["velocity", "mean"][1]) < 1e-9
-    expected = (plain["velocity", "std"][1] ** 2 + plain["velocity", "mean"][1] ** 2).sqrt()
-    torch.testing.assert_close(mirrored["velocity", "std"][1], expected)
-    torch.testing.assert_close(mirrored["velocity", "mean"][0], plain["velocity", "mean"][0])
-    torch.testing.assert_close(mirrored["pixels"], plain["pixels"])
-
-
-def test_transforms_see_the_pixels(root):
-    training = open_dataset(root, ["hill", "lane"]).statistics["pixels"]
-    norm = ObservationNorm(training["mean"], training["std"], in_keys=["pixels"], standard_normal=True)
-    data = open_dataset(root, ["hill", "lane"], transform=norm)
-    frames = data[:]["pixels"][:, :3]
-    torch.testing.assert_close(frames.mean((0, 2, 3)), torch.zeros(3), atol=1e-4, rtol=0)
-    torch.testing.assert_close(frames.std((0, 2, 3), correction=0), torch.ones(3), atol=1e-4, rtol=0)
-    doubled = open_dataset(root, "lane", transform=lambda rows: rows.set("double", 2 * rows["pixels"]), batch_size=4)
-    doubled.append_transform(lambda rows: rows.set("more", 2 * rows["double"]))
-    sample = doubled.sample()
-    assert (sample["more"] == 4 * sample["pixels"]).all()
 
 
 def test_flow(root, tmp_path):
@@ -192,27 +153,4 @@ def test_the_cache_is_mapped_and_opens_without_decoding(root, tmp_path, monkeypa
     assert sorted(path.name for path in tmp_path.iterdir()) == entries
 
 
-def test_a_bar_counts_what_is_decoded(root, tmp_path, monkeypatch):
-    bars = shared.counting_bars(monkeypatch)
-    open_dataset(root, "hill", cache=tmp_path)
-    assert [(bar.n, bar.total, bar.closed) for bar in bars] == [(14, 14, True)]
-    open_dataset(root, progress=False)
-    assert len(bars) == 1
-    open_dataset(root, ["hill", "lane", "town"], cache=tmp_path)  # what is there counts as done
-    assert [(bar.n, bar.total, bar.closed) for bar in bars[1:]] == [(14 + 9 + 22,) * 2 + (True,)]
-    open_dataset(root, "lane", cache=tmp_path, flow=partial(with_motion, cache=None))
-    assert [(bar.n, bar.total) for bar in bars[2:]] == [(18, 18)]
-
-
 # The rest of torchrl's interface -------------------------------------------------------------------------------------
-
-
-def test_it_deletes_nothing_of_the_users(root):
-    data = open_dataset(root, "lane")
-    shared.check_nothing_is_deleted(data)
-    assert data.root == root
-    assert (root / "sequences/lane/image_2/000000.png").is_file()
-
-
-def test_preprocess_sees_pixels(root, tmp_path):
-    shared.check_preprocess(open_dataset(root, "lane", mirrored=True), tmp_path)

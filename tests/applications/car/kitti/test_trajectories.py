@@ -55,19 +55,6 @@ def test_axes_are_those_of_kittis_camera_and_times_are_written(tmp_path):
     np.testing.assert_allclose(read.timestamps, TIMES, atol=1e-9)
 
 
-def test_the_first_line_of_a_tum_file_names_its_axes(tmp_path):
-    """Columns by what they hold: a step of 2 m forward and 1 m to the left, of states; poses have axes of their own."""
-    state = torch.tensor([[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]])
-    header, *rows = write_trajectory(tmp_path / "a", state, TIMES[:2], layout="tum").read_text().splitlines()
-    columns, axes = header.removeprefix("# ").split("; ")
-    assert axes == "axes of KITTI's camera: x to the right, y down, z forward"
-    step = dict(zip(columns.split(), map(float, rows[1].split()), strict=True))
-    assert (step["time_s"], step["x_m"], step["y_m"], step["z_m"], step["qw"]) == (0.103, -1.0, 0.0, 2.0, 1.0)
-    poses = np.eye(4)[None].repeat(2, 0)
-    header = write_trajectory(tmp_path / "b", poses, TIMES[:2], layout="tum").read_text().splitlines()[0]
-    assert header == f"# {columns}"
-
-
 def test_any_rotation_survives_both_layouts(tmp_path):
     rotations = Rotation.random(200, random_state=0).as_matrix()
     half_turns = Rotation.from_rotvec(np.pi * np.eye(3)).as_matrix()

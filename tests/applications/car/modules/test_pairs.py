@@ -10,7 +10,7 @@ from torch_denkf.applications.car import UnicycleMotion, UnicycleNoise, Unicycle
 from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, with_history
 from torch_denkf.filters import EKF, DEnKF
 from torch_denkf.imperfect import RejectReadings
-from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select, SubModel
+from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select
 
 DT, Q, R, START = 0.5, (0.3, 0.05), (0.2, 0.02), (0.0, 0.0, 0.0, 0.6, 0.1)
 
@@ -110,24 +110,6 @@ def test_a_reading_over_a_gap_corrects_velocity_and_way_like_a_kalman_filter_wit
     # The reading says 16 over three steps where 12 was forecast: the way is corrected, and not the last step alone.
     way = belief[:, :2].norm(dim=-1).mean()
     assert abs(float(way) - float(mean_v[3])) < 0.05 * float(mean_v[3])
-
-
-def test_an_exact_reading_over_a_gap_leaves_no_doubt_about_the_way(float64):
-    filter = pair_filter(64, "etkf")
-    frames = frames_of(torch.tensor([[0.0, 0.0], [0.0, 0.0], [10.0, 0.9]]), [0, 0, 2])
-    frames["y"][-1] = torch.tensor([10.0, 0.9])
-    exact = DEnKF(
-        filter["transition"],
-        None,
-        filter["observation"],
-        ConstantNoise([1e-6, 1e-6], in_key="y"),
-        filter["analysis"],
-        initial=filter.initial,
-    )
-    torch.manual_seed(1)
-    out = exact.sequence(frames)["belief", "ensemble"][-1]
-    turned = torch.full((64,), 0.9 * DT)
-    torch.testing.assert_close(out[:, 2], turned, rtol=0, atol=1e-4)
 
 
 def test_the_way_over_a_gap_is_that_of_the_corrected_steps(float64):
@@ -236,30 +218,12 @@ def test_a_smoothed_path_is_that_of_a_kalman_filter_of_velocity_and_way(float64)
     torch.testing.assert_close(found[True][:, 3:], found[False][:, 3:], rtol=0, atol=1e-12)  # velocities are the same
 
 
-def test_smoothing_needs_a_history():
-    with pytest.raises(ValueError, match="pass its history_key"):
-        UnicycleMotion(DT, smooth=True)
-
-
 def test_a_curve_is_what_the_sensor_makes_of_the_whole_way(float64):
     forecast, history = torch.tensor([[0.0, 0.0, 0.0, 10.0, 0.1]]), torch.tensor([[[9.0, 0.2]]])
     td = TensorDict({"forecast": {"ensemble": forecast}, "belief": {"history": history}, "steps": [2]})
     out = PairObservation([20.0, torch.inf], curve=lambda way: way**2)(td)["forecast"]
     torch.testing.assert_close(out["observation"], torch.tensor([[19.0**2, 0.3**2]]))
     assert out["observed"]  # it is the way, not what is read, that must be within reach
-
-
-def test_history_needs_a_lag():
-    with pytest.raises(ValueError, match="at least 1; got 0"):
-        with_history(AroundState([1.0] * 5), 0)
-
-
-def test_a_history_begins_with_the_present(float64):
-    start = with_history(AroundState([1.0] * 5, ensemble_size=7), 2)
-    out = start(TensorDict({"state": torch.zeros(3, 5)}, [3]))["belief"]
-    assert isinstance(start, SubModel)
-    for lag in range(2):
-        assert out["history"][:, :, lag].equal(out["ensemble"][..., 3:])
 
 
 def test_velocities_go_on_changing_by_a_share_of_their_last_change(float64):

@@ -79,8 +79,3 @@ def test_rendered_drive_tells_the_turn_and_the_pitch():
     pitch = found.focus[:, 1]
     off = ((pitch - pitch.median()) / found.focus_std[:, 1]).abs()
     assert 0.3 < off.median() < 1.4
-
-
-def test_wrong_shape():
-    with pytest.raises(ValueError, match=r"shape \[N, 3, 25, 79\]; got \[3, 25, 79\]"):
-        focus_of_expansion(torch.zeros(FLOW_SHAPE))

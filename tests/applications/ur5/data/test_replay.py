@@ -8,7 +8,6 @@ import pytest
 import torch
 from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
-from torchrl.envs.transforms import ObservationNorm
 
 from tests.applications.ur5.data.ur5_demos import LENGTHS, SIZE, make_demo, ten_demos, write_folder
 from tests.data import replay_for_tests as shared
@@ -158,23 +157,3 @@ def test_the_cache_is_read_and_follows_the_files(root, tmp_path, monkeypatch):
     assert len(list(place.iterdir())) == 2  # nothing half-made stays
     monkeypatch.undo()
     assert len(UR5ExperienceReplay(folder, split="all", size=(3, 4), cache=place)) == 40
-
-
-def test_transforms_and_preprocess(root, tmp_path):
-    scale = ObservationNorm(loc=-1.0, scale=2.0, in_keys=["pixels"])
-    plain, scaled = open_dataset(root, split="all"), open_dataset(root, split="all", transform=scale)
-    torch.testing.assert_close(scaled[:9]["pixels"], 2 * plain[:9]["pixels"] - 1)
-    shared.check_preprocess(plain, tmp_path / "means")
-    shared.check_nothing_is_deleted(plain)
-
-
-def test_demos_without_pictures(tmp_path):
-    write_folder(tmp_path, [make_demo(number, 8, frames=0) for number in range(4)])
-    data = open_dataset(tmp_path, split="all", size=(224, 224))
-    rows = data[:]
-    assert "pixels" not in rows
-    assert not rows["observed"].any()
-    assert list(data.statistics.keys()) == ["state", "action"]
-    assert len(UR5ExperienceReplay(tmp_path, split="all", cache=tmp_path / "cache")) == 32
-    with pytest.raises(ValueError, match="no-pixels"):
-        open_dataset(tmp_path, frames_only=True)

@@ -41,19 +41,6 @@ def test_options_out_of_range(root):
     assert len(short.sample()) in (12, 13, 14)
 
 
-def test_folders_without_demos(tmp_path):
-    with pytest.raises(FileNotFoundError, match=f"no folder {tmp_path / 'nowhere'}.*{COMMAND}"):
-        open_dataset(tmp_path / "nowhere")
-    with pytest.raises(FileNotFoundError, match=f"no demos in {tmp_path}: no {MANIFEST}"):
-        open_dataset(tmp_path)
-    write_folder(tmp_path, [make_demo(1, 8)])
-    with pytest.raises(ValueError, match=r"none of the 1 episodes in .* is in the split 'test'"):
-        open_dataset(tmp_path, split="test")
-    write_folder(tmp_path, [make_demo(9, 8)])
-    with pytest.raises(ValueError, match="training split"):
-        _ = open_dataset(tmp_path, split="test").statistics
-
-
 def cut(file):
     file.write_bytes(file.read_bytes()[:-100])
 
@@ -99,14 +86,6 @@ def test_what_is_no_file_is_named(tmp_path, name, make):
         open_dataset(tmp_path)
 
 
-def test_a_link_to_itself_is_named(tmp_path):
-    write_folder(tmp_path, [make_demo(0, 4), make_demo(1, 4)])
-    (tmp_path / "demo-000001.npz").unlink()
-    (tmp_path / "demo-000001.npz").symlink_to("demo-000001.npz")
-    with pytest.raises(ValueError, match=r"demo-000001\.npz is no file"):
-        open_dataset(tmp_path)
-
-
 def test_a_cut_line_of_the_manifest_counts_as_not_written(root, tmp_path):
     write_folder(tmp_path, [make_demo(number, 8) for number in range(3)])
     text = (tmp_path / MANIFEST).read_text()
@@ -114,12 +93,6 @@ def test_a_cut_line_of_the_manifest_counts_as_not_written(root, tmp_path):
     assert list(read_manifest(tmp_path)) == [0, 1]
     assert [json.loads(line)["demo"] for line in text.splitlines()] == [0, 1, 2]
     assert [e.demo for e in open_dataset(tmp_path, split="all").episodes] == [0, 1]
-
-
-def test_a_cache_that_cannot_be_written(root, tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(OSError, match=r"cannot write the cache at .*file.*TORCH_DENKF_CACHE"):
-        UR5ExperienceReplay(root, cache=tmp_path / "file" / "cache")
 
 
 def list_again(root, file):

@@ -4,7 +4,6 @@ from functools import partial
 
 import pytest
 import torch
-from torchrl.collectors import Collector
 from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
 
 from tests.envs.opengl import needs_opengl
@@ -34,18 +33,6 @@ def test_batched(kind):
         assert (start[0] != start[1]).any()
     finally:
         env.close()
-
-
-def test_collector():
-    needs_opengl()
-    make = partial(UR5TableEnv, "pick", **OPTIONS, seed=3)
-    collector = Collector(make, UR5Expert(), frames_per_batch=9, auto_register_policy_transforms=False)
-    batch = next(iter(collector))
-    collector.shutdown()
-    env = UR5TableEnv("pick", **OPTIONS, seed=3)
-    expected = env.rollout(9, UR5Expert(), break_when_any_done=False)
-    for key in ("pixels", "state", ("next", "pixels"), ("next", "state"), "action"):
-        assert batch[key].equal(expected[key])
 
 
 def test_a_filter_on_the_state():

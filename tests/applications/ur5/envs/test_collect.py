@@ -193,15 +193,6 @@ def test_a_file_without_a_line_is_not_trusted(unbroken, copy):
     assert content(copy) == content(unbroken)
 
 
-def test_more_and_fewer_demos(unbroken, tmp_path):
-    collect_ur5_demos(tmp_path, 2, **BLIND)
-    assert len(read_manifest(tmp_path)) == 2
-    assert collect_ur5_demos(tmp_path, DEMOS, **BLIND) == DEMOS - 2
-    assert content(tmp_path) == content(unbroken)
-    assert collect_ur5_demos(tmp_path, 1, **BLIND) == 0
-    assert content(tmp_path) == content(unbroken)
-
-
 def test_failures_are_left_out_and_counted(tmp_path, monkeypatch, unbroken):
     episode = episodes._episode
 
@@ -223,28 +214,6 @@ def test_failures_are_left_out_and_counted(tmp_path, monkeypatch, unbroken):
     assert len(read_manifest(tmp_path)) == 2
 
 
-def test_an_episode_without_success_is_no_demo(monkeypatch):
-    options = episodes.Options((8, 8), None, "sim", ("pick",), 0, 20, 0.0)
-    assert episodes._episode(options, 0, 0) is not None
-    step = UR5TableEnv._step
-
-    def away(self, tensordict):
-        out = step(self, tensordict)
-        return out.set("success", torch.zeros(1, dtype=torch.bool))
-
-    monkeypatch.setattr(UR5TableEnv, "_step", away)
-    assert episodes._episode(options, 0, 0) is None
-    episodes._close()
-
-
-def test_the_callers_generator_is_left_alone(tmp_path):
-    torch.manual_seed(5)
-    expected = torch.rand(3)
-    torch.manual_seed(5)
-    collect_ur5_demos(tmp_path, 1, **BLIND, noise=0.01)
-    assert torch.rand(3).equal(expected)
-
-
 @pytest.mark.parametrize(
     ("change", "text"),
     [
@@ -259,15 +228,6 @@ def test_another_collection_is_refused(unbroken, change, text):
     with pytest.raises(ValueError, match=f"{unbroken} holds another collection, with {text}"):
         collect_ur5_demos(unbroken, DEMOS, **{**BLIND, **change})
     assert content(unbroken) == before
-
-
-def test_a_folder_without_options_or_with_damaged_ones(copy):
-    (copy / COLLECTION).write_text("{")
-    with pytest.raises(ValueError, match=f"{COLLECTION} is damaged"):
-        collect_ur5_demos(copy, DEMOS, **BLIND)
-    (copy / COLLECTION).unlink()
-    with pytest.raises(ValueError, match=f"has demos but no {COLLECTION}"):
-        collect_ur5_demos(copy, DEMOS, **BLIND)
 
 
 def test_options_out_of_range(tmp_path):
@@ -301,16 +261,3 @@ def test_the_command(tmp_path, capsys, unbroken):
     assert "cannot use" in capsys.readouterr().err
     assert CollectUR5.main(["--out", str(tmp_path / "none"), "--verify"]) == 2
     assert "no demos in" in capsys.readouterr().err
-
-
-def test_without_opengl_no_folder_is_spoilt(tmp_path, capsys, monkeypatch):
-    from torch_denkf.applications.ur5.simulation import render
-
-    def none():
-        raise ImportError("no library")
-
-    monkeypatch.setattr(render, "_context_class", none)
-    words = ["--out", str(tmp_path), "--demos", "1", "--size", "16", "--max-steps", "5", "--processes", "1"]
-    assert CollectUR5.main(words) == 2
-    assert "apt-get install libegl1" in capsys.readouterr().err
-    assert CollectUR5.main([*words, "--no-pixels"]) == 0

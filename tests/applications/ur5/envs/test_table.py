@@ -124,30 +124,6 @@ def test_an_episode_leaves_nothing_to_the_next(task):
         assert (env.rollout(350, UR5Expert(env)) == fresh.rollout(350, UR5Expert(fresh))).all()
 
 
-def test_variety():
-    env = blind(seed=0)
-    resets = torch.stack([env.reset() for _ in range(40)])
-    thing, home = resets["expert", "object"], resets["state"]
-    assert (thing[:, 0].abs() < 0.19).all()
-    assert (thing[:, 1].abs() < 0.26).all()
-    assert (thing[:, :2].std(0) > torch.tensor([0.05, 0.1])).all()
-    assert (home.std(0) > 0.03).all()  # every joint, wrist 2 included
-    assert (home[:, 9] > 0.19).all()
-
-
-def test_random_actions_stay_near():
-    state = blind(seed=0).rollout(60)["next", "state"]
-    assert (state[-1, :6] - state[0, :6]).abs().max() < 1.0
-    assert state[:, :6].diff(dim=0).abs().max() < 0.1
-
-
-def test_truncation():
-    env = blind(max_steps=4, seed=0)
-    rollout = env.rollout(10, break_when_any_done=False)
-    assert rollout["next", "truncated"].flatten().tolist() == [False, False, False, True] * 2 + [False] * 2
-    assert not rollout["next", "terminated"].any()
-
-
 def test_expert_noise():
     planned = torch.zeros(4000, 7)
     read = TensorDict({"expert": {"action": planned}}, [4000])
