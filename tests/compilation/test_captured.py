@@ -4,9 +4,8 @@ import pickle
 
 import pytest
 import torch
-from tensordict import TensorDict
 
-from tests.filters.factories import linear_denkf, toy_denkf, toy_frames
+from tests.filters.factories import toy_denkf, toy_frames
 from tests.filters.test_contract import every_filter, with_noise
 from torch_denkf.compilation import CapturedSteps
 
@@ -111,19 +110,6 @@ def test_every_filter_recorded_is_eager(float64, reruns, name):
     assert_same(*outs, atol=1e-11)
 
 
-def test_two_replays_draw_different_members_and_a_seed_repeats_them(reruns):
-    graph = linear_denkf("perturbed", noisy=True).compile(mode="graph")
-    row = graph.initialise(TensorDict({"observation": torch.zeros(3, 2)}, [3]))
-    torch.manual_seed(0)
-    first, second = (graph.step(row.copy())["belief", "ensemble"] for _ in range(2))
-    recorded = reruns.recorded
-    torch.manual_seed(0)
-    again = graph.step(row.copy())["belief", "ensemble"]
-    assert not torch.isclose(first, second).any()
-    assert again.equal(first)
-    assert reruns.recorded == recorded == 1
-
-
 def test_weights_that_an_optimiser_changes_and_weights_that_move_are_read_anew(float64, reruns):
     eager, graph = pair()
     frames = noisy_frames(eager, 2, 4)
@@ -221,9 +207,3 @@ def test_on_a_processor_steps_run_eagerly_with_one_warning(float64, recwarn):
     expected, theirs = gradients(eager, frames)
     assert_same([out["belief", "mean"]], [expected["belief", "mean"]])
     assert_same(ours, theirs)
-
-
-def test_a_chunk_that_is_no_number_of_steps_raises():
-    for chunk in (-1, 1.5):
-        with pytest.raises((ValueError, TypeError), match="chunk"):
-            linear_denkf().compile(mode="graph", chunk=chunk)

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torch._dynamo.backends.common import aot_autograd
 
-from tests.filters.factories import has_compiler, linear_denkf, toy_denkf, toy_frames
+from tests.filters.factories import has_compiler, linear_denkf
 from tests.filters.gaussian_for_tests import linear_filter, linear_frames
 from tests.filters.test_contract import particles
 from torch_denkf.compilation import compared, refuse_other_numbers
@@ -239,16 +239,6 @@ def test_nothing_is_compiled_twice_for_it_and_it_is_done_once(monkeypatch):
     assert counting.graphs == 1
 
 
-def test_it_draws_no_number_of_the_users():
-    filter, states = toy_denkf(), []
-    row = filter.initialise(toy_frames((2,), masks=0, resets=False))
-    for chunk in (0, 1):
-        torch.manual_seed(0)
-        filter.compile(chunk=chunk, backend="eager").step(row.copy())
-        states.append(torch.rand(3))
-    assert states[0].equal(states[1])
-
-
 def test_what_has_no_value_in_both_is_equal_and_in_one_is_not():
     names = {"names": ["x"], "outputs": ["y"], "frames": [], "what": "thing", "cure": ""}
     nan = torch.tensor([1.0, torch.nan, torch.inf])
@@ -271,15 +261,6 @@ def test_half_precision_inside_rounds_as_such():
     refuse_other_numbers(lambda x: x @ weight, half, (x,), **names)
     with pytest.raises(RuntimeError, match="'y' is up to"):
         refuse_other_numbers(half, lambda x: x @ weight, (x,), **names)
-
-
-def test_numbers_drawn_inside_by_another_generator_are_no_error():
-    names = {"names": ["x"], "outputs": ["y"], "frames": [], "what": "thing", "cure": ""}
-    own = torch.Generator().manual_seed(1)
-    x = torch.zeros(100)
-    refuse_other_numbers(lambda x: x + torch.randn(100, generator=own), lambda x: x + torch.randn(100), (x,), **names)
-    with pytest.raises(RuntimeError, match="'y' is up to"):
-        refuse_other_numbers(lambda x: x + 50, lambda x: x + torch.randn(100), (x,), **names)
 
 
 def test_running_means_are_those_of_the_step_alone():

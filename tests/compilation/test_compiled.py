@@ -9,11 +9,9 @@ from tensordict import TensorDict
 from torch import nn
 
 from tests.filters.factories import (
-    Perturbed,
     has_compiler,
     linear_denkf,
     linear_kalman,
-    random_draws,
     toy_denkf,
     toy_frames,
 )
@@ -138,18 +136,6 @@ def test_a_new_filter_of_other_modules_or_options_compiles_its_own(float64):
         assert not torch.allclose(other, means[0])
 
 
-def test_predictions_and_steps_without_a_reading_stay_eager(float64):
-    for make in (linear_denkf, linear_kalman):
-        eager, filter = make(), make().compile(backend="eager")
-        td = filter.initialise(TensorDict({"observation": torch.zeros(2)}))
-        predicted, left_out = filter.predict(td.copy()), filter.step(td.copy(), without=["observation"])
-        assert not filter.compiled._functions
-        expected = eager.predict(td.copy())["belief"]
-        for belief in (predicted["belief"], left_out["belief"]):
-            for key in ("mean", "var"):
-                assert belief[key].equal(expected[key])
-
-
 def test_a_policys_data_go_on_from_what_is_stored(float64):
     """Slices that begin in the middle, an episode that begins inside of one, and a first belief that is all zero."""
     filter = linear_kalman()
@@ -169,23 +155,6 @@ def test_a_policys_data_go_on_from_what_is_stored(float64):
         TensorDict({"observation": data["observation"][1, 0], "belief": {"mean": mean[1, 0], "cov": cov[1, 0]}})
     )
     assert_close(eager[1, 0], step, filter.belief_keys, torch.float64)
-
-
-def test_a_stochastic_analysis_of_a_users_own_compiles(float64):
-    """And gives what the library's own gives for the same seed, compiled or not."""
-    frames, outs = TensorDict({"observation": torch.randn(3, 5, 2)}, [3, 5]), []
-    for analysis, chunk in ((None, 0), (Perturbed(), 0), (Perturbed(), 2)):
-        filter = random_draws(linear_denkf("perturbed", noisy=True))
-        if analysis is not None:
-            filter = filter.with_modules(analysis=analysis)
-        filter.compile(chunk=chunk, backend="eager")
-        torch.manual_seed(1)
-        out = filter.sequence(frames.copy())
-        step = filter.step(out[:, -1].copy())
-        outs.append(torch.cat([out["belief", "mean"], step["belief", "mean"].unsqueeze(1)], 1))
-    assert {kind[0] for kind in filter.compiled._functions} == {"chunk", "step"}
-    for out in outs[1:]:
-        torch.testing.assert_close(out, outs[0], rtol=0, atol=1e-12)
 
 
 def test_a_first_call_that_resets_all_rows_is_compared_all_the_same():
@@ -215,21 +184,6 @@ def test_a_compiled_step_draws_its_noise_outside_and_anew():
     assert means[0].equal(means[1])
     assert not means[0].equal(means[2])
     assert len(filter.compiled._functions) == 1
-
-
-def test_0_goes_back_to_eager():
-    filter = toy_denkf().compile(chunk=3, backend="eager")
-    assert filter.compile(chunk=0).compiled is None
-    with pytest.raises(ValueError, match="number of steps"):
-        filter.compile(chunk=-1)
-
-
-def test_pickles_without_what_was_compiled():
-    filter = toy_denkf().compile(chunk=3, backend="eager")
-    filter.compiled._functions["something"] = lambda: None
-    other = pickle.loads(pickle.dumps(filter))
-    assert other.compiled.chunk == 3
-    assert other.compiled._functions == {}
 
 
 def test_without_a_compiler_it_says_what_to_install(monkeypatch):

@@ -66,15 +66,6 @@ def test_small_tensors_go_as_one_and_gradients_stay(dtype):
         torch.testing.assert_close(value, other, rtol=tolerance, atol=tolerance)
 
 
-def test_large_tensors_stay_apart(monkeypatch):
-    monkeypatch.setattr(_partition, "LARGE", 4 * 5 * 4)
-    gradients, saved = run(compiled(steps, FewSavedTensors()), (4, 5), torch.float32)
-    assert sum(shape == (4, 5) for shape in saved) >= 6
-    assert max(shape[0] for shape in saved) == 5
-    for value, eager in zip(gradients, run(steps, (4, 5), torch.float32)[0], strict=True):
-        torch.testing.assert_close(value, eager, rtol=1e-5, atol=1e-5)
-
-
 def layers(x: torch.Tensor, first, bias, second, third) -> tuple[torch.Tensor, torch.Tensor]:
     """Five steps through a layer with bias and a second one; a third sees what the first one does."""
     outputs = []

@@ -108,21 +108,6 @@ def test_an_observer_that_raises_stops_an_environment_before_it_emits_a_belief()
     assert not written
 
 
-def test_observers_see_only_the_ways_that_they_name():
-    filter, seen = linear_kalman(), Seen()
-    filter.observers, seen.ways = [seen], ("sequence",)
-    for way in WAYS:
-        run(filter, way)
-    assert {record.way for record, _ in seen.records} == {"sequence"}
-
-
-def test_a_function_is_an_observer():
-    filter, ways = linear_kalman(), []
-    filter.observers = [lambda filter, record: ways.append(record.way)]
-    filter.step(filter.initialise(frames(2)))
-    assert ways == ["step"]
-
-
 # -------------------------------------------------------------------------------------------- the default observers
 
 

@@ -52,12 +52,6 @@ def test_transition_and_control_without_noise():
     assert rollout["next", "state"][:, :-1].equal(state[:, 1:])
 
 
-def test_initial_state():
-    state = make(batch_size=[20_000], initial_std=[0.5, 3.0]).reset()["state"]
-    # The standard error of a standard deviation is sigma / sqrt(2 n).
-    assert ((state.std(0) / torch.tensor([0.5, 3.0]) - 1).abs() < 5 / 40_000**0.5).all()
-
-
 def test_seeds():
     def run(set_seed=None, **kwargs):
         env = make(batch_size=[2], missing=0.3, **kwargs)
@@ -91,9 +85,3 @@ def test_episode_lengths_of_rows():
     assert rollout["next", "truncated"].equal(rollout["next", "done"])
     assert not rollout["next", "terminated"].any()
     assert make(max_steps=4).rollout(50).shape == (4,)
-
-
-def test_float64(float64):
-    env = LinearGaussianEnv(F.double(), H.double(), [0.3, 0.5], [0.1, 0.2, 0.4])
-    check_env_specs(env)
-    assert env.rollout(2)["next", "observation"].dtype == torch.float64

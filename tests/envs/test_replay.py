@@ -22,11 +22,6 @@ from torch_denkf.submodel import SubModel
 from torch_denkf.transforms import DEnKFTransform
 
 LENGTHS = [6, 9, 4, 7]
-OWN = ("state", "step", "time", "episode", "wheel")
-
-
-def doubled(rows):
-    return rows.set("double", 2 * rows["state"]).set(("deep", "wheel"), -rows["wheel"])
 
 
 def make(actions=True, transform=None):
@@ -173,19 +168,6 @@ def test_batched_environments(data, kind):
             env.close()
 
 
-def test_transforms_of_the_data_set_are_seen():
-    data = make(transform=doubled)
-    env = ReplayEnv(data, batch_size=[3])
-    check_env_specs(env)
-    assert env.device is None
-    on_device = ReplayEnv(data, batch_size=[3], device="cpu")
-    check_env_specs(on_device)
-    now = on_device.reset()
-    assert now.device == now["double"].device == torch.device("cpu")
-    assert now["double"].equal(2 * now["state"])
-    assert now["deep", "wheel"].equal(-now["wheel"])
-
-
 # Actions --------------------------------------------------------------------------------------------------------------
 
 
@@ -223,13 +205,6 @@ def test_a_filter_is_driven_by_what_the_policy_commands():
     assert (other["next", "state"][..., 1] == torch.arange(1, 5)).all()
     now = env.reset()
     assert env.base_env.policy(now)["action"].equal(now["recorded", "action"])
-
-
-def test_rand_action_without_a_tensordict():
-    env = ReplayEnv(make())
-    env.reset()
-    env.step(env.rand_action(env.reset()))
-    assert env.rand_action()["action"].item() == 11  # run1 now, at its second row
 
 
 # Errors ---------------------------------------------------------------------------------------------------------------

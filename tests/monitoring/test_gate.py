@@ -52,18 +52,6 @@ def test_an_inert_gate_is_the_filter_bit_for_bit(name, response):
         assert torch.equal(plain[key], gated[key]), key
 
 
-@pytest.mark.parametrize("name", FILTERS)
-@pytest.mark.parametrize("response", RESPONSES)
-def test_a_limit_of_infinity_is_inert_too(name, response):
-    """Here the gate does run the analysis again, with factors of one."""
-    plain, filter = run(FILTERS[name](), data()), FILTERS[name]()
-    gated = Gated(filter, DIM, response=response)
-    gated.gates[0].limits.fill_(torch.inf)
-    out = run(gated, data())
-    for key in filter.out_keys:
-        assert torch.equal(plain[key], out[key]), key
-
-
 def still(variance=1.0, noise=1.0, **kwargs):
     """A state that does not move, in one dimension: the update is a weighted mean."""
     one = torch.eye(1, dtype=torch.float64)
@@ -91,19 +79,6 @@ def test_responses_are_their_closed_forms(value):
         assert out["gate", "factor"].item() == pytest.approx(factor, rel=1e-5), response  # the limits are float32's
         assert out["belief", "mean"].item() == pytest.approx(value / (1 + factor), rel=1e-5), response
         assert out["gate", "nis"].item() == pytest.approx(q)
-
-
-def test_the_pull_of_an_outlier():
-    """Student's falls with distance, Huber's stays, that of a rejected reading is none."""
-    pull = {
-        response: [
-            one_reading(still(1e-3, response=response, window=1), value)["belief", "mean"].item() for value in (20, 200)
-        ]
-        for response in RESPONSES
-    }
-    assert pull["student"][1] < 0.2 * pull["student"][0]
-    assert pull["huber"][1] == pytest.approx(pull["huber"][0], rel=0.02)
-    assert pull["reject"] == [0.0, 0.0]
 
 
 def test_several_steps_decide():

@@ -42,10 +42,6 @@ def test_what_was_not_observed_stays_so():
     assert gate(td)["camera", "seen"].tolist() == [[True, False], [False, False]]
 
 
-def test_before_calibration_nothing_is_large():
-    assert SignGate(3)(clean(5))["seen"].all()
-
-
 def test_wrong_arguments_are_named():
     with pytest.raises(ValueError, match="floor is one number, or one for each of the 2"):
         SignGate(2, floor=(0.1,))

@@ -132,18 +132,6 @@ def test_angles_stay_beside_the_mean():
     assert (high - low).max() < 0.8
 
 
-def test_times_means_and_axes_may_be_passed():
-    seconds = torch.tensor([0.0, 1.0, 4.0])
-    given = Figure().subplots(2, 1)
-    panels = plot_bands(torch.ones(3, 2), torch.zeros(3, 2), time=seconds, ax=given, legend=False)
-    assert panels == list(given)
-    np.testing.assert_array_equal(line(panels[0], "belief")[0], seconds)
-    assert panels[0].get_xlim() == (-0.5, 5.5)
-    assert not panels[0].collections
-    assert panels[1].get_legend() is None
-    assert plot_bands(torch.ones(3, 1))[0].get_xlabel() == "step"
-
-
 def test_errors_say_what_to_do():
     run = ensemble_run()
     with pytest.raises(ValueError, match="2 Axes are needed, one a component; got 1"):
@@ -186,14 +174,3 @@ def test_a_slow_sensor_is_shaded_where_it_lost_a_reading_alone():
 def test_gap_is_the_longest_time_between_two_readings_that_is_no_outage(gap, count):
     (axes,) = plot_bands(slow_sensor(lost=2), time=0.01, gap=gap)
     assert len(spans(axes)) == count  # 2 s once, twice 1 s, and half a second at both ends
-
-
-def test_without_any_reading_all_is_shaded():
-    sequence = TensorDict({"belief": {"mean": torch.zeros(4, 1)}, "observed": torch.zeros(4, 1, dtype=torch.bool)}, [4])
-    (axes,) = plot_bands(sequence)
-    assert spans(axes) == [(-0.5, 3.5)]
-
-
-def test_a_gap_below_zero_is_refused():
-    with pytest.raises(ValueError, match="gap is the longest time between two readings"):
-        plot_bands(slow_sensor(lost=2), gap=-1)

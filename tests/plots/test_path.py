@@ -94,27 +94,6 @@ def test_ellipses_of_an_ensemble_are_those_of_its_covariance():
         np.testing.assert_allclose([patch.height, patch.width], wanted, rtol=1e-5)
 
 
-def test_space_has_one_span():
-    axes = plot_path(ensemble_run(), dims=[0, 1, 2])
-    (truth,) = [line for line in axes.get_lines() if line.get_label() == "truth"]
-    np.testing.assert_allclose(np.stack(truth.get_data_3d(), -1), ensemble_run()["state"], rtol=1e-6)
-    spans = [np.ptp(limits) for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
-    np.testing.assert_allclose(spans, spans[0])
-    assert axes.get_zlabel() == "z, m"
-
-
-def test_any_belief_and_any_axes():
-    run = ensemble_run()
-    given = Figure().add_subplot()
-    forecast = TensorDict({"forecast": {"ensemble": run["belief", "ensemble"]}, "truth": run["state"]}, [40])
-    axes = plot_path(forecast["forecast"], forecast["truth"], legend=False, ax=given)
-    assert axes is given
-    assert axes.get_legend() is None
-    np.testing.assert_allclose(lines(axes)["belief"], run["belief", "mean"][:, :2], rtol=1e-5)
-    assert set(lines(plot_path(run["belief", "mean"]))) == {"belief"}
-    assert "truth" in lines(plot_path(run.exclude("state").set("pose", run["state"]), "pose"))
-
-
 def test_errors_say_what_to_do():
     run = ensemble_run()
     with pytest.raises(KeyError, match=r"no \(\"belief\", \"mean\"\)"):
@@ -144,8 +123,3 @@ def test_readings_are_dots_where_they_were_read(forward_up):
     (dots,) = [line for line in axes.get_lines() if line.get_label() == "readings"]
     x, y = (dots.get_xdata().tolist(), dots.get_ydata().tolist())
     assert (x, y) == (([-2.0, -5.0], [1.0, 4.0]) if forward_up else ([1.0, 4.0], [2.0, 5.0]))
-
-
-def test_readings_of_other_dimensions_are_refused():
-    with pytest.raises(ValueError, match=r"readings must be \[T, 2\], a column for each of dims; got \[3, 4\]"):
-        plot_path(torch.zeros(3, 4), readings=torch.zeros(3, 4))

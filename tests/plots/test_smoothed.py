@@ -7,7 +7,7 @@ from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import ensemble_run, kalman_runs
 from torch_denkf.functional.manifolds import Circle
-from torch_denkf.plots import belief_video, plot_bands, plot_calibration, plot_path, plot_spread_error
+from torch_denkf.plots import plot_bands, plot_calibration, plot_path, plot_spread_error
 
 LAG = 6
 
@@ -76,26 +76,3 @@ def test_each_state_is_taken_from_the_latest_row_of_its_episode():
     np.testing.assert_allclose(drawn(axes, "smoothed belief")[:, 1], wanted, rtol=1e-6)
     (axes,) = plot_calibration(run, torch.zeros(9, 1), belief="smoothed", bins=2)
     assert heights(axes) == [100, 0]  # of three states, each below its mean
-
-
-def test_particles_of_long_ago_weigh_what_they_weigh_now():
-    age, weight = torch.tensor([[0], [1], [1]]), torch.tensor([[0.5, 0.5], [0.9, 0.1], [0.2, 0.8]])
-    ensemble = torch.tensor([[[0.0], [1.0]], [[0.0], [1.0]], [[0.0], [1.0]]])
-    run = TensorDict({"belief": {"log_weight": weight.log()}, "smoothed": {"ensemble": ensemble, "age": age}}, [3])
-    (axes,) = plot_bands(run, belief="smoothed")
-    np.testing.assert_allclose(drawn(axes, "smoothed belief")[:, 1], [0.1, 0.8, np.nan], rtol=1e-6)
-
-
-def test_a_video_shows_it(tmp_path, monkeypatch):
-    names = []
-    for name, plot in (("plot_bands", plot_bands), ("plot_path", plot_path)):
-
-        def note(*given, plot=plot, **settings):
-            axes = plot(*given, **settings)
-            names.extend(line.get_label() for line in np.ravel(axes)[0].get_lines() if line.get_gid() != "member")
-            return axes
-
-        monkeypatch.setattr(f"torch_denkf.plots.video.{name}", note)
-    run = kalman_runs(lag=LAG)[0][:12]
-    belief_video(tmp_path / "a.gif", run, belief="smoothed", path={}, bands={"dims": [0]}, size=(6, 4), every=4)
-    assert names.count("smoothed belief") == 2

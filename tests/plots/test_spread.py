@@ -50,11 +50,6 @@ def test_few_members_are_expected_to_err_more_than_they_spread():
     assert spread[0] == pytest.approx(error[0], abs=0.02)
 
 
-def test_the_axes_say_each_unit():
-    axes = plot_spread_error(kalman_runs(), names=["x, m", "y, m", "vx, m/s", "vy, m/s"])
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("predicted spread, m or m/s", "RMS error, m or m/s")
-
-
 def test_angles_are_wrapped():
     belief = TensorDict({"mean": torch.tensor([[0.0, 3.1]]), "var": torch.ones(1, 2)}, [1])
     axes = plot_spread_error(

@@ -20,7 +20,6 @@ from torchrl.envs import (
     InitTracker,
     ParallelEnv,
     SerialEnv,
-    StepCounter,
     TransformedEnv,
     check_env_specs,
 )
@@ -35,7 +34,6 @@ from tests.transforms.envs_for_tests import (
     fixed_filter,
     forked_env,
     half_known_filter,
-    known_start_filter,
     random_filter,
     random_rollout,
     seeded_env,
@@ -162,21 +160,6 @@ def test_copies_compute_the_same(copy):
     assert_equal(*rollouts, BELIEF)
 
 
-def test_state_dict():
-    first, second = (DEnKFTransform(toy_filter()) for _ in range(2))
-    env, other = (TransformedEnv(toy_base_env(batch_size=[3]), part) for part in (first, second))
-
-    def run(env):
-        torch.manual_seed(1)
-        env.set_seed(1)
-        return random_rollout(env)
-
-    assert not run(env)["next", "belief", "mean"].equal(run(other)["next", "belief", "mean"])
-    second.load_state_dict(first.state_dict())
-    assert_equal(run(env), run(other), BELIEF)
-    assert set(first.state_dict()) == {f"filter.{name}" for name in first.filter.state_dict()}
-
-
 def test_kalman_filter_in_the_transform(float64):
     kf = linear_kalman()
     env = filtered_env(lambda: kf, batch_size=[3], max_steps=[4, 7, 50], missing=0.2)
@@ -225,15 +208,3 @@ def test_nothing_on_self():
     other = TransformedEnv(base_env(batch_size=[2]), transform.clone())
     assert other.rollout(3).shape == (2, 3)
     assert env.rollout(3).shape == (3, 3)
-
-
-def test_spec_cache_is_cleared_on_append():
-    env = TransformedEnv(base_env(batch_size=[3]))
-    assert "belief" not in env.full_observation_spec
-    assert "belief" not in env.full_state_spec
-    env.append_transform(DEnKFTransform(known_start_filter()))
-    for spec in (env.full_observation_spec, env.full_state_spec):
-        assert ("belief", "ensemble") in spec.keys(True, True)
-    check_env_specs(env)
-    env.append_transform(StepCounter())
-    check_env_specs(env)

@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import (
     ClipTransform,
     Compose,
@@ -36,16 +35,6 @@ def test_plain_sequential_with_its_initial_belief():
         for transform in (DEnKFTransform(filter), DEnKFTransform(plain, initial=filter.initial))
     ]
     assert_equal(rollouts[0]["next"], rollouts[1]["next"], envs.BELIEF)
-
-
-def test_store_ensemble_false_outside_of_a_batched_environment():
-    plain = SerialEnv(2, [partial(envs.seeded_env, n, max_steps=n) for n in envs.STEPS])
-    env = TransformedEnv(plain, DEnKFTransform(envs.known_start_filter(), store_ensemble=False))
-    check_env_specs(env)
-    rollout = envs.random_rollout(env)
-    assert set(rollout["next", "belief"].keys()) == {"mean", "var"}
-    assert (rollout["belief", "mean"][0, [0, 3, 6, 9]] == torch.tensor(envs.PRIOR_MEAN)).all()
-    assert (rollout["belief", "mean"][0, [1, 2, 4, 5]] != torch.tensor(envs.PRIOR_MEAN)).all()
 
 
 @pytest.mark.parametrize("use_buffers", [False, True])
@@ -146,26 +135,6 @@ def test_reset_mask_of_the_transform_alone(float64, shape):
     torch.testing.assert_close(out["belief", "var"], expected.var(-2), rtol=0, atol=1e-15)
 
 
-def test_nested_reset_key(float64):
-    # done and _reset inside of a group, as in multi-agent environments: the mask is agent-wise.
-    env = TransformedEnv(
-        envs.base_env(batch_size=[3], max_steps=[3, 5, 30]),
-        Compose(
-            RenameTransform(
-                in_keys=["done", "terminated", "truncated"],
-                out_keys=[("group", "done"), ("group", "terminated"), ("group", "truncated")],
-                create_copy=True,
-            ),
-            DEnKFTransform(envs.known_start_filter()),
-        ),
-    )
-    rollout = envs.random_rollout(env)
-    start = torch.cat([torch.ones(3, 1, dtype=torch.bool), rollout["next", "done"][:, :-1].squeeze(-1)], 1)
-    ensemble = rollout["belief", "ensemble"]
-    assert (ensemble[start] == torch.tensor(envs.PRIOR_MEAN)).all()
-    assert ensemble[:, 1:][~start[:, 1:]].equal(rollout["next", "belief", "ensemble"][:, :-1][~start[:, 1:]])
-
-
 @pytest.mark.parametrize("resetting", [[], ["one"], ["two"], ["one", "two"]])
 def test_the_belief_starts_anew_where_any_group_does(float64, resetting):
     done = ["done", "terminated", "truncated"]
@@ -198,45 +167,6 @@ def test_diagnostics(float64, update_at_reset):
     if not update_at_reset:  # an initial belief has no innovation, and is its own forecast
         assert all((rollout[key][:, 0] == 0).all() for key in keys[:2])
         assert rollout["forecast", "ensemble"][:, 0].equal(rollout["belief", "ensemble"][:, 0])
-
-
-def test_randomness_does_not_depend_on_the_mode():
-    transform = DEnKFTransform(envs.toy_filter())
-    env, rollouts = TransformedEnv(envs.toy_base_env(batch_size=[3]), transform), []
-    assert not transform.training
-    for mode in (True, False):
-        transform.train(mode)
-        torch.manual_seed(1)
-        env.set_seed(1)
-        rollouts.append(env.rollout(4))
-    assert_equal(*rollouts, envs.BELIEF)
-    assert (rollouts[0]["next", "belief", "var"] > 0).all()
-
-
-def test_specs_use_up_no_random_numbers():
-    env = envs.filtered_env(envs.random_filter)
-    state = torch.get_rng_state()
-    _ = env.observation_spec, env.state_spec
-    assert torch.get_rng_state().equal(state)
-
-
-def test_gradient_mode_in_a_replay_buffer():
-    filter = envs.toy_filter()
-    frames = TensorDict({"observation": torch.randn(2, 5, 4), "action": torch.randn(2, 5, 2)}, [2, 5])
-    assert not DEnKFTransform(filter)(frames.copy())["belief", "mean"].requires_grad
-    assert DEnKFTransform(filter, no_grad=False)(frames.copy())["belief", "mean"].requires_grad
-
-
-def test_in_a_replay_buffer(float64):
-    filter = envs.fixed_filter()
-    buffer = ReplayBuffer(storage=LazyTensorStorage(4), transform=DEnKFTransform(filter), batch_size=3)
-    frames = TensorDict(
-        {"observation": torch.randn(4, 7, 2), "number": torch.arange(4).unsqueeze(-1).expand(4, 7)}, [4, 7]
-    )
-    buffer.extend(frames)
-    sample = buffer.sample()
-    expected = filter.sequence(frames[sample["number"][:, 0]].clone())
-    assert_equal(sample, expected, envs.BELIEF, atol=1e-14)
 
 
 class Doubled(envs.Changed):
