@@ -85,30 +85,12 @@ def test_reference_is_the_authors_code():
     torch.testing.assert_close(std, torch.full_like(std, 0.05))
 
 
-@pytest.mark.parametrize("preset", [DEnKF.paper, DEnKF.reference])
-@pytest.mark.parametrize("batch", [(), (2,)])
-def test_presets_filter_images(preset, batch):
-    denkf = preset(4, 3, image_shape=(3, 32, 48), ensemble_size=5, r=0.3)
-    td = TensorDict({"pixels": torch.randint(0, 256, (*batch, 3, 32, 48), dtype=torch.uint8)}, batch)
-    out = denkf.step(denkf.initialise(td))
-    torch.testing.assert_close(out["sensor", "noise"], torch.full((*batch, 3), 0.09))
-    assert out["belief", "ensemble"].shape == (*batch, 5, 4)
-    assert out["belief", "ensemble"].isfinite().all()
-    assert not out["belief", "ensemble"].equal(out["forecast", "ensemble"])
-
-
 def test_paper_arguments():
     initial = DEnKF.paper(4, 3, image_shape=(3, 16, 16), ensemble_size=7).initial
     denkf = DEnKF.paper(4, 3, image_shape=(3, 16, 16), initial=initial, ensemble_size=7, rate=0.5, update_at_reset=True)
     assert denkf.initial is initial
     assert denkf.update_at_reset
     assert {net.rate for net in denkf.modules() if isinstance(net, StochasticMLP) and net.layer == "dropout"} == {0.5}
-
-
-def test_standard_prior():
-    denkf = DEnKF.paper(4, 3, image_shape=(3, 16, 16))
-    assert denkf.initial.mean.equal(torch.zeros(4))
-    assert denkf.initial.std.equal(torch.ones(4))
 
 
 def test_process_noise_of_another_width_leaves_the_analysis_its_own():

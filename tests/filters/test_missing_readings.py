@@ -10,7 +10,6 @@ from torch import nn
 from tests.filters.beliefs_for_tests import BELIEF, ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import (
     NoisyLinear,
-    Perturbed,
     linear_denkf,
     linear_kalman,
     linear_system,
@@ -27,14 +26,6 @@ from torch_denkf.modules.particles import with_weights
 from torch_denkf.smoothers import FixedLag
 
 LOG_WEIGHT = ("belief", "log_weight")
-
-
-@pytest.mark.parametrize("make", [linear_denkf, linear_kalman, lambda: bootstrap(50)])
-def test_without_its_check_a_step_takes_nan(make):
-    filter = make()
-    filter.check_finite = False
-    td = filter.initialise(TensorDict({"observation": torch.tensor([0.0, torch.nan])}))
-    assert not filter.step(td)[MEAN].isfinite().all()
 
 
 def test_noise_that_is_given_and_is_not_finite_is_named():
@@ -126,27 +117,10 @@ def test_a_prediction_refuses_an_analysis_that_does_not_name_its_reading(float64
         nameless.predict(start)
 
 
-def test_an_analysis_without_a_mask_cannot_do_without_its_reading():
-    filter = linear_denkf("perturbed", noisy=True).with_modules(analysis=Perturbed())
-    td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
-    with pytest.raises(KeyError, match="its reading_keys and its observed_key"):
-        filter.predict(td)
-
-
 def test_an_analysis_that_cannot_take_a_past_says_what_to_write(float64):
     lagged = FixedLag(linear_denkf().with_modules(analysis=Halfway(True)), lag=2)
     with pytest.raises(RuntimeError, match=r"2 times 2 components: write Halfway.move_past"):
         lagged.sequence(TensorDict({"observation": torch.randn(4, 2)}, [4]))
-
-
-def test_a_filter_under_vmap_is_the_filter_row_by_row(float64):
-    filter, frames = linear_denkf(), torch.randn(4, 3, 6, 2)
-
-    def means(observation):
-        return filter.sequence(TensorDict({"observation": observation}, observation.shape[:-1]))[MEAN]
-
-    expected = torch.stack([means(rows) for rows in frames])
-    torch.testing.assert_close(torch.vmap(means)(frames), expected, rtol=0, atol=1e-12)
 
 
 def test_one_of_two_sensors_may_be_missing(float64):

@@ -8,9 +8,6 @@ from torch import nn
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system, toy_denkf, toy_frames
 from torch_denkf.filters import Filter
-from torch_denkf.modules import ConstantNoise, LinearObservation, SubModel
-from torch_denkf.modules.stochastic import deterministic
-from torch_denkf.running import run_module
 
 MEAN, ENSEMBLE = ("belief", "mean"), ("belief", "ensemble")
 
@@ -117,47 +114,6 @@ def test_flipout_in_a_sensor_has_a_perturbation_of_its_own_at_each_time():
     assert outs[0].equal(outs[1])
 
 
-class SideBySide(SubModel):
-    """Two noise modules for one reading, one behind the other."""
-
-    def __init__(self, *modules):
-        super().__init__(nn.ModuleList(modules), ["observation"], [("sensor", "noise")])
-
-    def on_entries(self, entries, call):
-        parts = [run_module(module, entries, call)[module.out_keys[0]] for module in self.module]
-        return {("sensor", "noise"): torch.cat(parts, -1)}
-
-
-def test_parts_of_different_sizes():
-    plain, other = linear_denkf("perturbed", noisy=True), linear_denkf("perturbed", noisy=True)
-    _, _, H, R = linear_system()
-    sd = torch.cat([R, R[:1]]).sqrt()
-    observation = LinearObservation(torch.cat([H, H[:1]]))
-    plain = plain.with_modules(observation=observation, noise=ConstantNoise(sd, in_key="observation"))
-    parts = (ConstantNoise(part, in_key="observation") for part in (sd[:1], sd[1:]))
-    other = other.with_modules(observation=observation, noise=SideBySide(*parts))
-    frames, outs = TensorDict({"observation": torch.randn(2, 5, 3)}, [2, 5]), []
-    assert set(other.draw_noise(frames.copy())["noise"].keys()) == {"transition", "analysis"}
-    for filter in (plain, other):
-        torch.manual_seed(1)
-        outs.append(filter.sequence(frames.copy())[MEAN])
-    torch.testing.assert_close(outs[1], outs[0])
-
-
-def test_a_deterministic_run_does_not_change_what_is_drawn_after_it():
-    filter, other = toy_denkf(), toy_denkf()
-    other.load_state_dict(filter.state_dict())
-    frames = toy_frames((3, 5))
-    with deterministic(other):
-        other.sequence(frames.copy())
-    outs = []
-    for model in (filter, other):
-        torch.manual_seed(1)
-        outs.append(model.sequence(frames.copy())[MEAN])
-    torch.testing.assert_close(*outs, rtol=0, atol=0)
-    assert {*other.draw_noise(frames.copy())["noise"].keys()} == {"initial", "sensor", "transition"}
-
-
 class Normalised(nn.Module):
     """Batch normalisation of all rows, which in training needs more than one."""
 
@@ -181,21 +137,6 @@ def test_a_batch_normalisation_does_not_notice_the_trial_step():
     filter.sequence(frames)
     assert sensor.module.norm.num_batches_tracked == 1
     assert all(part.training for part in filter.modules())
-
-
-def test_the_trial_step_calls_no_hooks():
-    filter, calls = linear_denkf("perturbed", noisy=True), []
-    filter["analysis"].register_forward_hook(lambda *_: calls.append("hook"))
-    filter["transition"].register_forward_pre_hook(lambda *_: calls.append("pre-hook"))
-    filter.draw_noise(readings(3, 5))
-    assert not calls
-
-
-def test_what_a_module_asked_for_before_is_drawn_where_its_reading_has_not_come():
-    filter = linear_denkf("perturbed", noisy=True)
-    filter.draw_noise(readings(3, 5))
-    drawn = filter.draw_noise(TensorDict({}, [3, 5]))["noise"]
-    assert drawn["analysis"].shape == (3, 5, 6, 2)
 
 
 def test_a_draw_of_which_a_part_is_missing_is_drawn_whole():

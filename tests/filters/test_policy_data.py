@@ -79,14 +79,6 @@ def test_an_element_without_a_belief_before_it_starts_from_the_initial_one(name)
     close(out[:, 3], start, filter.belief_keys)
 
 
-@every_filter
-def test_a_compiled_filter_goes_on_from_the_same_belief(name):
-    filter = FILTERS[name]()
-    data, steps = policy_data(filter, anew=(3,))
-    filter.compile(chunk=2, backend="eager")
-    close(filter.sequence(data.copy()), steps, filter.out_keys)
-
-
 def test_the_action_before_drives_the_step_and_need_not_be_stored_twice():
     control = torch.tensor([[0.5], [-1.0]])
     filter = linear_denkf(control=control)
@@ -164,14 +156,3 @@ def test_a_start_that_is_made_of_the_reading_uses_it():
     broken["observation"][1, 0] = torch.nan
     assert linear_denkf(initial=start).sequence(broken.copy())["belief", "mean"][1].isnan().all()
     assert linear_denkf().sequence(broken.copy())["belief", "mean"].isfinite().all()
-
-
-def test_policy_steps_under_vmap():
-    filter = linear_kalman()
-    row = policy_data(filter)[0][:, 0].select("observation", ("previous", "belief"))
-
-    def step(*values):
-        return filter(TensorDict(dict(zip(keys, values, strict=True)), []))["belief", "mean"]
-
-    keys = list(row.keys(True, True))
-    torch.testing.assert_close(torch.vmap(step)(*(row[key] for key in keys)), filter(row)["belief", "mean"])

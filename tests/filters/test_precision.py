@@ -9,13 +9,11 @@ from tests.filters.beliefs_for_tests import COV, MEAN, VAR, close
 from tests.filters.factories import (
     NoisyLinear,
     linear_system,
-    toy_denkf,
-    toy_frames,
 )
 from tests.filters.gaussian_for_tests import linear_filter
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter
-from torch_denkf.modules import ConstantNoise, GaussianPrior, LinearObservation, MomentPrior, Select, StochasticMLP
+from torch_denkf.modules import ConstantNoise, GaussianPrior, LinearObservation, MomentPrior, Select
 
 
 def test_float64_matrices_beside_float32_are_refused():
@@ -83,17 +81,6 @@ def test_process_noise_is_a_part_of_an_ensemble_filter(float64):
     torch.testing.assert_close(out[VAR], exact[VAR], rtol=0.06, atol=0)
     collapsed = DEnKF(NoisyLinear(F), *parts, initial=prior, observation_key="observation").sequence(frames.copy())
     assert (collapsed[VAR][-1] < 0.3 * exact[VAR][-1]).all()
-
-
-def test_a_replaced_network_draws_its_own_noise():
-    filter, frames = toy_denkf(action=False), toy_frames((2, 5), resets=False)
-    filter.sequence(frames.copy())
-    filter["transition"].module = StochasticMLP(3, 3, (16, 16, 4), rate=0.3)
-    assert filter.draw_noise(frames.copy())["noise", "transition"].shape[-1] == 36
-    assert filter.sequence(frames.copy())[MEAN].isfinite().all()
-    filter = filter.with_modules(observation=Select([0, 1]))
-    out = filter.sequence(frames.copy())
-    assert out["forecast", "observation"][:, 1:].equal(out["forecast", "ensemble"][:, 1:, :, :2])
 
 
 @pytest.mark.parametrize("value", [0.1, torch.tensor(0.1), np.float32(0.1)])

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torchrl.envs import TransformedEnv
 from torchrl.modules import set_recurrent_mode
 from torchrl.modules.utils import get_env_transforms_from_module
@@ -154,12 +154,3 @@ def test_smoothers_and_losses_of_a_filter_with_a_prefix(float64, make):
     named_loss, plain_loss = (loss(smoother.filter, nll=1.0)(frames) for smoother in (other, plain))
     assert dict(named_loss.items()) == dict(plain_loss.items())
     assert named_loss["loss_nll"] != 0
-
-
-def test_foreign_modules_read_what_stands_under_a_prefix():
-    filter = random_walk(prefix="imu")
-    double = TensorDictModule(lambda mean: 2 * mean, [("imu", "belief", "mean")], ["doubled"])
-    data = TensorDict({"observation": torch.ones(4, 1)}, [4])
-    with set_recurrent_mode(True):
-        out = TensorDictSequential(filter, double)(data)
-    assert torch.equal(out["doubled"], 2 * out["imu", "belief", "mean"])

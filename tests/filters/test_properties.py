@@ -160,16 +160,6 @@ def test_a_step_that_observes_nothing_is_a_forecast(seed, batch, name, width):
         close(blind[key], forecast[key])
 
 
-@FIXED
-@given(SEEDS, GAUSSIAN | ENSEMBLE, st.sampled_from([torch.float32, torch.float64]))
-def test_a_filter_keeps_its_precision(seed, name, dtype):
-    system = System(seed, dtype=dtype)
-    filter = system.gaussian(name) if name[0].isupper() else system.ensemble(name)
-    out = filter.sequence(system.frames(seed, (2,)))
-    kinds = {value.dtype for value in out.values(True, True) if value.is_floating_point()}
-    assert kinds == {dtype}
-
-
 @pytest.mark.parametrize("name", ["KalmanFilter", "EKF", "UKF", "BackpropKF"])
 def test_single_precision_is_near_double(name):
     results = []

@@ -185,13 +185,6 @@ def test_marks_of_beginnings_stand_above_those_of_ends(float64):
     close(filter.sequence(data), plain, [ENSEMBLE, MEAN])
 
 
-def test_groups_of_next_and_previous_mark_nothing(float64):
-    filter, (data, _) = linear_denkf(), marked()
-    plain = filter.sequence(data.copy())
-    data["next", "agents", "is_init"] = data["previous", "is_init"] = torch.ones(9, 1, dtype=torch.bool)
-    close(filter.sequence(data), plain, [ENSEMBLE, MEAN])
-
-
 def test_other_modules_make_a_new_filter():
     """The filter itself stays as it is, and the modules of both are the same but for the new one."""
     filter = blocks(named=True)
@@ -222,24 +215,6 @@ def test_a_new_module_that_would_lose_readings_is_named():
     with pytest.raises(ValueError, match=r"'wheels' \(KalmanAnalysis\) takes in .* the reading would be lost"):
         two.with_modules(gps=KalmanAnalysis(one, one, observation_key="gps"))
     assert two["gps"] is gps
-
-
-def test_a_module_of_a_list_is_exchanged_by_its_number():
-    filter = Filter(*linear_denkf()._module_iter(), initial=linear_denkf().initial)
-    last = len(filter) - 1
-    for place in (last, str(last)):
-        new = EnsembleAnalysis("sakov", observation_key="observation")
-        assert filter.with_modules({place: new})[last] is new
-
-
-def test_a_new_filter_has_hooks_and_buffers_of_its_own():
-    filter = linear_denkf()
-    other, calls = filter.with_options(check_finite=False), []
-    other.register_forward_hook(lambda *_: calls.append("other"))
-    other.register_buffer("own", torch.zeros(1))
-    filter(filter.initialise(TensorDict({"observation": torch.zeros(3, 2)}, [3])))
-    assert not calls
-    assert "own" not in dict(filter.named_buffers())
 
 
 def test_other_options_are_checked_like_those_of_the_constructor():

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal
 
-from tests.functional.checks import Shapes, assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.functional import analyse, ensemble_mean, kalman_update
 from torch_denkf.functional.inflation import random_rotation
 from torch_denkf.functional.moments import ensemble_anomalies, ensemble_cov
@@ -232,32 +232,6 @@ def test_compiled_equals_eager_forward_and_backward(sizes, schemes, backend):
         torch.testing.assert_close(ours, theirs, **EXACT)
 
 
-@pytest.mark.parametrize("sizes", [(8, 400, 300), (300, 400, 8)])
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_nothing_is_larger_than_the_inputs(scheme, sizes):
-    # Forward and backward: no S x S, no O x O where O > E, no E x E where E > O.
-    problem = Problem(*sizes)
-    inputs = [tensor.requires_grad_() for tensor in problem.tensors]
-    with Shapes() as shapes:
-        result = problem.analyse(scheme)
-        torch.autograd.grad(sum(value.square().sum() for value in result), inputs)
-    assert max(shape.numel() for shape in shapes.seen) == problem.forecast.numel()
-
-
-@pytest.mark.parametrize("space", SPACES)
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_vmap_equals_the_batch(scheme, space):
-    problem = Problem(6, 4, 3, (2,))
-    perturbation = problem.perturbation if scheme == "perturbed" else None
-
-    def call(*tensors):
-        return analyse(*tensors[:4], scheme=scheme, space=space, perturbation=(*tensors[4:], None)[0])
-
-    extra = () if perturbation is None else (perturbation,)
-    mapped = torch.func.vmap(call)(*problem.tensors, *extra)
-    torch.testing.assert_close(mapped, problem.analyse(scheme, space=space), **EXACT)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -313,12 +287,6 @@ def test_a_taper_of_blocks_is_one_analysis_for_each_block(scheme):
         torch.testing.assert_close(tapered.ensemble[..., rows], alone.ensemble, **EXACT)
         nis = nis + alone.nis
     torch.testing.assert_close(tapered.nis, nis, **EXACT)
-
-
-def test_a_taper_of_ones_changes_nothing_and_one_per_batch_is_allowed():
-    problem = Problem(4, 3, 9, (2,))  # more observations than members: the taper decides for observation space
-    ones = torch.ones(2, 3, 9, dtype=torch.float64), torch.ones(2, 9, 9, dtype=torch.float64)
-    torch.testing.assert_close(problem.analyse("sensor", taper=ones), problem.analyse("sensor"), **EXACT)
 
 
 @pytest.mark.parametrize(

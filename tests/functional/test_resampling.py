@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
-from tests.functional.checks import assert_compiled_is_eager, assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.functional import (
     crps_ensemble,
     crps_weighted,
@@ -115,13 +115,6 @@ def test_soft_weights_correct_for_the_proposal(alpha):
     index = (out.unsqueeze(-2) == particles.unsqueeze(-3)).all(-1).int().argmax(-1)
     ratio = (log_weights.exp() / proposal).gather(-1, index)
     torch.testing.assert_close(weights.exp(), ratio / ratio.sum(-1, keepdim=True))
-
-
-def test_alpha_one_changes_nothing():
-    particles, log_weights = problem((5,))
-    out, weights = soft_resample(particles, log_weights, 0.2 + 0.6 * torch.rand(5, 1), alpha=1.0)
-    assert out.equal(particles)
-    torch.testing.assert_close(weights, log_weights)
 
 
 @pytest.mark.parametrize("width", [1, E])
@@ -237,14 +230,6 @@ def test_gradient_of_transport():
     assert torch.autograd.gradcheck(moved, (particles, log_weights))
 
 
-def test_transport_of_one_point():
-    particles = torch.ones(2, 4, 1, requires_grad=True)
-    out, _ = transport_resample(particles, torch.randn(2, 4).log_softmax(-1))
-    torch.testing.assert_close(out, torch.ones(2, 4, 1))
-    out.sum().backward()
-    assert particles.grad.isfinite().all()
-
-
 def test_transport_of_a_single_likely_particle():
     particles, log_weights = problem(size=8, spread=500.0)
     assert effective_sample_size(log_weights) < 1.001
@@ -268,13 +253,6 @@ def test_errors():
     with pytest.raises(ValueError, match="epsilon and iterations must be positive"):
         transport_resample(particles, log_weights, epsilon=0.0)
     assert_refused(ValueError, "at least 2", weighted_var, particles[:1], log_weights[:1])
-
-
-def test_compiled_equals_eager():
-    def everything(x, w, u):
-        return [*systematic_resample(x, w, u), *soft_resample(x, w, u), *transport_resample(x, w, iterations=3)]
-
-    assert_compiled_is_eager(everything, *problem((3,)), torch.rand(3, 1))
 
 
 def test_jitter_moves_the_copies_and_has_the_kernels_covariance():
@@ -303,15 +281,6 @@ def test_jitter_of_few_effective_particles_is_wide():
     alone = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).log()
     moved = jitter_copies(particles[[0, 0, 0, 0]], particles, alone, ones)
     torch.testing.assert_close(moved[1:], particles.std().expand(3, 1))
-
-
-def test_jitter_is_zero_without_copies_or_factor():
-    particles, log_weights = torch.randn(5, 4, 2), torch.randn(5, 4).log_softmax(-1)
-    normal = torch.randn(5, 4, 2)
-    assert jitter_copies(particles, particles, log_weights, normal).equal(particles)
-    copies = particles[:, :1].expand_as(particles)
-    assert jitter_copies(copies, particles, log_weights, normal, factor=0.0).equal(copies)
-    assert_refused(ValueError, "0 or more", jitter_copies, copies, particles, log_weights, normal, factor=-1.0)
 
 
 def test_gradient_of_jitter_is_that_of_finite_differences():

@@ -230,20 +230,6 @@ def test_more_numbers_than_fit_at_once_are_believed_as_far(float64, monkeypatch)
     torch.testing.assert_close(analyse(*given, scheme="etkf", significance=1.5).ensemble, expected, rtol=0, atol=0)
 
 
-def test_a_threshold_that_is_not_a_number_is_not_silent(cases):
-    forecast, *given = cases
-    assert analyse(forecast, *given, scheme="etkf", significance=torch.tensor(torch.nan)).ensemble.isnan().all()
-
-
-def test_a_tensor_is_a_buffer_of_its_own():
-    threshold = torch.tensor([1.0, 2.0])
-    analysis = EnsembleAnalysis("etkf", localisation="significance", threshold=threshold)
-    threshold += 1
-    assert analysis.state_dict()["threshold"].tolist() == [1, 2]
-    with pytest.raises(TypeError, match=r"threshold is a number or a tensor; got \[1.0, 2.0\]"):
-        EnsembleAnalysis("etkf", localisation="significance", threshold=[1.0, 2.0])
-
-
 @pytest.mark.parametrize("analysis", [EnsembleAnalysis, partial(LocalEnsembleAnalysis, torch.ones(5, 2))])
 def test_a_threshold_is_positive(analysis):
     with pytest.raises(ValueError, match="threshold"):

@@ -137,13 +137,6 @@ def test_a_rollout_is_one_sequence(ended):
         torch.testing.assert_close(loss(flags[None])["loss_state"], expected)
 
 
-def test_truncated_ends_a_slice_like_done():
-    loss = objective()
-    rows = TensorDict({"observation": torch.randn(12, 2), "state": torch.randn(12, 2)}, [12])
-    cut = rows.copy().set(("next", "truncated"), (torch.arange(12) % 6 == 5).unsqueeze(-1))
-    torch.testing.assert_close(loss(cut)["loss_state"], loss(rows.reshape(2, 6))["loss_state"])
-
-
 def test_an_episode_that_is_done_needs_a_mark_after_it():
     rows = TensorDict({"observation": torch.randn(12, 2), "state": torch.randn(12, 2)}, [12])
     rows["is_init"] = torch.arange(12).unsqueeze(-1) == 0

@@ -1,25 +1,15 @@
 """The programs of the page on policies: which gradients reach the filter, and what is filtered anew."""
 
-import re
 from functools import cache
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.envs import ExplorationType
-from torchrl.modules import TanhNormal, set_recurrent_mode
-from torchrl.objectives import DDPGLoss, SACLoss, SoftUpdate
+from torchrl.objectives import DDPGLoss
 
-from tests.filters.composed import A, S
 from tests.objectives.test_torchrl_losses import (
     MEAN,
-    beliefs_by_hand,
-    collected,
-    filter_and_frames,
-    filtered,
-    q_network,
-    sac,
     with_other_beliefs,
 )
 from tests.test_docs import BLOCK, ROOT
@@ -143,18 +133,6 @@ def regulated(names):
         weight.data.copy_(before)
 
 
-def test_the_returns_that_need_no_training_are_those_of_the_page():
-    names = run("ppo")
-    torch.manual_seed(0)
-    still = with_policy(names, TensorDictModule(Still(), ["state"], ["action"]), names["test"])
-    truth = with_policy(names, TensorDictModule(Regulator(), ["state"], ["action"]), names["test"])
-    row = re.search(r"^\| regulator .*$", PAGE.read_text(), re.MULTILINE)[0]
-    stated = [float(number) for number in re.findall(r"-\d+\.\d", row)]
-    assert [regulated(names), truth] == pytest.approx(stated, abs=0.2)
-    stated = float(re.search(r"without any push returns (-\d+\.\d)", PAGE.read_text())[1])
-    assert still == pytest.approx(stated, abs=0.2)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "rounds"), [("ppo", 25), ("sac", 20), ("ddpg", 20)])
 def test_a_program_learns(name, rounds):
@@ -165,91 +143,3 @@ def test_a_program_learns(name, rounds):
     best = regulated(names)
     still = with_policy(names, TensorDictModule(Still(), ["state"], ["action"]), names["test"])
     assert names["test"]() > best + 0.25 * (still - best)
-
-
-class Draw(TensorDictModuleBase):
-    """Draws a filter's noise, so that what is collected holds it."""
-
-    def __init__(self, filter):
-        super().__init__()
-        self.in_keys, self.out_keys = [], [("noise", "transition"), ("noise", "initial")]
-        self.__dict__["filter"] = filter
-
-    def forward(self, tensordict):
-        return self.filter.draw_noise(tensordict)
-
-
-@pytest.mark.parametrize("length", [50, 25, 10])
-def test_a_slice_gives_the_beliefs_that_the_collector_had(length):
-    """With the collector's noise: episodes cut into slices, each from the belief that is stored before it."""
-    names = run("ppo")
-    policy = TensorDictSequential(Draw(names["denkf"]), names["policy"])
-    play = names["play"]
-    data = with_policy(names, policy, lambda: play(3, 5, ExplorationType.RANDOM))
-    assert ("noise", "transition") in data.keys(True)
-    rows = data.reshape(-1, length)
-    with torch.no_grad(), set_recurrent_mode(True):
-        again = names["denkf"](with_other_beliefs(rows))
-    torch.testing.assert_close(again[MEAN], rows[MEAN], rtol=1e-4, atol=1e-5)
-
-
-def test_ddpg_in_front_with_target_networks(float64):
-    """Both losses written out; the target is of the slowly following networks, on what the filter believes now."""
-    filter, frames = filter_and_frames()
-    data = collected(filter, frames)
-    head, value = nn.Linear(S, A), q_network()
-    actor = TensorDictModule(head, [MEAN], ["action"])
-    loss = DDPGLoss(actor, value, delay_actor=True)
-    loss.make_value_estimator(gamma=0.9)
-    updater = SoftUpdate(loss, tau=0.25)  # puts the networks themselves in the place of the target networks
-    before = [[p.clone() for p in network.parameters()] for network in (head, value)]
-    with torch.no_grad():
-        for parameter in [*filter.parameters(), *loss.parameters()]:
-            parameter.add_(0.1 * torch.randn_like(parameter))
-    updater.step()
-    out = loss(filtered(filter, with_other_beliefs(data)))
-
-    roots, nexts = beliefs_by_hand(filter, data)
-    torch.testing.assert_close(out["loss_actor"], -value.module(roots, head(roots)).mean())
-    predicted = value.module(roots, data["action"]).detach()
-    with torch.no_grad():
-        for network, old in zip((head, value), before, strict=True):
-            for parameter, earlier in zip(network.parameters(), old, strict=True):
-                parameter.copy_(0.25 * parameter + 0.75 * earlier)
-        worth = value.module(nexts, head(nexts))
-    target = data["next", "reward"] + 0.9 * ~data["next", "terminated"] * worth
-    torch.testing.assert_close(out["loss_value"], nn.functional.mse_loss(predicted, target))
-
-
-@pytest.mark.parametrize("vmap", [True, False])
-def test_sac_in_front_with_target_networks(float64, vmap):
-    """Two critics, whose target networks have followed a quarter of the way: the critics' loss written out."""
-    filter, frames = filter_and_frames()
-    data = collected(filter, frames)
-    actor, head, options = sac(filter, inside=False)
-    loss = SACLoss(actor, q_network(), deactivate_vmap=not vmap, **options)
-    loss.make_value_estimator(gamma=0.9)
-    updater = SoftUpdate(loss, tau=0.25)
-    with torch.no_grad():
-        for parameter in loss.qvalue_network_params.values(True, True):
-            parameter.add_(0.1 * torch.randn_like(parameter))
-    old = loss.target_qvalue_network_params.clone()
-    updater.step()
-    torch.manual_seed(3)
-    found = loss(filtered(filter, with_other_beliefs(data)))["loss_qvalue"]
-
-    def q_by_hand(params, mean, action):
-        with params.to_module(loss.qvalue_network):
-            return loss.qvalue_network.module(mean, action)
-
-    roots, nexts = beliefs_by_hand(filter, data)
-    torch.manual_seed(3)
-    ahead = TanhNormal(*head(nexts.detach()))
-    action = ahead.rsample()
-    now = loss.qvalue_network_params.detach()
-    slow = (0.25 * now.to_tensordict() + 0.75 * old.to_tensordict()).detach()
-    worth = torch.stack([q_by_hand(slow[number], nexts, action) for number in (0, 1)]).min(0).values
-    worth = worth - 0.3 * ahead.log_prob(action).unsqueeze(-1)
-    target = (data["next", "reward"] + 0.9 * ~data["next", "terminated"] * worth).detach()
-    by_hand = sum((q_by_hand(now[number], roots, data["action"]) - target).square().mean() for number in (0, 1))
-    torch.testing.assert_close(found, by_hand)

@@ -66,11 +66,6 @@ def test_labels_of_another_shape(make, case):
     refuses(lambda: make(**options)(data), *words)
 
 
-def test_no_dims():
-    for make in LOSSES.values():
-        refuses(lambda make=make: make(dims=[]), "dims", "got none")
-
-
 def test_parts_of_the_state_where_all_of_it_is_read():
     short = TensorDict({"state": torch.zeros(4, 5, 2), "target_observation": torch.zeros(4, 5, 2)}, [4, 5])
     refuses(lambda: ObservationLoss(toy_denkf())(short), "whole true state of 3", "'state' has 2")
@@ -111,10 +106,6 @@ def test_settings(loss, options, words):
     refuses(lambda: LOSSES[loss](**options), words)
 
 
-def test_an_energy_of_steps_of_moments():
-    refuses(lambda: TransitionLoss(linear_kalman(), score="energy"), '"crps", "nll" or "mse"')
-
-
 OBSERVATION, SENSOR = only(TERMS, "observation"), only(TERMS, "sensor")
 MISSING = [
     ("state", DEnKFLoss, toy_denkf, {}, "DEnKFLoss reads", "state", "set_keys"),
@@ -139,11 +130,6 @@ def test_missing_entries(left_out, loss, make, options, words):
 def test_a_step_takes_two_times():
     frames, _ = problem(toy_denkf())
     refuses(lambda: TransitionLoss(linear_kalman())(frames[0, 0]), "two times")
-
-
-def test_the_keys_that_a_loss_reads_are_set_by_name():
-    with pytest.raises(AttributeError, match="set_keys"):
-        DEnKFLoss(toy_denkf()).in_keys = ["state"]
 
 
 # --------------------------------------------------------------------------------------------- another kind of belief
@@ -212,13 +198,6 @@ def test_what_is_no_key(name, key):
         refuses(lambda loss=loss: loss.set_keys(**{name: key}), name, "is a key", repr(key), error=TypeError)
     if name == "belief":
         refuses(lambda: TransitionLoss(linear_kalman(), belief=key), name, repr(key), error=TypeError)
-
-
-def test_none_is_the_default_key():
-    loss = DEnKFLoss(toy_denkf())
-    loss.set_keys(state=("truth", "x"))
-    loss.set_keys(state=None)
-    assert loss.tensor_keys.state == "state"
 
 
 def test_what_makes_no_smoother():

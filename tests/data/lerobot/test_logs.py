@@ -225,15 +225,6 @@ def test_origins_that_are_none(tmp_path, origin, error, match):
         open_all(tmp_path, origin=origin)
 
 
-def test_rows_in_memory_are_selected_by_their_owner():
-    image = torch.zeros(4, 3, 8, 8, dtype=torch.uint8)
-    rows = TensorDict({"observation": {"image": image, "state": torch.rand(4, 2)}, "episode": torch.zeros(4)}, [4])
-    recording = recording_from_rows(rows, fps=10.0)
-    for options in ({"episodes": [0]}, {"origin": {"state": 1.0}}):
-        with pytest.raises(ValueError, match="episodes= and origin= are for folders"):
-            LeRobotReplay(recording, **options)
-
-
 def test_a_stamp_that_is_missing_leaves_the_others_their_steps(tmp_path):
     write_version_2(tmp_path, [20])
     file = tmp_path / "data/chunk-000/episode_000000.parquet"

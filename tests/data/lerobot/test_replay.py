@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 
 import torch_denkf.data.lerobot.recording as recording_module
@@ -153,13 +152,6 @@ def test_slices_are_contiguous_and_in_one_episode(root, options):
     )
 
 
-def test_each_row_once(root):
-    data = LeRobotReplay(root, size=SIZE, cache=None, batch_size=6, sampler=SamplerWithoutReplacement())
-    seen = torch.cat([batch["index"].flatten() for batch in data])
-    assert sorted(seen.tolist()) == list(range(len(data)))
-    assert len(data) < sum(LENGTHS)
-
-
 def test_statistics_by_numpy(root):
     data = LeRobotReplay(root, size=SIZE, cache=None)  # the training split
     which = [e.number for e in data.episodes]
@@ -175,19 +167,6 @@ def test_statistics_by_numpy(root):
     everything = open_all(root)  # its statistics are those of the training episodes, too
     assert (everything.statistics == data.statistics).all()
     assert abs(everything[:]["state"][:, 0].mean() - data.statistics["state", "mean"][0]) > 0.01
-
-
-def test_transforms_and_preprocess_see_the_pixels(root, tmp_path):
-    data = open_all(root, transform=lambda rows: rows.set("half", rows["pixels"] / 2), batch_size=4)
-    sample = data.sample()
-    assert sample["half"].equal(sample["pixels"] / 2)
-    shared.check_preprocess(open_all(root), tmp_path)
-
-
-def test_it_deletes_and_writes_nothing(root):
-    data = open_all(root)
-    shared.check_nothing_is_deleted(data)
-    assert data.root == root.resolve()
 
 
 # Cache and bar --------------------------------------------------------------------------------------------------------

@@ -69,15 +69,6 @@ def test_repeats_are_those_that_were_written():
     shared.check_contract(data)
 
 
-def test_count_is_of_the_split():
-    repeats = torch.zeros(EPISODES, LENGTH, dtype=torch.bool)
-    repeats[:, 5] = True
-    record, _ = recording(0, repeats)
-    for split in ("train", "test"):
-        data = LeRobotReplay(record, split=split, repeats="mask")
-        assert data.repeats_masked == len(data.episodes)
-
-
 def test_an_episode_does_not_repeat_the_one_before():
     pictures = torch.full((4, 3, 4, 4), 7, dtype=torch.uint8)
     first = torch.tensor([True, False, True, False])
@@ -97,12 +88,6 @@ def test_threshold_is_in_grey_levels():
     rows = torch.arange(2)
     assert not repeated_pictures(pictures, rows, rows == 0, threshold=0.0999)[1]
     assert repeated_pictures(pictures, rows, rows == 0, threshold=0.1001)[1]
-
-
-def test_other_words_are_refused():
-    record, _ = recording(0)
-    with pytest.raises(ValueError, match="'keep' or 'mask', got 'drop'"):
-        LeRobotReplay(record, repeats="drop")
 
 
 # Lag ------------------------------------------------------------------------------------------------------------------
