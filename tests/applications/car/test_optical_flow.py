@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
-from torchrl.envs import Compose, InitTracker, TransformedEnv, check_env_specs
+from torchrl.envs import Compose, InitTracker, TransformedEnv
 
 from tests.applications.car.vision.drives_for_tests import rendered
 from tests.filters.factories import FixedEnsemble
@@ -20,7 +20,6 @@ from torch_denkf.applications.car import (
 )
 from torch_denkf.applications.car.kitti.frames import frames_at
 from torch_denkf.applications.car.vision.motion import image_motion
-from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import DiagonalNoise, EnsembleAnalysis, Select, StochasticMLP
 from torch_denkf.transforms import DEnKFTransform
@@ -62,15 +61,6 @@ def test_replayed_frames_have_the_drives_motion(colour):
     same(rollout["next"], expected[1:])
 
 
-def test_rows_that_reset_start_anew():
-    drive = a_drive()
-    expected = with_motion(drive, cache=None)
-    env = flow_env(drive, batch_size=[2], start=[2, 10], length=[3, 20 - 10])
-    rollout = env.rollout(5, break_when_any_done=False)
-    same(rollout[0], expected[[2, 3, 2, 3, 2]])
-    same(rollout[1], expected[10:15])
-
-
 def test_frames_that_are_not_observed_are_zero_and_not_read():
     drive = a_drive()
     frames = frames_at(drive, torch.arange(10, 14))
@@ -98,27 +88,6 @@ def test_height_calibration_and_keys_by_hand():
     assert out["a"].equal(torch.from_numpy(flow))
     assert out["b", "c"].equal(torch.from_numpy(road))
     assert (transform(td.set("there", torch.tensor([False])))["a"] == 0).all()
-
-
-def test_spec():
-    drive = a_drive()
-    for batch in ([], [2]):
-        env = flow_env(drive, batch_size=batch, start=2, length=4)
-        check_env_specs(env)
-        assert env.observation_spec["flow"].shape == (*batch, *FLOW_SHAPE)
-        assert env.observation_spec["road"].shape == (*batch, *ROAD_SHAPE)
-        assert env.observation_spec["road"].dtype == torch.float32
-    nested = OpticalFlow(calibration(drive), out_keys=(("motion", "flow"), ("motion", "road")))
-    check_env_specs(TransformedEnv(KITTIReplayEnv(drive, length=4), nested))
-
-
-def test_errors_say_what_to_pass():
-    transform = OpticalFlow((87.0, 86.5, 73.4, 24.8))
-    with pytest.raises(KeyError, match=r"'pixels'.*'?image"):
-        transform(TensorDict({"image": torch.zeros(2, 50, 150)}))
-    for shape in ((3, 50, 150), (50, 150), (1, 2, 50, 150)):
-        with pytest.raises(ValueError, match=r"2C, H, W.*'pixels'"):
-            transform(TensorDict({"pixels": torch.zeros(shape)}))
 
 
 # ------------------------------------------------------------------------------------------------------ in a filter

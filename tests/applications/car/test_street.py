@@ -12,7 +12,7 @@ from torch_denkf.applications.car.street.camera import HEIGHT, Camera
 from torch_denkf.applications.car.street.path import Path as Way
 from torch_denkf.applications.car.street.renderer import Renderer
 from torch_denkf.applications.car.street.scene import RESOLUTION, Box, Mover
-from torch_denkf.applications.car.street.terrain import SMOOTH, Terrain
+from torch_denkf.applications.car.street.terrain import SMOOTH
 from torch_denkf.applications.car.street.textures import TILE
 from torch_denkf.applications.car.vision.poses import KITTI_DT, poses_to_state
 
@@ -172,22 +172,3 @@ def test_nothing_stands_on_any_stretch_of_the_road():
             )
             gap = np.linalg.norm(scene.road[:, None] - np.array(outline), axis=-1).min()
             assert gap > scene.road_width / 2 - 0.6, (seed, item)  # the map of the roads has cells of 0.5 m
-
-
-def test_ground_that_neighbouring_stretches_share_is_the_same():
-    # Once round a block, and on along the same street 3 m higher: recorded altitudes drift.
-    side = np.arange(60.0)
-    square = [np.stack([0 * side, side], -1), np.stack([side, 60 + 0 * side], -1)]
-    square += [np.stack([60 + 0 * side, 60 - side], -1), np.stack([60 - side, 0 * side], -1)]
-    line = np.concatenate([*square, square[0], square[0][-1] + np.stack([0 * side, side + 1], -1)])
-    heights = HEIGHT - 0.0125 * np.arange(len(line))
-    terrain = Terrain(line, heights)
-    for metre in range(16, len(line) - 120, 16):
-        first, second = terrain.around(metre), terrain.around(metre + 16)
-        visible = line[metre : metre + 80]
-        np.testing.assert_allclose(first.at(*visible.T), second.at(*visible.T), atol=0.03)
-        near = line[metre : metre + 30]
-        np.testing.assert_allclose(first.at(*near.T), heights[metre : metre + 30], atol=0.15)
-    # The same place, at both times, lies where the car was at that time.
-    np.testing.assert_allclose(terrain.around(32).at(*line[40]), heights[40], atol=0.15)
-    np.testing.assert_allclose(terrain.around(272).at(*line[280]), heights[280], atol=0.15)

@@ -83,15 +83,6 @@ def test_a_robot_may_start_upside_down():
     torch.testing.assert_close(up, row["imu"][3:] / 9.81, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("key", ["imu", "joints", "joint_rates", "contact"])
-def test_readings_of_another_robot_are_named(key):
-    env = quadruped_env(seed=0)
-    row = env.reset().select("imu", "joints", "joint_rates", "contact")
-    row[key] = row[key][:-1]
-    with pytest.raises(ValueError, match=key):
-        legged_filter(env.model, **QUADRUPED, dt=env.dt, kind="EKF").initialise(row)
-
-
 @pytest.mark.parametrize("kind", ["EKF", "UKF", "DEnKF"])
 def test_a_run_goes_on_from_what_is_carried(kind):
     """The velocity of the stored belief follows from it and from what the gyro reads then."""

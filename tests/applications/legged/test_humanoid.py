@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from torchrl.envs.utils import check_env_specs
 
 from tests.applications.legged.test_environment import PERFECT
 from torch_denkf.applications.legged import legged_filter
@@ -26,10 +25,6 @@ def walking(env, steps, **gait):
 @pytest.fixture(scope="module")
 def log():
     return walking(humanoid_env(PERFECT, speed=0.5, turn=0.2), 400).double()
-
-
-def test_specs():
-    check_env_specs(humanoid_env())
 
 
 def test_it_walks_upright_on_its_own_legs(log):

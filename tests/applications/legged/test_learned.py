@@ -6,7 +6,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
-from torchrl.envs import TransformedEnv
 
 from tests.applications.legged.test_environment import trotting
 from torch_denkf import from_pretrained
@@ -14,7 +13,6 @@ from torch_denkf.applications.legged import (
     QUADRUPED,
     LearnedContacts,
     LeggedNoises,
-    last_rows,
     legged_filter,
     quadruped_env,
     with_last_rows,
@@ -96,42 +94,6 @@ def test_feet_of_a_rigid_turn_say_one_velocity(model, log):
     stands = log["contact"][0].any(-1)
     assert_close(features[stands][..., 7:10], velocity[stands].unsqueeze(-2).expand(-1, 4, 3), rtol=0, atol=1e-3)
     assert torch.equal(features[..., 0].bool(), log["contact"][0])
-
-
-def test_feet_in_the_air_do_not_count_in_the_mean(model):
-    """Feet that disagree: the mean is of those that stand, row by row, and zero where none does."""
-    torch.manual_seed(0)
-    contacts, rows, count = contacts_of(model, rows=3), 3, 6
-    imu, joints, rates = (
-        torch.randn(count, rows * 6),
-        0.3 * torch.randn(count, rows * 16),
-        torch.randn(count, rows * 16),
-    )
-    stands = torch.rand(count, rows, 4) < 0.5
-    stands[0, 1] = False
-    features = contacts.features(imu, joints, rates, stands.flatten(-2)).unflatten(-1, (rows, 16))
-    base, mean = features[..., 4:7], features[..., 7:10]  # [count, feet, rows, 3]
-    for row in range(rows):
-        for one in range(count):
-            own = base[one, stands[one, row], row]
-            expected = own.sum(0) / max(len(own), 1)
-            assert_close(mean[one, :, row], expected.expand(4, 3), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("every", [1, 2])
-def test_an_environment_keeps_the_rows_of_a_log(every):
-    env = TransformedEnv(quadruped_env(seed=4), last_rows(3, every))
-    row = env.reset()
-    rows = [row]
-    for step in range(6):
-        row = env.step(row.set("action", torch.full((12,), 0.1 * step)))["next"]
-        rows.append(row)
-    found = torch.stack([row.select(*KEYS, "last") for row in rows]).unsqueeze(0)
-    expected = with_last_rows(found.select(*KEYS), 3, every)
-    assert env.observation_spec["last", "imu"].shape == (18,)
-    assert torch.equal(expected["last", "imu"][0, 6, :6], found["imu"][0, 6 - 2 * every])
-    for key in KEYS:
-        assert torch.equal(found["last", key], expected["last", key]), key
 
 
 def test_a_foot_walks_as_its_noise_says():
@@ -237,23 +199,6 @@ def test_they_learn_through_the_filter(model, log):
     assert all(each.isfinite().all() for each in gradients.values())
     assert gradients[last].any()
     assert gradients[next(name for name in gradients if name.startswith("mean"))] is not None
-
-
-def test_without_rates_they_are_refused(model):
-    with pytest.raises(ValueError, match="rates_key"):
-        legged_filter(model, **QUADRUPED, dt=0.01, rates_key=None, contacts=contacts_of(model))
-
-
-def test_rows_without_a_standing_foot_teach_nothing(model, log):
-    rows = with_last_rows(log, 10)
-    rows["last", "contact"] = torch.zeros_like(rows["last", "contact"])
-    with pytest.raises(ValueError, match="No foot stands"):
-        contacts_of(model).loss(rows)
-
-
-def test_other_numbers_of_rows_are_named(model, log):
-    with pytest.raises(ValueError, match=r"rows of 'imu' .* last_rows"):
-        contacts_of(model).loss(with_last_rows(log, 11))
 
 
 def test_the_shipped_filter_knows_feet_that_slide():

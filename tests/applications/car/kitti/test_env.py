@@ -31,14 +31,6 @@ def same(rollout, frames, rows, keys=KEYS):
         torch.testing.assert_close(rollout[key], frames[key][rows], rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("batch_size", [[], [3], [2, 2]])
-def test_specs(drive, batch_size):
-    check_env_specs(KITTIReplayEnv(drive, batch_size=batch_size, length=5))
-    env = KITTIReplayEnv(drive, batch_size=batch_size, start="random", length=5, device="cpu")
-    check_env_specs(env)
-    assert env.device == env.reset().device == torch.device("cpu")
-
-
 @pytest.mark.parametrize("colour", [True, False, None])
 def test_a_rollout_is_the_drives_frames(root, tmp_path, colour):
     env = KITTIReplayEnv(root, "town", size=(10, 30), colour=colour, cache=tmp_path)
@@ -119,19 +111,3 @@ def test_the_pair_that_shows_a_speed_is_labelled_with_it():
     assert rollout["observed"].all()
     torch.testing.assert_close(moved / dt, rollout["state"][:, 3])
     assert rollout["state"][:, 3].tolist() == pytest.approx([5.0] * 6 + [12.0] * 5)
-
-
-def test_errors_say_what_to_do(root, drive):
-    with pytest.raises(TypeError, match=r"name the sequence to replay.*list_kitti_drives"):
-        KITTIReplayEnv(root)
-    with pytest.raises(TypeError, match="not both"):
-        KITTIReplayEnv(drive, "town")
-    with pytest.raises(FileNotFoundError, match=r"no folder .*sequences/09"):
-        KITTIReplayEnv(root, "09")
-    with pytest.raises(ValueError, match="random starts need the number of frames"):
-        KITTIReplayEnv(drive, start="random")
-    with pytest.raises(ValueError, match="or 'random', got 'first'"):
-        KITTIReplayEnv(drive, start="first", length=3)
-    for options in ({"start": 20, "length": 5}, {"start": -1}, {"length": 1}, {"start": ROWS - 1}):
-        with pytest.raises(ValueError, match=r"do not fit in a drive of 24 rows.*at least 2 frames"):
-            KITTIReplayEnv(drive, **options)

@@ -52,10 +52,3 @@ def test_differences_and_flow_are_those_of_the_frames_left_side_by_side(drive):
         assert motion[key][kept][seen].equal(expected[key][seen])
         assert not motion[key][~kept].any()
         assert not motion[key][12].any()
-
-
-def test_the_cache_knows_the_pairs(drive, tmp_path):
-    apart, bridged = with_motion(drive, cache=tmp_path), with_motion(bridge_gaps(drive), cache=tmp_path)
-    assert not apart["road"][4].any()
-    assert bridged["road"][4].any()
-    assert with_motion(bridge_gaps(drive), cache=tmp_path)["road"].equal(bridged["road"])

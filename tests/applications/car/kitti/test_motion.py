@@ -8,11 +8,9 @@ import torch
 import torch_denkf.applications.car.kitti.motion as motion_module
 from tests.applications.car.vision.drives_for_tests import rendered
 from tests.applications.car.vision.plane_for_tests import as_image, random_texture
-from torch_denkf.applications.car import read_kitti_drive, with_motion, write_drives
-from torch_denkf.applications.car.vision.epipolar import two_view_motion
+from torch_denkf.applications.car import with_motion
 from torch_denkf.applications.car.vision.motion import image_motion
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
-from torch_denkf.applications.car.vision.signs import picture_signs, static_region
 
 cv2.setNumThreads(1)
 ROWS = 8
@@ -53,21 +51,6 @@ def test_rows_are_image_motion_of_neighbours(drive):
     for key in drive.keys():  # noqa: SIM118
         assert out[key] is drive[key]  # a shallow copy
     assert "flow" not in drive
-
-
-def test_corners_are_tracked_if_asked_for(drive, tmp_path):
-    plain = with_motion(drive, cache=tmp_path)
-    out = with_motion(drive, cache=tmp_path, two_view=True)  # not the entry without
-    assert "two_view" not in plain
-    assert out["flow"].equal(plain["flow"])
-    assert not out["two_view"][0].any()
-    images = drive["image"][:, 0].numpy()
-    for row in range(1, ROWS):
-        expected = two_view_motion(images[row - 1], images[row], drive["calibration"][row].tolist())
-        assert out["two_view"][row].equal(torch.from_numpy(expected))
-    turned = drive["state"][1:, 4] * drive["dt"][1:, 0]
-    # Images of 60 rows: a twentieth of a degree, or a tenth of a pixel.
-    assert (out["two_view"][1:, 0] - turned).abs().median() < np.deg2rad(0.05)
 
 
 def test_rows_without_a_pair_are_zero(drive):
@@ -179,22 +162,3 @@ def test_mirrored_images_give_the_mirrored_flow():
     # The table sees the flow only through the median turn.
     assert (mirrored["road"] - out["road"]).abs().max() < 0.1
     assert (mirrored["road"] - out["road"]).abs().float().mean() < 0.01
-
-
-def test_signs_and_repaired_flow_are_those_of_each_pair(tmp_path):
-    drive = read_kitti_drive(tmp_path, *write_drives(tmp_path, ["town"], frames=4), colour=False, cache=None).copy()
-    image = drive["image"].clone()
-    image[2:, :, 15:35, 60:90] = 0  # hidden in the last two pictures
-    drive["image"] = image
-    plain, repaired = (with_motion(drive, cache=tmp_path / "cache", signs=True, repair=each) for each in (False, True))
-    pictures = image[:, 0].numpy()
-    for row in (1, 2, 3):
-        before, after = pictures[row - 1], pictures[row]
-        assert torch.equal(plain["signs"][row], torch.from_numpy(picture_signs(before, after)))
-        hidden = static_region(before, after)
-        assert hidden.any() == (row == 3)
-        flow, _ = image_motion(before, after, drive["calibration"][row].tolist(), hidden=hidden)
-        assert torch.equal(repaired["flow"][row], torch.from_numpy(flow).half())
-    assert torch.equal(plain["flow"][:3], repaired["flow"][:3])
-    assert not torch.equal(plain["flow"][3], repaired["flow"][3])
-    assert "signs" not in with_motion(drive, cache=tmp_path / "cache")

@@ -172,18 +172,6 @@ def test_a_box_appears_where_its_corners_project():
             assert abs(found.max() - expected.max()) < 1.01
 
 
-def test_drives_follow_from_name_and_seed_alone(town, tmp_path):
-    def pictures(root, name):
-        return [file.read_bytes() for file in sorted((root / "sequences" / name / "image_2").iterdir())]
-
-    assert write_drives(tmp_path / "a", "hill", frames=60, seed=3) == ["hill"]
-    assert pictures(tmp_path / "a", "hill") == pictures(town, "hill")
-    assert (tmp_path / "a/poses/hill.txt").read_bytes() == (town / "poses/hill.txt").read_bytes()
-    write_drives(tmp_path / "b", ["hill"], frames=60, seed=4)
-    assert pictures(tmp_path / "b", "hill")[5] != pictures(town, "hill")[5]
-    assert pictures(town, "hill")[5] != pictures(town, "town")[5]
-
-
 def test_drives_that_are_there_are_kept(tmp_path):
     write_drives(tmp_path, ["a"], frames=3)
     picture = tmp_path / "sequences/a/image_2/000001.png"

@@ -10,7 +10,7 @@ from torchrl.data.datasets import BaseDatasetExperienceReplay
 
 import torch_denkf.applications.car.kitti.drive as kitti_module
 from tests.data import replay_for_tests as shared
-from torch_denkf.applications.car import KITTIOdometryExperienceReplay, read_kitti_drive, with_motion, write_drives
+from torch_denkf.applications.car import KITTIOdometryExperienceReplay, read_kitti_drive, write_drives
 from torch_denkf.applications.car.kitti.frames import drive_frames
 from torch_denkf.applications.car.kitti.mirror import mirror_drive
 from torch_denkf.data.cache_entry import CachedTensor
@@ -72,12 +72,6 @@ def test_all_rows(root):
     shared.check_indices(data)
 
 
-@pytest.mark.parametrize("options", shared.ways_to_slice())
-def test_slices_are_contiguous_and_in_one_episode(root, options):
-    # 18 + 8 + 36 windows fit in the drives and as many in their mirror images.
-    shared.check_slices(open_dataset(root, mirrored=True, **{"batch_size": 24, **options}), options, "step", KEYS)
-
-
 def test_statistics_by_hand(root):
     """Of the training drives alone: numpy, from the PNGs of those two drives."""
     data = open_dataset(root, ["hill", "town"])
@@ -103,39 +97,6 @@ def test_statistics_by_hand(root):
     assert statistics["pixels", "mean"].shape == (6, 1, 1)
     others = open_dataset(root).statistics
     assert abs(others["velocity", "mean"][0] - statistics["velocity", "mean"][0]) > 0.01  # the lane would count
-
-
-def test_flow(root, tmp_path):
-    """Added once for each drive and camera, mirrored with its episode, with or without pixels."""
-    calls = []
-
-    def flow(drive, **options):
-        calls.append(len(drive))
-        return with_motion(drive, cache=tmp_path, **options)
-
-    data = open_dataset(root, ["lane", "town"], mirrored=True, flow=flow)
-    assert calls == [9, 23]
-    rows = data[:]
-    for episode in data.episodes:
-        _, drive = expected_rows(root, episode)
-        drive = with_motion(drive, cache=tmp_path)
-        frames = drive_frames(mirror_drive(drive) if episode.mirrored else drive)
-        for key in ("flow", "road", "pixels"):
-            assert rows[key][episode.start : episode.start + episode.length].equal(frames[key]), key
-    assert rows["flow"][1, 0].any()
-    assert not (rows["flow"][1] == rows["flow"][1 + 9]).all()  # the lane's mirror image
-    light = open_dataset(root, ["lane", "town"], mirrored=True, flow=partial(flow, keep_images=False))
-    assert "pixels" not in light[:]
-    assert light[:]["flow"].equal(rows["flow"])
-    assert light[:]["calibration"].equal(rows["calibration"])
-    assert set(light.statistics.keys()) == {"state", "velocity"}
-    short = open_dataset(root, ["lane", "town"], mirrored=True, flow=True, cache=tmp_path / "cache")
-    assert (short[:] == rows).all()
-    assert len(list(tmp_path.glob("cache/motion-*"))) == 2
-    assert "flow" not in open_dataset(root, "lane", flow=False)[:]
-    for bad in (lambda drive: drive, lambda drive: flow(drive)[1:]):
-        with pytest.raises(ValueError, match=r"flow must return the drive with 'flow', 9 rows of it; for lane/image_2"):
-            open_dataset(root, "lane", flow=bad)
 
 
 def test_the_cache_is_mapped_and_opens_without_decoding(root, tmp_path, monkeypatch):

@@ -34,16 +34,3 @@ def test_cameras(tmp_path):
             open_dataset(tmp_path, cameras=wrong)
     with pytest.raises(FileNotFoundError, match=r"no folder .*sequences/01/image_2"):
         open_dataset(tmp_path, cameras=["image_2"], drives="01")
-
-
-def test_a_drive_that_starts_later(tmp_path):
-    """Row 0 is frame 2: frame k is (R, G, B) = (100 + k, 50 + k, k), and one brighter than the frame before."""
-    make(tmp_path, images=[2, 3, 4, 5])
-    data = open_dataset(tmp_path, mirrored=True)
-    assert [episode.length for episode in data.episodes] == [4, 4]
-    rows = data[:]
-    assert rows["frame"].flatten().tolist() == [2, 3, 4, 5] * 2
-    assert rows["step"].flatten().tolist() == [0, 1, 2, 3] * 2
-    assert rows["time"][[0, 4]].flatten().tolist() == [0, 0]
-    values = (255 * rows["pixels"][:, :, 5, 7]).round().int().tolist()
-    assert values == [[100 + k, 50 + k, k, *[int(k > 2)] * 3] for k in (2, 3, 4, 5)] * 2

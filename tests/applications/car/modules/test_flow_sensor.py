@@ -173,15 +173,6 @@ def test_unobserved_nan_rows_poison_nothing(columns):
     torch.testing.assert_close(out[[0, 2]], sensor(alone)["sensor", "ensemble"])
 
 
-@pytest.mark.parametrize(
-    ("key", "shape"), [("flow", (3, 25, 78)), ("flow", (25, 79, 3)), ("road", (69, 13)), ("road", (1, 13, 69))]
-)
-def test_wrong_shape_names_the_key_and_who_writes_it(key, shape):
-    frames = random_frames().set(key, torch.zeros(shape))
-    with pytest.raises(ValueError, match=rf"'{key}'.*OpticalFlow"):
-        make()(frames)
-
-
 def test_mirrored_drives_turn_the_other_way():
     """The reading before any correction: v stays as it is, and the turn changes its sign."""
     sensor, motion = make(layer="none"), rendered_motion("road9").select("flow", "road")

@@ -165,30 +165,6 @@ def test_a_slow_camera_is_read_again_when_the_car_slows_down(float64):
     assert abs(float(out["belief", "mean"][-1, 3]) - 2.0) < 1.0
 
 
-def test_steps_equal_the_sequence(float64):
-    filter = pair_filter(8, "etkf", change=torch.nn.Linear(2, 2))
-    frames = frames_of(torch.randn(10, 2) + torch.tensor([4.0, 0.1]), [0, 1, 0, 2, 1, 0, 0, 3, 1, 0])
-    filter.draw_noise(frames)
-    expected = filter.sequence(frames.copy())
-    row, rows = filter.initialise(frames[0].copy()), []
-    for t in range(1, 10):
-        row = filter.step(frames[t].copy().update(row.select(*filter.carry_keys)))
-        rows.append(row["belief", "ensemble"])
-    torch.testing.assert_close(torch.stack(rows), expected["belief", "ensemble"][1:], rtol=0, atol=1e-12)
-    assert filter.carry_keys == [("belief", "ensemble"), ("belief", "history")]
-
-
-def test_gradients_reach_the_past(float64):
-    before, history, analysis = (torch.randn(*shape, requires_grad=True) for shape in ((2, 5), (2, 2, 2), (2, 9)))
-
-    def moved(before, history, analysis):
-        td = TensorDict({"belief": {"ensemble": before, "history": history}, "analysis": {"ensemble": analysis}})
-        td = UnicycleMotion(0.1, history_key=("belief", "history"))(td.set("steps", torch.tensor([3])))
-        return td["belief", "ensemble"]
-
-    assert torch.autograd.gradcheck(moved, (before, history, analysis))
-
-
 def test_a_smoothed_path_is_that_of_a_kalman_filter_of_velocity_and_way(float64):
     """Its way is corrected by all innovations since; so is the filter's path, if the history is as long as the drive.
 
@@ -216,14 +192,6 @@ def test_a_smoothed_path_is_that_of_a_kalman_filter_of_velocity_and_way(float64)
     torch.testing.assert_close(way.var(), cov[1, 1], rtol=4 * (2 / size) ** 0.5, atol=0)
     assert float(mean[1] - found[False][:, 0].mean()) > 20 * error  # 0.13 m of 14.5 m
     torch.testing.assert_close(found[True][:, 3:], found[False][:, 3:], rtol=0, atol=1e-12)  # velocities are the same
-
-
-def test_a_curve_is_what_the_sensor_makes_of_the_whole_way(float64):
-    forecast, history = torch.tensor([[0.0, 0.0, 0.0, 10.0, 0.1]]), torch.tensor([[[9.0, 0.2]]])
-    td = TensorDict({"forecast": {"ensemble": forecast}, "belief": {"history": history}, "steps": [2]})
-    out = PairObservation([20.0, torch.inf], curve=lambda way: way**2)(td)["forecast"]
-    torch.testing.assert_close(out["observation"], torch.tensor([[19.0**2, 0.3**2]]))
-    assert out["observed"]  # it is the way, not what is read, that must be within reach
 
 
 def test_velocities_go_on_changing_by_a_share_of_their_last_change(float64):

@@ -2,7 +2,6 @@
 
 import os
 import warnings
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -15,8 +14,6 @@ from torch_denkf.applications.car.kitti.gaps import bridge_gaps
 from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.applications.car.odometry.images import read_frames
-from torch_denkf.applications.car.vision.motion import image_motion
-from torch_denkf.applications.car.vision.shapes import ROAD_SHIFTS
 from torch_denkf.pretrained import from_pretrained
 
 
@@ -98,17 +95,6 @@ def test_times_with_a_gap_count_as_missing_frames(checkpoint, drive):
         list(track(car, images, calibration, times=far))
 
 
-def test_colour_and_large_images_are_read_as_grey_and_small_ones(checkpoint, drive):
-    car, images, calibration = from_pretrained(checkpoint), frames_of(drive), calibration_of(drive)
-    grey = list(track(car, images[:5], calibration))
-    colour = list(track(car, (np.dstack([image] * 3) for image in images[:5]), calibration))
-    assert torch.equal(grey[-1].mean, colour[-1].mean)
-    fx, fy, cx, cy = calibration
-    large = (image.repeat(4, 0).repeat(4, 1) for image in images[:5])
-    reduced = list(track(car, large, (4 * fx, 4 * fy, 4 * cx + 1.5, 4 * cy + 1.5)))
-    torch.testing.assert_close(reduced[-1].mean, grey[-1].mean, rtol=1e-3, atol=1e-3)
-
-
 def test_bad_input_says_what_to_do(checkpoint, drive):
     car, images, good = from_pretrained(checkpoint), frames_of(drive), calibration_of(drive)
     for calibration in (good[:3], [0.0, *good[1:]], [float("nan"), *good[1:]]):
@@ -171,31 +157,6 @@ def test_a_camera_that_does_not_fit_is_noticed(moving):
     assert "the road does not look like a plane under this camera" in message
     (message,) = messages(moving, height=4.5)
     assert "m between two frames, where the sensor's range ends" in message
-
-
-def test_height_scales_the_path_and_cannot_be_seen(moving):
-    """Nothing contradicts a wrong height: twice as high a camera sees the same images on twice as long a way."""
-    assert messages(moving, height=2.5) == []
-    motions = []
-    for height in (1.65, 2.475):
-        images = [image[0].numpy() for image in moving["image"][20:31]]
-        roads = [image_motion(*pair, calibration_of(moving), height=height)[1] for pair in pairwise(images)]
-        motions.append(np.median([ROAD_SHIFTS[road.max(0).argmax()] for road in roads]))
-    assert motions[1] == pytest.approx(1.5 * motions[0], rel=0.15)
-
-
-def test_a_damaged_frame_of_a_video_is_missing(tmp_path):
-    """It does not end the video."""
-    file = tmp_path / "run.mkv"
-    writer = cv2.VideoWriter(str(file), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"MJPG"), 10, (320, 240))
-    for number in range(8):
-        writer.write(np.random.default_rng(number).integers(0, 255, (240, 320, 3), np.uint8))
-    writer.release()
-    data = bytearray(file.read_bytes())
-    starts = [k for k in range(len(data)) if data[k : k + 3] == b"\xff\xd8\xff"]
-    data[starts[5] : starts[5] + 2000] = bytes(2000)
-    file.write_bytes(data)
-    assert [frame is None for frame in read_frames(file)] == [k == 5 for k in range(8)]
 
 
 @pytest.mark.parametrize("blank", [0, 255, (20, 20, 240)])

@@ -12,7 +12,7 @@ from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
 from torch_denkf.applications.car.odometry.filter import CarSettings, car_filter
 from torch_denkf.applications.car.odometry.roles import assign_roles
 from torch_denkf.applications.car.odometry.scores import calibrate
-from torch_denkf.applications.car.odometry.streams import Drive, all_frames, lose_frames, read_spans, take_spans
+from torch_denkf.applications.car.odometry.streams import Drive, all_frames, read_spans
 from torch_denkf.applications.car.odometry.training import Updates, train_car_filter
 from torch_denkf.training import FilterTrainer
 
@@ -127,16 +127,3 @@ def test_evaluation_beside_the_floor(trained, root, tmp_path):
     assert missing[0]["blind"] > 0.3
     with pytest.raises(ValueError, match=r"missing is in \[0, 1\)"):
         evaluate_car_filter(car, root, ["b"], missing=1.0)
-
-
-def test_readings_over_gaps_are_those_of_pairs(trained, root):
-    """take_spans picks, for each frame, the reading of as many steps as are missing before it."""
-    data = [each.read() for each in Drive(root, "b", (25, 75), trained[0] / "cache", two_view=True).spans(3)]
-    spans = read_spans(trained[1].sensor, data, 3)
-    steps = torch.tensor([0, 1, 0, 2, 3, 1, 5, *[1] * 9])
-    taken = take_spans(spans, steps)
-    assert taken["observed"].flatten().tolist() == [False, True, False, True, True, True, False, *[True] * 9]
-    assert torch.equal(taken["sensor", "ensemble"][4], spans["spans", "ensemble"][4, 2])
-    assert taken["steps"].flatten().tolist()[3:7] == [2, 3, 1, 0]
-    lost = lose_frames(spans, seed=0, share=0.5)
-    assert (lost["sensor"] == lose_frames(spans, seed=0, share=0.5)["sensor"]).all()

@@ -56,16 +56,6 @@ def test_a_direction_is_seen_where_the_canonical_camera_projects_it(name, direct
     np.testing.assert_allclose(camera.pixels(*map(np.float64, direction)), expected, rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("fx", "focal", "height", "width"),
-    # 2 * 0.27 * focal + 1 rows and 2 * 0.86 * focal + 1 columns, by hand.
-    [(87.2, 120.0, 66, 207), (200.0, 192.0, 105, 331), (721.5, 240.0, 131, 414)],
-)
-def test_resolution_near_a_real_camera(fx, focal, height, width):
-    camera = CanonicalCamera.near((fx, 1.0, 2.0, 3.0))
-    assert (camera.focal, camera.height, camera.width) == (pytest.approx(focal), height, width)
-
-
 def test_a_large_image_is_averaged_and_not_sampled():
     rng = np.random.default_rng(0)
     large = rng.integers(0, 256, (376, 1241)).astype(np.uint8)  # white noise: its means over 3 x 3 pixels vary a third

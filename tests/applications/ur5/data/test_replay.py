@@ -2,11 +2,9 @@
 
 from functools import partial
 
-import cv2
 import numpy as np
 import pytest
 import torch
-from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 
 from tests.applications.ur5.data.ur5_demos import LENGTHS, SIZE, make_demo, ten_demos, write_folder
@@ -51,21 +49,6 @@ def test_all_rows(root):
     shared.check_indices(data)
 
 
-def test_frames_only(root):
-    data = open_dataset(root, split="all", frames_only=True, batch_size=5, sampler=SamplerWithoutReplacement())
-    everything = open_dataset(root, split="all")[:]
-    expected = everything[everything["observed"].squeeze(-1)]
-    rows = data[:]
-    assert len(rows) == 30
-    for key in ("pixels", "state", "action", "step", "task", "episode", "success", "observed"):
-        assert (rows[key] == expected[key]).all(), key
-    assert rows["is_init"].all()
-    assert rows["next", "done"].all()
-    assert [(e.start, e.length) for e in data.episodes] == [(3 * k, 3) for k in range(10)]
-    seen = torch.cat([batch["index"].flatten() for batch in data])
-    assert sorted(seen.tolist()) == list(range(30))
-
-
 def test_splits_are_by_demo(root, tmp_path):
     demos = {split: {e.demo for e in open_dataset(root, split=split).episodes} for split in ("train", "test", "all")}
     assert demos["train"] | demos["test"] == demos["all"] == set(range(10))
@@ -83,12 +66,6 @@ def test_splits_are_by_demo(root, tmp_path):
     assert {e.demo for e in open_dataset(fewer, split="test").episodes} == set(tests[:3])
 
 
-@pytest.mark.parametrize("options", shared.ways_to_slice())
-def test_slices_are_contiguous_and_in_one_demo(root, options):
-    data = open_dataset(root, split="all", **{"batch_size": 24, **options})
-    shared.check_slices(data, options, "step", ("pixels", "state", "action", "observed", "step"))
-
-
 def test_statistics_are_of_the_training_demos_alone(root):
     train = [e.demo for e in open_dataset(root).episodes]
     demos = [make_demo(number, LENGTHS[number]) for number in train]
@@ -99,23 +76,6 @@ def test_statistics_are_of_the_training_demos_alone(root):
         shared.check_statistics(statistics, state=state, action=action, pixels=pixels)
     shape = tuple(statistics["pixels", "std"].shape)
     assert shape == (3, 1, 1)
-
-
-def test_scaled_pixels(root, tmp_path):
-    data = open_dataset(root, split="all", size=(6, 8), frames_only=True)
-    for picture, row in zip(make_demo(0, LENGTHS[0]).pixels, data[:3]["pixels"], strict=True):
-        # By half in each direction, areas are 2 x 2 blocks; OpenCV rounds the quarter sums.
-        blocks = picture.reshape(3, 6, 2, 8, 2).mean((2, 4))
-        np.testing.assert_allclose(row.numpy() * 255, blocks, atol=0.5001)
-    uneven = open_dataset(root, split="all", size=(5, 11), frames_only=True, cache=tmp_path)
-    expected = cv2.resize(make_demo(0, 9).pixels[0].transpose(1, 2, 0), (11, 5), interpolation=cv2.INTER_AREA)
-    assert (uneven[0]["pixels"].numpy() == expected.transpose(2, 0, 1).astype(np.float32) / 255).all()
-    pixels = uneven[:]["pixels"].numpy()[[e.start + k for e in uneven.episodes for k in range(3)]]
-    train = [e.demo for e in open_dataset(root).episodes]
-    of_training = pixels.reshape(10, 3, 3, 5, 11)[train]
-    np.testing.assert_allclose(
-        uneven.statistics["pixels", "std"].flatten(), of_training.std((0, 1, 3, 4), dtype=np.float64), rtol=1e-5
-    )
 
 
 def test_the_cache_is_read_and_follows_the_files(root, tmp_path, monkeypatch):

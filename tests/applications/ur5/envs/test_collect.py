@@ -1,8 +1,6 @@
 """Demos are the expert's episodes; kills, processes and damage leave a collection byte for byte as it would be."""
 
-import json
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -184,15 +182,6 @@ def test_damaged_files_are_found_and_made_again(unbroken, copy, capsys, damage):
     assert capsys.readouterr().out == f"6 demos in {copy}: all checksums are right\n"
 
 
-def test_a_file_without_a_line_is_not_trusted(unbroken, copy):
-    """A run killed between the file and its line, or a file put there by hand."""
-    lines = (copy / MANIFEST).read_text().splitlines(keepends=True)
-    (copy / MANIFEST).write_text("".join(lines[:4] + lines[5:]))
-    (copy / "demo-000004.npz").write_bytes(b"something else")
-    assert collect_ur5_demos(copy, DEMOS, **BLIND) == 1
-    assert content(copy) == content(unbroken)
-
-
 def test_failures_are_left_out_and_counted(tmp_path, monkeypatch, unbroken):
     episode = episodes._episode
 
@@ -214,22 +203,6 @@ def test_failures_are_left_out_and_counted(tmp_path, monkeypatch, unbroken):
     assert len(read_manifest(tmp_path)) == 2
 
 
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ({"seed": 4}, "seed 3 instead of 4"),
-        ({"max_steps": 41, "noise": 0.1}, "max_steps 350 instead of 41, noise 0.0 instead of 0.1"),
-        ({"frames": 2}, "frames None instead of 2"),
-        ({"tasks": ["push"]}, r"tasks \['pick', 'push', 'put_down'\] instead of \['push'\]"),
-    ],
-)
-def test_another_collection_is_refused(unbroken, change, text):
-    before = content(unbroken)
-    with pytest.raises(ValueError, match=f"{unbroken} holds another collection, with {text}"):
-        collect_ur5_demos(unbroken, DEMOS, **{**BLIND, **change})
-    assert content(unbroken) == before
-
-
 def test_options_out_of_range(tmp_path):
     for change, text in [
         ({"tasks": []}, "tasks are some of"),
@@ -244,20 +217,3 @@ def test_options_out_of_range(tmp_path):
         with pytest.raises(ValueError, match=text):
             collect_ur5_demos(tmp_path / "no", 1, **{**BLIND, **change})
     assert not (tmp_path / "no").exists()
-
-
-def test_the_command(tmp_path, capsys, unbroken):
-    out = tmp_path / "demos"
-    words = ["--out", str(out), "--no-pixels", "--seed", "3", "--processes", "1", "--demos", "2"]
-    assert CollectUR5.main(words) == 0
-    assert capsys.readouterr().out == f"2 demos in {out}: 2 made, 0 were there; 0 failed episodes left out\n"
-    expected = content(unbroken)
-    assert all(data == expected[name] for name, data in content(out).items() if name != MANIFEST)
-    assert json.loads((out / COLLECTION).read_text())["size"] == [224, 224]
-    assert CollectUR5.main([*words, "--seed", "4"]) == 2
-    assert re.match(r"error: .*seed 3 instead of 4", capsys.readouterr().err)
-    (tmp_path / "file").touch()
-    assert CollectUR5.main(["--out", str(tmp_path / "file"), "--no-pixels"]) == 2
-    assert "cannot use" in capsys.readouterr().err
-    assert CollectUR5.main(["--out", str(tmp_path / "none"), "--verify"]) == 2
-    assert "no demos in" in capsys.readouterr().err

@@ -50,9 +50,3 @@ def test_a_ghost_is_translucent_and_orange(env):
     change = (with_ghost - alone).abs().amax(0)[touched]
     assert change.median() < 0.2  # what is behind shines through,
     assert change.max() < 0.5  # also where several links lie behind one another
-
-
-@pytest.mark.parametrize("shape", [(10,), (4, 5, 10), (5, 6)])
-def test_ghosts_of_another_shape(env, shape):
-    with pytest.raises(ValueError, match=r"ghosts are \[\*N, G, S\] beside a state \[\*N, S\]"):
-        env.render_state(torch.zeros(10), ghosts=torch.zeros(shape))
