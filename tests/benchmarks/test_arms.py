@@ -6,7 +6,7 @@ from tensordict import TensorDict
 
 pytest.importorskip("dm_control", reason="dm_control is not installed: pip install dm-control 'mujoco<4'")
 
-from benchmarks.arms.arms import ARMS, NOISE, SIDE, Encoders, HoldAngles, make_one, wrap
+from benchmarks.arms.arms import ARMS, NOISE, SIDE, Encoders, make_one, wrap
 from benchmarks.arms.filters import DRIFT, LENGTH, ArmTransition
 from benchmarks.arms.sensor import CELLS, FromPlaces, JointPlaces, JointSensor
 from benchmarks.arms.study import scores
@@ -32,25 +32,6 @@ def test_reacher_knows_where_finger_and_target_are(seed):
     torch.testing.assert_close(velocity, torch.tensor(physics.data.qvel[:2]).float())
 
 
-def test_manipulator_knows_its_weight():
-    arm, _, physics = physics_at("manipulator", 0)
-    angles = 2 * torch.rand(20, 4, dtype=torch.float64) - 1
-    for pose, held in zip(angles, arm.hold(angles), strict=True):
-        with physics.reset_context():
-            physics.named.data.qpos[["arm_root", "arm_shoulder", "arm_elbow", "arm_wrist"]] = pose.numpy()
-            physics.data.qvel[:] = 0
-        torque = torch.tensor(physics.data.qfrc_bias[:4]) / torch.tensor(physics.model.actuator_gear[:4, 0])
-        torch.testing.assert_close(held, torque, atol=2e-5, rtol=0)  # of full actions; the weights are rounded
-
-
-@pytest.mark.parametrize("name", sorted(ARMS))
-def test_angles_follow_from_places(name):
-    arm = ARMS[name]
-    angles = 6.2 * torch.rand(50, arm.joints) - 3.1
-    torch.testing.assert_close(arm.angles(arm.places(angles)), angles, atol=1e-4, rtol=0)
-    torch.testing.assert_close(arm.angles(3 * arm.places(angles)), angles, atol=1e-4, rtol=0)
-
-
 def test_readings_have_the_stated_noise_and_are_missing_as_often_as_stated():
     arm = ARMS["reacher"]
     emitted = TensorDict({"position": torch.full((20000, 2), 3.0), "velocity": torch.ones(20000, 2)}, [20000])
@@ -61,26 +42,6 @@ def test_readings_have_the_stated_noise_and_are_missing_as_often_as_stated():
     assert abs(error.std() - NOISE) < 0.002  # its own deviation is 0.0004
     assert abs(out["observed"].float().mean() - 0.7) < 0.02
     assert out["state"][0].tolist() == pytest.approx([-0.98999, -0.98999, 0.14112, 0.14112, 1.0, 1.0], abs=1e-4)
-
-
-def test_held_readings():
-    arm = ARMS["reacher"]
-    hold = HoldAngles(arm, "reading")
-
-    def frame(angle, seen=True):
-        angle = torch.tensor([angle, 0.0])
-        return TensorDict({"reading": torch.cat([angle.cos(), angle.sin()]), "observed": torch.tensor([seen])}, [])
-
-    held = hold._reset(None, frame(3.1))
-    velocities = []
-    for angle, seen in ((3.1, True), (-3.1, True), (1.0, False), (-3.0, True)):
-        held = hold._step(held, frame(angle, seen))
-        angles, velocity = arm.split(held["held"])
-        velocities.append(velocity[0].item())
-    assert angles[0].item() == pytest.approx(-3.0)
-    step = (2 * torch.pi - 6.2) / arm.dt  # from 3.1 on to -3.1, not all the way back
-    expected = [0.0, 0.2 * step, 0.16 * step, 0.128 * step + 0.2 * 0.1 / arm.dt]
-    assert velocities == pytest.approx(expected, rel=1e-4)
 
 
 def transition(arm, bias=None):

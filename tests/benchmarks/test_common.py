@@ -1,22 +1,12 @@
 """What the studies share: options, jobs that are done once, rows that survive their file."""
 
-import sys
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-from benchmarks.common.arguments import ROOT, command
-from benchmarks.common.jobs import once, read_rows, same_settings, side_by_side
+from benchmarks.common.jobs import once, read_rows, same_settings
 from benchmarks.common.tables import Columns, head, line, pick
-
-
-def test_the_command_for_the_record_names_no_folder_of_the_machine(monkeypatch):
-    data, out = ROOT.parent / "shared/data/kitti", ROOT / "runs/monitor"
-    monkeypatch.setattr(sys, "argv", ["monitor", "--root", str(data), f"--out={out}", "--tasks", "car", "--draws", "3"])
-    assert command("monitor") == (
-        "python -m benchmarks.monitor --root ../shared/data/kitti --out=runs/monitor --tasks car --draws 3"
-    )
 
 
 def test_a_job_is_done_once_and_leaves_nothing_half(tmp_path):
@@ -38,15 +28,6 @@ def test_a_job_is_done_once_and_leaves_nothing_half(tmp_path):
     file.write_text(file.read_text()[:-4])
     with pytest.raises(ValueError, match=r"a\.json is damaged .* remove it"):
         read_rows([file])
-
-
-@pytest.mark.parametrize("processes", [1, 2])
-def test_calls_side_by_side(tmp_path, processes):
-    files = [tmp_path / name for name in "abc"]
-    side_by_side([partial(Path.write_text, file, file.name) for file in files], processes, "files")
-    assert [file.read_text() for file in files] == ["a", "b", "c"]
-    with pytest.raises(FileNotFoundError):
-        side_by_side([partial(Path.read_text, tmp_path / "no")], processes, "files")
 
 
 def test_a_folder_has_the_settings_it_was_begun_with(tmp_path):

@@ -1,8 +1,5 @@
 """The study's environments, inputs, filters and statistics, against closed forms."""
 
-import math
-
-import numpy as np
 import pytest
 import torch
 from torchrl.envs import ExplorationType
@@ -10,7 +7,6 @@ from torchrl.modules import get_primers_from_module, set_recurrent_mode
 
 from benchmarks.control import hike
 from benchmarks.control.arms import ARMS, Inputs
-from benchmarks.control.page import interquartile_mean, page, reached, summary
 from benchmarks.control.ppo import PPO, Head, Settings
 from benchmarks.control.run import make_env, rollout
 from benchmarks.control.sac import Units
@@ -21,28 +17,6 @@ def env_of(task, arm, count=4, cell=(0.2, 0.3), seed=0):
     task, arm = TASKS[task], ARMS[arm]
     filter = task.exact(cell[0]) if arm.filter == "exact" else task.unlearned(8) if arm.filter else None
     return make_env(task, arm, count, cell, seed, filter)
-
-
-def test_the_ground_is_a_maximum_of_three_ridges():
-    # On the crest of the first: density 1 / (2 pi 0.4 0.1).
-    assert hike.altitude(torch.tensor([-0.4, -0.8])).item() == pytest.approx(
-        -math.exp(-1 / (2 * math.pi * 0.4 * 0.1)) + 0.2 * -1.2 - 0.02, abs=1e-6
-    )
-    # Far from all of them it is a slope.
-    assert hike.altitude(torch.tensor([-3.0, 3.0])).item() == pytest.approx(-1.02, abs=1e-4)
-
-
-def test_a_hike_is_its_strides_and_its_noise():
-    env = hike.MountainHike(2000, 0.1)
-    data = env.rollout(hike.STEPS)
-    moved = data["next", "state"] - data["state"] - hike.STRIDE * data["action"]
-    count = moved.numel()
-    assert moved.std().item() == pytest.approx(hike.PROCESS, rel=5 / (2 * count) ** 0.5)
-    torch.testing.assert_close(
-        data["next", "reward"].squeeze(-1), hike.altitude(data["next", "state"] + hike.START), atol=1e-6, rtol=1e-6
-    )
-    assert data["next", "truncated"][:, -1].all()
-    assert data["action"].abs().max() <= 1
 
 
 def test_the_exact_filter_holds_the_truth():
@@ -134,34 +108,6 @@ def test_advantages_and_targets_are_those_of_a_constant_critic():
         torch.testing.assert_close(found.sort().values, expected, atol=1e-4, rtol=1e-4)
         torch.testing.assert_close(target, found + value, atol=1e-4, rtol=1e-4)
     assert reward.equal(data["next", "reward"])  # the collected ones stay as they were
-
-
-def test_statistics():
-    assert interquartile_mean([1.0, 2.0, 3.0, 100.0]) == 2.5
-    center, low, high = summary([1.0, 2.0, 3.0, 4.0, 5.0])
-    assert center == 3
-    assert 1 < low < 3 < high < 5
-    assert summary([2.0])[0] == 2.0
-    assert np.isnan(summary([2.0])[1])
-
-
-def rows(ends=(1000, 2000, 3000)):
-    """Three tests or more, of which the last two count."""
-    for arm, final in (("LSTM", -20.0), ("belief mean", -10.0), ("truth", -5.0)):
-        for seed in range(2):
-            for steps, value in zip(ends, (*[-40.0] * (len(ends) - 2), final - 5, final), strict=True):
-                entries = {"arm": arm, "seed": seed, "env_steps": steps, "return": value - seed, "wall_s": 1.0}
-                yield {"task": "hike", "cell": "noise 0", **entries}
-
-
-def test_tables():
-    table = list(rows())
-    assert reached(table, "hike", "noise 0", "belief mean") == "2"
-    assert reached(table, "hike", "noise 0", "LSTM") == "3"
-    text = page(table)
-    assert "control.png" not in text  # one noise makes no line
-    assert "| noise 0 | 10.0 |" in text  # more than the LSTM, with both seeds
-    assert "| noise 0 | 2 | -20.5 [-21.0, -20.0] | -10.5 [-11.0, -10.0] | -5.5 [-6.0, -5.0] |" in text
 
 
 def test_the_actors_loss_filters_slices_from_what_was_stored_and_trains_the_filter():

@@ -5,12 +5,10 @@ import pytest
 import torch
 from dm_control import suite
 from tensordict import TensorDict
-from torchrl.envs import ExplorationType
 
 from benchmarks.control import cartpole
 from benchmarks.control.arms import ARMS, Inputs
-from benchmarks.control.learning import refiltered
-from benchmarks.control.run import make_env, rollout
+from benchmarks.control.run import make_env
 from benchmarks.control.sac import SAC, Settings
 from benchmarks.control.shift import told
 from benchmarks.control.tasks import TASKS
@@ -36,21 +34,6 @@ def test_physics_and_reward_are_those_of_dm_control():
         there = [*physics.bounded_position(), *physics.velocity()]
         np.testing.assert_allclose(row["next", "state"][-1].numpy(), there, atol=1e-3)
     assert data["next", "state"][:, -1, 3:].abs().max() > 0.1
-
-
-def test_noises_are_what_they_are_said_to_be():
-    count = 3000
-    data = cartpole.NoisyCartpole(count, 0.2).rollout(1, lambda td: td.set("action", torch.zeros(count, 1)))[:, 0]
-    spread = 5 / (2 * count) ** 0.5
-    reading = (data["observation"] - data["state"][:, :3]).std(0)
-    torch.testing.assert_close(reading, torch.full((3,), 0.2), rtol=spread, atol=0)
-    # Near the start a velocity is proportional to what the motor got.
-    still = cartpole.NoisyCartpole(count, 0.2, action_noise=0.0)
-    one = still.rollout(1, lambda td: td.set("action", 0.1 * torch.ones(count, 1)))[:, 0]
-    gain = (one["next", "state"] - one["state"])[:, 3].mean() / 0.1
-    motor = (data["next", "state"] - data["state"])[:, 3] / gain
-    mean_of = cartpole.REPEAT**0.5  # independent noises, one in each physics step
-    assert motor.std().item() == pytest.approx(cartpole.ACTION_NOISE / mean_of, rel=spread + 0.02)
 
 
 def test_the_filter_that_knows_the_world_errs_as_it_believes():
@@ -95,30 +78,6 @@ def test_what_the_filter_is_told_is_what_the_analysis_uses():
         with told(filter, 0.3):
             torch.testing.assert_close(belief(), update(0.3), atol=1e-5, rtol=1e-3)
     assert not torch.allclose(belief()[0], update(0.3)[0], atol=1e-3)
-
-
-def test_what_the_buffer_holds_is_filtered_once_more():
-    """All that is kept stays in its place; beliefs become what the filter that is used now says of whole episodes."""
-    filter, arm = still_filter(), ARMS["belief mean, spread"]
-    agent = SAC(arm, Inputs(0, 1, SCALE, 1.0), Settings(every=10_000), 3)
-    agent.refilter(filter)  # nothing is kept yet
-    env = make_env(TASKS["cartpole"], arm, 4, (0.1, 0.0), 0, filter)
-    batches = [rollout(env, agent.policy, 30, ExplorationType.RANDOM) for _ in range(3)]
-    for data in batches[:2]:
-        agent.update(data)
-    before = agent.buffer[:].clone()
-    with told(filter, 0.5):
-        agent.refilter(filter)
-        expected = refiltered(filter, torch.cat(batches[:2])).reshape(-1)
-    after = agent.buffer[:]
-    for key in ("belief", "mean"), ("belief", "var"), ("next", "belief", "mean"), ("next", "belief", "var"):
-        torch.testing.assert_close(after[key], expected[key], atol=1e-4, rtol=1e-3)
-        assert not torch.allclose(after[key], before[key], atol=1e-2)
-    for key in "observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"):
-        assert after[key].equal(before[key])
-    agent.update(batches[2])
-    assert len(agent.buffer) == 360
-    torch.testing.assert_close(agent.buffer[240:]["belief", "mean"], batches[2]["belief", "mean"].reshape(-1, 5))
 
 
 def test_what_comes_after_a_time_limit_counts():

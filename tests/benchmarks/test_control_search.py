@@ -1,15 +1,11 @@
 """The search for PPO's learning rate: what runs, what is chosen, what the study takes of it."""
 
 import sys
-from pathlib import Path
 
 import pytest
 
 from benchmarks.control import search as protocol
-from benchmarks.control import study
-from benchmarks.control.search import CELLS, COLUMNS, FIRST, best, complete, page
-from benchmarks.control.study import BELIEFS
-from benchmarks.control.tasks import RATES
+from benchmarks.control.search import FIRST, best, page
 
 
 def rows(returns, arm="LSTM", task="hike"):
@@ -62,18 +58,3 @@ def search(tmp_path, monkeypatch):
         return made
 
     return search
-
-
-def test_the_committed_search_is_what_the_study_takes():
-    """The rates in tasks.py are those that are best in the committed rows; belief's variants have the belief's."""
-    tried = COLUMNS.read(Path(protocol.__file__).parent / "results" / "search.csv")
-    assert complete(tried) == tried
-    assert {row["seed"] for row in tried} == {FIRST, FIRST + 1, FIRST + 2}
-    chosen = {}
-    for task in CELLS:
-        arms = {row["arm"] for row in tried if row["task"] == task}
-        chosen |= {(task, arm): best(tried, task, arm) for arm in arms}
-        variants = set(study.READERS[task]) - arms
-        assert set(BELIEFS[1:]) <= variants
-        chosen |= {(task, arm): best(tried, task, "belief mean") for arm in variants}
-    assert {key: rate for key, rate in chosen.items() if rate != 1} == RATES

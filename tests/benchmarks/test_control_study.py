@@ -1,6 +1,5 @@
 """What a run of the study is made of, who may see what, and which runs the tables are of."""
 
-import json
 import time
 
 import pytest
@@ -10,8 +9,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from benchmarks.control import hike
 from benchmarks.control.learning import Learner, Learning
-from benchmarks.control.run import Budget, cell_name, run
-from benchmarks.control.study import CELLS, Study, arms_of, complete, part
+from benchmarks.control.run import Budget, run
 from benchmarks.control.tasks import TASKS, Task
 
 BUDGET = Budget(tests=3, episodes=5, members=4)
@@ -118,52 +116,4 @@ def test_no_world_is_both_trained_in_and_tested_in(tiny):
     assert len({world.made_of[3] for world in Paid.made}) == 10
 
 
-def test_a_filter_that_is_not_taught_never_sees_the_state():
-    """With other states it learns the same, bit for bit; a taught one does not."""
-    data = hike.MountainHike(4, 0.2).rollout(hike.STEPS)
-    other = data.clone()
-    other["state"].add_(1.0), other["next", "state"].add_(1.0)
-
-    def learned(data, taught):
-        torch.manual_seed(0)
-        filter = hike.unlearned_filter(4)
-        learner = Learner(filter, TASKS["hike"].prior, 4, Learning(windows=4), taught)
-        learner.add(data)
-        learner.update(3)
-        return torch.nn.utils.parameters_to_vector(filter.parameters())
-
-    assert learned(other, False).equal(learned(data, False))
-    assert not learned(other, True).equal(learned(data, True))
-
-
 # ------------------------------------------------------------------------------------------------- cells and tables
-
-
-def fill(folder, wanted):
-    """Leaves a run's rows for each task, number of a cell, arm and seed that is ``wanted``."""
-    found = Study(out=folder)
-    for task in CELLS:
-        for number, cell in enumerate(CELLS[task]):
-            for seed in range(4):
-                for order, arm in enumerate(arms_of(task, cell)):
-                    if wanted(task, number, arm, seed):
-                        entries = {"arm": arm, "seed": seed, "env_steps": 1000, "return": 100.0 + order, "wall_s": 1.0}
-                        file = part(found, task, cell, arm, seed)
-                        file.parent.mkdir(parents=True, exist_ok=True)
-                        file.write_text(json.dumps([{"task": task, "cell": cell_name(cell), **entries}]))
-    return found
-
-
-def test_a_seed_counts_where_all_arms_have_run(tmp_path):
-    """Seeds 0 to 2 of the first hike, of which seed 1 lacks an arm; nothing of the second, which lacks that arm."""
-    found = fill(
-        tmp_path,
-        lambda task, number, arm, seed: (
-            task == "hike"
-            and seed < 3
-            and ((number == 0 and (seed, arm) != (1, "GRU")) or (number == 1 and arm != "GRU"))
-        ),
-    )
-    rows = complete(found)
-    assert {(row["cell"], row["seed"]) for row in rows} == {("noise 0.4", 0), ("noise 0.4", 2)}
-    assert len(rows) == 2 * len(arms_of("hike", (0.4, 0.0)))

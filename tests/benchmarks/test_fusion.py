@@ -5,21 +5,9 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
-from benchmarks.fusion import training
-from benchmarks.fusion.car import DT, car_task, readings, simulated
+from benchmarks.fusion.car import car_task
 from benchmarks.fusion.study import Study, page
 from benchmarks.fusion.task import add_features, faulty, without
-from benchmarks.fusion.training import make_weights, train
-
-
-def test_a_car_at_fifty_hertz_is_where_it_is_at_ten():
-    states, camera = simulated(10, 0)
-    data = readings(states, camera, 0)
-    assert_close(data["state"][:, 4::5], states[:, 1:], rtol=0, atol=1e-4)
-    way = (data["state"][:, 1:, :2] - data["state"][:, :-1, :2]).norm(dim=-1)
-    assert_close(way, data["state"][:, 1:, 3] * DT, rtol=0, atol=1e-4)
-    seen = data["camera_observed"][..., 0]
-    assert_close(data["camera"][seen].reshape(2, 9, 2), camera[:, 1:])
 
 
 @pytest.fixture(scope="module")
@@ -51,27 +39,6 @@ def test_features_count_in_standard_deviations_of_the_sensor():
     features = add_features(data, {"a": torch.tensor([4.0])})["a_features"]
     assert_close(features[0, -1, 0], torch.tensor(0.5 + 0.01).log())
     assert (features[..., 1] == 0).all()
-
-
-def test_what_the_trainings_see(monkeypatch):
-    """A third of the windows lacks a sensor; in a half of those for the weights one fails, after the start-up."""
-    task, seen = car_task(None, frames=60), []
-    monkeypatch.setattr(training, "fit", lambda model, loss, sample, *_: seen.append(sample()))
-    train(task, make_weights(task), updates=(1, 1), window=200, batch=60)
-    begin = task.settled.start
-    assert begin == round(0.5 * task.rate)
-    for number, windows in enumerate(seen):
-        absent = torch.stack([~windows[f"{name}_observed"].any(1).squeeze(-1) for name in task.sensors])
-        assert absent.any(0).sum() == 20
-        assert (absent.sum(0) <= 1).all()
-        clean = torch.zeros(60, dtype=torch.bool)
-        for row, window in enumerate(windows):
-            starts = (task.train["state"][:, :96] == window["state"][0]).all(-1).nonzero()
-            recording, start = starts[0]
-            same = [(window[name] == task.train[recording, start : start + 200][name]).all(-1) for name in task.sensors]
-            assert all(values[:begin].all() for values in same)
-            clean[row] = all(values.all() for values in same)
-        assert clean.sum() == (60, 30)[number]
 
 
 def test_medians_over_the_seeds_and_the_worst_training():

@@ -1,28 +1,10 @@
 """The frontier of the KITTI study: the same weights at other sizes, means over drives."""
 
-import pytest
 import torch
 
-from benchmarks.kitti.folds import Statistics
 from benchmarks.kitti.frontier import COLUMNS, means
-from benchmarks.kitti.recipes import FILTERS
-from benchmarks.kitti.sensors import SENSORS
-from benchmarks.kitti.training import load_filter, run_filter
 from tests.benchmarks.test_kitti import smooth_drive
 from torch_denkf.applications.car.odometry.streams import all_frames
-from torch_denkf.training.checkpoint import write_checkpoint
-
-
-@pytest.fixture
-def trained(tmp_path):
-    """A folder with an untrained DEnKF of 32 members, its recipe and its model."""
-    facts = Statistics(torch.tensor([9.0, 0.0]), torch.tensor([3.0, 0.1]), torch.zeros(2), torch.ones(2), 0.1)
-    torch.manual_seed(0)
-    recipe = FILTERS["denkf"](SENSORS["flow"](facts), facts)
-    model = recipe.build()
-    notes = {"filter": "denkf", "sensor": "flow", "facts": vars(facts)}
-    write_checkpoint(tmp_path / "filter.pt", {"model": model.state_dict(), "inflation": 1.1, **notes})
-    return tmp_path, recipe, model
 
 
 def drive(recipe, members):
@@ -31,17 +13,6 @@ def drive(recipe, members):
     samples = read["spans", "ensemble"]
     read["spans"]["ensemble"] = samples[:, :, torch.arange(members) % samples.shape[2]]
     return all_frames(read)
-
-
-def test_the_size_that_was_trained_gives_what_was_trained(trained):
-    folder, recipe, model = trained
-    recipe.set_inflation(model, 1.1)
-    reading = drive(recipe, 32)
-    with torch.no_grad():
-        own = run_filter(recipe, model, [reading])["belief", "mean"]
-        for options in ({}, {"size": 32}, {"size": 32, "scheme": "sensor"}):
-            again, loaded, *_ = load_filter(folder, **options)
-            assert torch.equal(run_filter(again, loaded, [reading])["belief", "mean"], own)
 
 
 def row(name, drive, value, window=100, **entries):

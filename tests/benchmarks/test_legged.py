@@ -3,11 +3,8 @@
 import pytest
 import torch
 
-from benchmarks.legged.start import turned
 from benchmarks.legged.task import FIRM, scores, simulated
 from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.applications.legged.motion import LeggedSpace
-from torch_denkf.applications.legged.readings import FeetInBody
 from torch_denkf.functional.manifolds import SO3, rotate
 
 
@@ -51,13 +48,3 @@ def test_a_turned_belief_tilts_and_drifts(robot):
     found = scores(robot, velocity, torch.ones_like(velocity), moved)
     assert found["drift"] < 0.01
     assert found["tilt"] < 0.1
-
-
-def test_a_turned_world_looks_the_same_to_its_feet():
-    torch.manual_seed(0)
-    state, turn = torch.randn(5, 28), SO3().exp(torch.randn(5, 3))
-    state[:, :4] = SO3().exp(torch.randn(5, 3))
-    seen = FeetInBody(LeggedSpace(4)).compute(state.unsqueeze(-2))
-    moved = turned(state, turn)
-    assert (FeetInBody(LeggedSpace(4)).compute(moved.unsqueeze(-2)) - seen).abs().max() < 1e-5
-    assert (rotate(turn, state[:, 4:7]) - moved[:, 4:7]).abs().max() < 1e-6

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import mujoco
 import pytest
 import torch
 from tensordict import TensorDict
@@ -18,10 +17,8 @@ from benchmarks.legged.policy import (
     Study,
 )
 from benchmarks.legged.training import LSTM, VELOCITY
-from benchmarks.legged.walk import EVERY, acted, gait, play
-from torch_denkf.applications.legged import QUADRUPED, LearnedContacts, quadruped_env
-from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.functional.manifolds import rotate
+from benchmarks.legged.walk import EVERY, acted, play
+from torch_denkf.applications.legged import QUADRUPED, LearnedContacts
 
 GROUND = "ground of the training"
 
@@ -42,28 +39,6 @@ def still(forwards=0.0):
 def played(laboratory, arm, rows=20, forwards=0.0):
     keep = [*READ, "true", "command", INPUT, *([] if arm in (TRUTH, GAIT) else [VELOCITY])]
     return play(laboratory.env(arm, GROUND, 3), still(forwards), rows, keep)
-
-
-def feet_of(controls):
-    """Where feet go under constant controls, where nothing weighs, in the base's axes ``[4, 3]``."""
-    robot = quadruped_env(seed=0)
-    robot.reset()
-    robot.model.opt.gravity[:] = 0
-    robot.data.qpos[2] = 5
-    robot.data.ctrl[:] = controls.numpy()
-    mujoco.mj_step(robot.model, robot.data, 1200)
-    columns = torch.tensor(robot.data.qpos[robot.columns], dtype=torch.float32)
-    kinematics = LegKinematics(robot.model, **QUADRUPED)
-    return rotate(kinematics.base[:4], kinematics(columns))
-
-
-@pytest.mark.parametrize("stride", [[0.06, 0.0, 0.0], [0.0, 0.06, 0.0]])
-def test_feet_go_as_far_as_the_stride_says(stride):
-    """By the simulator: at the beginning of a stance, two feet are ahead, and the other two behind."""
-    stride = torch.tensor(stride)
-    moved = feet_of(gait(torch.zeros(1), stride)) - feet_of(gait(torch.zeros(1), torch.zeros(3)))
-    wanted = torch.tensor([[1.0], [-1.0], [1.0], [-1.0]]) * stride
-    assert (moved - wanted)[:, :2].abs().max() < 0.015
 
 
 def test_the_reward_is_that_of_the_true_velocity(laboratory):

@@ -6,15 +6,9 @@ from tensordict import TensorDict
 
 from benchmarks.monitor.car import CarGuard, gates_of
 from benchmarks.monitor.drives import believed_spans
-from benchmarks.monitor.scores import Run, afterwards, auroc, detection, false_alarms, spans_of
+from benchmarks.monitor.scores import Run, afterwards, auroc, detection, false_alarms
 from torch_denkf.applications.car.vision.poses import KITTI_DT
 from torch_denkf.applications.car.vision.signs import PICTURE_SIGNS, flow_signs
-
-
-def test_spans_are_first_and_behind_the_last():
-    fault = torch.tensor([0, 1, 1, 0, 0, 1]).bool()
-    assert spans_of(fault) == [(1, 3), (5, 6)]
-    assert spans_of(torch.zeros(4, dtype=torch.bool)) == []
 
 
 def test_auroc_counts_pairs():

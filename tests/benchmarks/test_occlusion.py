@@ -1,6 +1,6 @@
 import torch
 
-from benchmarks.occlusion.study import SETTLED, scores, times
+from benchmarks.occlusion.study import scores
 from benchmarks.occlusion.task import HEIGHT, PILLAR, RADIUS, WIDTH, drawn, filter_of, runs
 
 
@@ -21,18 +21,6 @@ def test_the_ball_stays_in_its_box_and_is_seen_where_it_is():
     partly = visible.isnan()
     x = place[..., 0]
     assert (((x - PILLAR[0]).abs() < RADIUS) | ((x - PILLAR[1]).abs() < RADIUS) | ~partly).all()
-
-
-def test_times_do_not_overlap_and_after_is_one_second():
-    data = runs(50, 150, 1)
-    masks = times(data)
-    assert sum(mask.int() for mask in masks.values()).max() == 1
-    assert not any(mask[:, :SETTLED].any() for mask in masks.values())
-    began = masks["after"] & ~torch.nn.functional.pad(masks["after"], (1, 0))[:, :-1]
-    assert masks["after"].sum() <= 10 * began.sum()
-    exact = scores(data["state"][..., :2], torch.ones(50, 150, 2), data)
-    assert {exact[f"error_{when}"] for when in masks} == {0.0}
-    assert {exact[f"coverage_{when}"] for when in masks} == {1.0}
 
 
 def test_filters_that_know_of_the_camera_find_the_ball_behind_the_pillar():

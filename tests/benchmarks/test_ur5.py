@@ -7,9 +7,9 @@ import torch
 from tensordict import TensorDict
 
 from benchmarks.ur5.demos import Roles
-from benchmarks.ur5.evaluation import blackout, errors, sensor_rows
+from benchmarks.ur5.evaluation import errors, sensor_rows
 from benchmarks.ur5.motion import SIZE, with_rates
-from benchmarks.ur5.readings import BLACK, Windows, blackouts, fail
+from benchmarks.ur5.readings import Windows
 from benchmarks.ur5.sensors import SENSORS, TurnedWrist
 from tests.benchmarks.ur5_for_tests import states
 
@@ -22,19 +22,6 @@ def test_who_is_tested_is_not_trained_on():
 
 
 # ------------------------------------------------------------------------------------------------ failing cameras
-
-
-def test_conditions_hide_what_they_say():
-    readings = TensorDict({"observed": torch.ones(40, 100, 1, dtype=torch.bool)}, [40, 100])
-    black = fail(readings, "black20")["observed"].squeeze(-1)
-    assert (~black).sum(1).tolist() == [BLACK] * 40
-    first = black.int().argmin(1)
-    assert torch.equal(first, blackouts(40, 100))
-    assert all(not row[begin : begin + BLACK].any() for row, begin in zip(black, first, strict=True))
-    missing = fail(readings, "missing")["observed"]
-    assert abs(float(missing.float().mean()) - 0.7) < 0.025  # 3.5 standard errors of 4000 draws
-    assert bool(missing[:, 0].all())
-    assert bool(readings["observed"].all())
 
 
 def test_windows_begin_wrong_as_they_are_told_and_are_true_otherwise():
@@ -65,16 +52,6 @@ def test_errors_are_means_of_absolute_ones_with_wrapped_angles_and_without_the_f
     assert scores["joint_mae_deg"] == pytest.approx(3.0, abs=1e-3)
     assert scores["J6_deg"] == pytest.approx(7.0, abs=1e-3)
     assert scores["ee_mae_cm"] == pytest.approx(1.0, abs=1e-4)
-
-
-def test_a_blackout_is_scored_in_its_own_rows():
-    truth, begin = torch.zeros(1, 80, 10), torch.tensor([30])
-    mean, var = truth.clone(), torch.full((1, 80, 17), math.radians(1.0) ** 2)
-    mean[:, 30:50, :7] = math.radians(2.0)
-    var[:, 49] = math.radians(5.0) ** 2
-    var[:, 65] = math.radians(1.5) ** 2
-    scores = blackout(mean, var, truth, begin)
-    assert list(scores.values()) == pytest.approx([2.0, 1.0, 5.0, 1.5], abs=1e-4)
 
 
 def test_a_perfect_sensor_has_no_error_where_it_sees():

@@ -1,19 +1,14 @@
 """Sensors, motion and filters of the UR5 study."""
 
-import copy
 import math
 
 import pytest
 import torch
-from tensordict import TensorDict
 
-from benchmarks.ur5.evaluation import errors
 from benchmarks.ur5.glimpse import project
-from benchmarks.ur5.motion import ERRORS, SIZE, ArmMotion, open_loop, with_rates
-from benchmarks.ur5.recipes import FILTERS
+from benchmarks.ur5.motion import ArmMotion, open_loop, with_rates
 from benchmarks.ur5.recipes.denkf import localisation
-from benchmarks.ur5.sensors import MEMBERS, NEAR, SENSORS, NearForecast, TurnedWrist, side_of, wrist_of
-from benchmarks.ur5.training import run_filter
+from benchmarks.ur5.sensors import TurnedWrist, side_of, wrist_of
 from tests.benchmarks.ur5_for_tests import FACTS, states
 from torch_denkf.applications.ur5.simulation.domains import Domain
 
@@ -41,19 +36,6 @@ def test_a_clear_picture_decides_the_half_turn_and_an_open_one_leaves_it_to_the_
     reading[:, 7:9] *= 0.2
     other = wrist_of(reading, side_of(reading, state[:, 5] + math.pi))[:, 5]
     torch.testing.assert_close(other, state[:, 5] + math.pi, atol=1e-5, rtol=0)
-
-
-def test_samples_that_leave_it_open_turn_to_the_side_of_the_forecast():
-    state = states(2)
-    state[:, 5] = torch.tensor([1.0, 1.0])
-    samples = TurnedWrist()(state).unsqueeze(1).repeat(1, 4, 1)
-    samples[..., 7:9] = 0.0
-    forecast = torch.zeros(2, 3, SIZE)
-    forecast[0, :, 5], forecast[1, :, 5] = torch.tensor([0.5, 1.0, 1.2]), torch.tensor([1.0, 4.0, 4.2])
-    td = TensorDict({"sensor": {"ensemble": samples}, "forecast": {"ensemble": forecast}}, [2])
-    near = NearForecast(SENSORS["keypoints"])(td)[NEAR]
-    expected = torch.tensor([1.0, 1.0 + math.pi])
-    torch.testing.assert_close(near[..., 5], expected.unsqueeze(-1).expand(2, 4), atol=1e-5, rtol=0)
 
 
 # ------------------------------------------------------------------------------------------------------ the motion
@@ -100,46 +82,6 @@ def test_places_project_as_a_pinhole_has_it():
     # Another camera, from above: its target is in the middle, too.
     above = Domain(camera=(-0.1, 0.02, 2.0), target=(-0.2, 0.0, 0.1), field=40.0)
     assert project(torch.tensor([-0.2, 0.0, 0.1]), above).abs().max() < 1e-6
-
-
-@pytest.fixture(scope="module")
-def readings():
-    """Three demos of an arm at a constant rate, read without bias: a filter must follow."""
-    torch.manual_seed(0)
-    motion = ArmMotion(FACTS)
-    motion.damping.data.fill_(12.0)  # rates last
-    state = torch.cat([states(3), 0.01 * torch.randn(3, 7), torch.zeros(3, 7)], -1)
-    path = [state]
-    with torch.no_grad():
-        state[:, 7:10] = motion.place(state[:, :7])
-        for _ in range(39):
-            path.append(motion(path[-1]))
-    path = torch.stack(path, 1)
-    sensor = SENSORS["keypoints"].build(FACTS, 32)
-    samples = TurnedWrist()(path[..., :10]).unsqueeze(-2) + 0.01 * torch.randn(3, 40, MEMBERS, 13)
-    encoding = torch.zeros(3, 40, 64)
-    td = TensorDict({"state": path[..., :10], "motion": path, "action": path[..., :7]}, [3, 40])
-    td["sensor"] = TensorDict({"ensemble": samples, "encoding": encoding}, [3, 40])
-    td["observed"] = torch.ones(3, 40, 1, dtype=torch.bool)
-    return sensor, motion, td
-
-
-@pytest.mark.parametrize("name", sorted(FILTERS))
-def test_every_filter_carries_the_table_first_and_follows_a_sensor_that_is_right(name, readings):
-    sensor, motion, td = readings
-    torch.manual_seed(0)
-    recipe = FILTERS[name](copy.deepcopy(sensor), SENSORS["keypoints"], FACTS, motion, ERRORS)
-    model = recipe.build()
-    out = run_filter(recipe, model, td)
-    assert out["belief", "mean"].shape[-1] >= 10
-    assert torch.isfinite(out["belief", "mean"]).all()
-    scores = errors(out["belief", "mean"][..., :10], td["state"])
-    assert scores["joint_mae_deg"] < 2.0, scores  # the start is 1 to 3 degrees off, in rates, too
-    wide = copy.deepcopy(model)
-    recipe.set_inflation(wide, 1.5)
-    tempered = run_filter(recipe, wide, td)
-    spread = [float(each["belief", "var"][:, 10:, :10].log().mean()) for each in (out, tempered)]
-    assert spread[1] > spread[0]
 
 
 def test_localisation_keeps_covariances_and_the_gripper_apart():

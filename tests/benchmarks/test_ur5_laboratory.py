@@ -9,7 +9,7 @@ pytest.importorskip("cv2")
 needs_opengl()
 
 from benchmarks.ur5 import laboratory  # noqa: E402
-from benchmarks.ur5.laboratory import Drawn, colours, find_camera, look_of  # noqa: E402
+from benchmarks.ur5.laboratory import Drawn, find_camera, look_of  # noqa: E402
 
 TRUE = np.array([1.36, 0.06, 0.88, -0.17, 0.01, 0.26, 0.02, 34.0, 0.0])
 GAIN, OFFSET = np.array([0.6, 0.5, 0.4]), np.array([30.0, 25.0, 20.0])
@@ -41,12 +41,3 @@ def test_the_camera_is_found(seen):
     true, near, before = (silhouettes(look) for look in (look_of(TRUE), found, laboratory.SIM))
     drawn.close()
     assert np.abs(near - true).sum() < 0.25 * np.abs(before - true).sum()
-
-
-def test_colours_are_those_that_the_frames_were_painted_with(seen):
-    frames, joints, _ = seen
-    drawn = Drawn(SIDE, look_of(TRUE))
-    gain, offset = colours(drawn, frames.astype(np.float32), joints)
-    drawn.close()
-    assert np.abs(gain - GAIN).max() < 0.02
-    assert np.abs(offset - OFFSET).max() < 2

@@ -16,7 +16,6 @@ from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.particle_for_tests import bootstrap
 from torch_denkf.applications.car import track
 from torch_denkf.applications.car.kitti.gaps import bridge_gaps
-from torch_denkf.applications.car.modules.member_gain import MemberGain
 from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
 from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.applications.car.odometry.training import train_car_filter
@@ -27,7 +26,7 @@ from torch_denkf.envs import ReplayEnv
 from torch_denkf.modules import LearnedTransition, NoisyTransition
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, TransitionLoss
 from torch_denkf.pretrained import from_pretrained, save_pretrained
-from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
+from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
 
 INF = math.inf
 
@@ -116,28 +115,6 @@ def test_refused(case):
 @pytest.mark.parametrize("case", WRONG_TYPES.values(), ids=WRONG_TYPES)
 def test_wrong_types(case):
     refuses(*case, error=TypeError)
-
-
-@pytest.mark.parametrize("make", [RTSSmoother, EnRTS, EnKS, ParticleSmoother])
-def test_smoothers_of_another_belief(make):
-    other = linear_denkf("etkf") if make is RTSSmoother else linear_kalman()
-    with pytest.raises(TypeError, match=f"{make.__name__} takes a filter with"):
-        make(other)
-
-
-@pytest.mark.parametrize("shape", [(2, 3), (2,)])
-@pytest.mark.parametrize("make", [linear_kalman, linear_denkf])
-def test_an_age_of_another_shape(make, shape):
-    filter = FixedLag(make(), 2)
-    row = filter.initialise(TensorDict({"observation": torch.zeros(2, 2)}, [2]))
-    row["smoothed", "age"] = torch.zeros(shape, dtype=torch.int64)
-    with pytest.raises(ValueError, match="age of what is smoothed must be"):
-        filter.step(row)
-
-
-def test_samples_of_another_size_name_the_standard_deviations():
-    with pytest.raises(ValueError, match="entries of std"):
-        MemberGain([0.1] * 3, ensemble_size=8)(TensorDict({("sensor", "ensemble"): torch.zeros(8, 2)}))
 
 
 FRAME = np.zeros((24, 72, 3), np.uint8)

@@ -68,12 +68,6 @@ def test_metadata(root, case):
     refuses(root, *words)
 
 
-@pytest.mark.parametrize("name", [INFO, EPISODES])
-def test_text_that_is_no_utf8(root, name):
-    (root / name).write_bytes((root / name).read_bytes() + b"\xff\xfe")
-    refuses(root, name, "UTF-8", "0xff")
-
-
 LINES = {
     "twice": ('{"episode_index": 0, "length": 12}', EPISODES, "lists episode 0 twice"),
     "negative": ('{"episode_index": -1, "length": 12}', "episode_index in", f"{EPISODES}:3", "got -1"),
@@ -172,11 +166,6 @@ def test_an_episode_without_a_sound_row(root):
     edit_table(root / DATA, **{"observation.state": pa.array(list(states), pa.list_(pa.float32()))})
     with pytest.warns(UserWarning, match="12 of 16 rows"):
         refuses(root, "no row of episode 0 has a 'state' that is finite")
-
-
-def test_sound_recordings_have_no_further_masks(root):
-    keys = set(open_all(root)[:].keys())
-    assert not keys & {"collector", "state_observed", "action_observed"}
 
 
 @pytest.mark.parametrize("fps", [0, -10.0, float("nan"), float("inf")])

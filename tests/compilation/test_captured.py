@@ -153,20 +153,6 @@ def test_training_records_once_though_the_last_loss_is_kept(float64, reruns):
     assert_same(torch.autograd.grad(retained, list(graph.parameters())), first)
 
 
-def test_another_part_of_the_loss_after_an_optimisers_step_has_its_gradient(float64, reruns):
-    eager, graph = pair()
-    frames = noisy_frames(eager, 2, 4)
-    for key in (("belief", "mean"), ("info", "log_likelihood"), ("belief", "var")):
-        found = []
-        for model in (eager, graph):
-            optimiser = torch.optim.SGD(model.parameters(), lr=1e-3)
-            optimiser.zero_grad()
-            model.sequence(frames.copy())[key].sum().backward()
-            found.append([p.grad.clone() for p in model.parameters() if p.grad is not None])
-            optimiser.step()
-        assert_same(*found)
-
-
 def test_running_means_count_each_sequence_once(float64, reruns):
     def normalise(network, args):
         network.norm(args[0][..., :3].flatten(0, -2))
@@ -194,16 +180,3 @@ def test_what_waits_for_the_device_runs_eagerly_with_a_warning(float64, reruns, 
     assert_same([out["belief", "mean"]], [expected["belief", "mean"]])
     assert_same(ours, theirs)
     assert not reruns.recorded
-
-
-def test_on_a_processor_steps_run_eagerly_with_one_warning(float64, recwarn):
-    eager, graph = pair()
-    frames = noisy_frames(eager, 2, 3)
-    with pytest.warns(UserWarning, match="records CUDA graphs; on 'cpu' steps run eagerly"):
-        out, ours = gradients(graph, frames)
-    recwarn.clear()
-    graph.step(out[:, 1].detach())
-    assert not [warning for warning in recwarn if "CUDA graphs" in str(warning.message)]
-    expected, theirs = gradients(eager, frames)
-    assert_same([out["belief", "mean"]], [expected["belief", "mean"]])
-    assert_same(ours, theirs)

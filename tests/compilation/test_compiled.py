@@ -15,7 +15,6 @@ from tests.filters.factories import (
     toy_denkf,
     toy_frames,
 )
-from torch_denkf.compilation import need_compiler
 from torch_denkf.modules import ConstantNoise, LearnedObservation, StochasticMLP
 
 #: float32: a few roundings through eight steps; float64 likewise.
@@ -157,23 +156,6 @@ def test_a_policys_data_go_on_from_what_is_stored(float64):
     assert_close(eager[1, 0], step, filter.belief_keys, torch.float64)
 
 
-def test_a_first_call_that_resets_all_rows_is_compared_all_the_same():
-    """Looks at rows that go on: at a reset nothing of the transition shows, and one function serves all steps."""
-
-    def wrong_after_a_step(graph, example):
-        def run(*inputs):
-            (goes_on,) = (value for value in inputs if value.dtype == torch.bool)
-            off = goes_on.any().float()
-            return tuple(value + off if value.is_floating_point() else value for value in graph(*inputs))
-
-        return run
-
-    frames = TensorDict({"observation": torch.randn(2, 1, 2)}, [2, 1])
-    filter = linear_kalman().compile(chunk=1, backend=wrong_after_a_step)
-    with torch.no_grad(), pytest.raises(RuntimeError, match="compiled sequence is wrong"):
-        filter.sequence(frames)
-
-
 def test_a_compiled_step_draws_its_noise_outside_and_anew():
     filter = toy_denkf("perturbed").compile(chunk=1, backend="eager")
     td = filter.initialise(toy_frames((2,), masks=0, resets=False))
@@ -184,18 +166,3 @@ def test_a_compiled_step_draws_its_noise_outside_and_anew():
     assert means[0].equal(means[1])
     assert not means[0].equal(means[2])
     assert len(filter.compiled._functions) == 1
-
-
-def test_without_a_compiler_it_says_what_to_install(monkeypatch):
-    from torch._inductor import cpp_builder
-    from torch._inductor.exc import InvalidCxxCompiler
-
-    def none():
-        raise InvalidCxxCompiler
-
-    monkeypatch.setattr(cpp_builder, "get_cpp_compiler", none)
-    with pytest.raises(RuntimeError, match="apt install g"):
-        toy_denkf().compile()
-    assert toy_denkf().compile(backend="eager").compiled is not None  # dynamo alone needs none
-    with pytest.raises(RuntimeError, match="C\\+\\+ compiler"):
-        need_compiler()

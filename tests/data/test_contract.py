@@ -68,13 +68,6 @@ def test_slices_that_may_be_shorter_stay_flat():
     assert spans.sample().batch_dims == 1
 
 
-def test_a_sampler_that_marks_no_ends():
-    data = make(batch_size=8, sampler=SliceSampler(num_slices=2, truncated_key=None, traj_key="episode"))
-    sample = data.sample()
-    assert (sample["state"][:, :, 1].diff(dim=1) == 1).all()
-    assert sample.shape == (2, 4)
-
-
 # Splits ---------------------------------------------------------------------------------------------------------------
 
 

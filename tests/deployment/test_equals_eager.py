@@ -110,15 +110,6 @@ def test_the_graph(name, tmp_path):
     assert_the_same(FILTERS[name](), tmp_path, compiled=False)
 
 
-def test_an_lstm_cell_is_taken_apart(tmp_path):
-    """Inductor compiles the whole cell to other numbers; the package of its parts is compared in the slow tests."""
-    export_step(lstm(), lstm().initialise(frames(4)[0]), tmp_path / "step.pt2", compiled=False)
-    graph = torch.export.load(tmp_path / "step.pt2").graph
-    called = {str(node.target) for node in graph.nodes if node.op == "call_function"}
-    assert "aten.sigmoid.default" in called
-    assert not [name for name in called if "lstm" in name]
-
-
 @needs_compiler
 @pytest.mark.parametrize(
     "name", ["EKF of a known motion", *(pytest.param(name, marks=pytest.mark.slow) for name in ("dEKF", "LSTMFilter"))]

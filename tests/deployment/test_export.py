@@ -114,21 +114,6 @@ def test_noise_drawn_inside_follows_the_seed_and_differs_from_step_to_step(tmp_p
     assert not first[0].equal(other[0])
 
 
-def test_a_filter_in_training_is_exported_as_it_is_evaluated(tmp_path):
-    """A user's network with layers that depend on the mode: the package holds their deterministic forward."""
-    filter = small_filter()
-    filter = filter.with_modules(transition=LearnedTransition(nn.Sequential(nn.Dropout(0.5), nn.Linear(3, 3))))
-    example = TensorDict({"state": torch.ones(3), "reading": torch.zeros(2), "observed": torch.tensor([False])})
-    step = load_step(export_step(filter.train(), example, tmp_path / "a.pt2", compiled=False))
-    assert set(example.keys()) == {"state", "reading", "observed"}, "the example is left as it is"
-    row = filter.initialise(example.copy())
-    found = step({name: row[tuple(name.split("."))] for name in step.inputs})
-    assert set(step.outputs) == {f"belief.{name}" for name in ("ensemble", "mean", "var")}
-    expected = filter.eval().step(row)
-    for name in step.outputs:
-        torch.testing.assert_close(found[name], expected[tuple(name.split("."))])
-
-
 def test_errors(tmp_path, monkeypatch):
     filter = small_filter()
     example = TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)})

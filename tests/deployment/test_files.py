@@ -96,15 +96,6 @@ def test_links_stay_and_devices_are_written_to(tmp_path):
         write_text(tmp_path / "elsewhere", "text")
 
 
-def test_errors_of_other_files_are_not_the_writers(tmp_path):
-    match = r"^\[Errno 2\] No such file or directory: '/nowhere'$"
-    with pytest.raises(FileNotFoundError, match=match), replacing(tmp_path / "a.txt"):
-        Path("/nowhere").read_text()
-    (tmp_path / "file").touch()
-    with pytest.raises(OSError, match=r"cannot write .*file/a.txt: .*; choose another folder"):
-        write_text(tmp_path / "file" / "a.txt", "")
-
-
 def test_a_folder_is_one_process_s_alone(tmp_path):
     holder = start(LOCKS, tmp_path)
     match = rf"cannot use .*{tmp_path.name}: another process is writing to it \(process {holder.pid}\); wait"

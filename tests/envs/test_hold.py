@@ -4,11 +4,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.collectors import Collector
-from torchrl.envs import InitTracker, SerialEnv, TransformedEnv, check_env_specs
+from torchrl.envs import InitTracker, TransformedEnv
 from torchrl.modules import LSTMModule
 
-from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.envs import HoldReading
 
@@ -56,11 +54,6 @@ def test_values():
     assert hold._reset(last, frames((5.0, True))[0])["held"].item() == 5
 
 
-@pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
-def test_specs(batch):
-    check_env_specs(held_env(batch_size=batch))
-
-
 def test_episodes_that_end_apart():
     """Rows of 3, 5 and 4 steps: each begins anew, and the others keep what they hold."""
     env = held_env(batch_size=[3], max_steps=[3, 5, 4])
@@ -71,17 +64,6 @@ def test_episodes_that_end_apart():
     began = data["step"].squeeze(-1).eq(0) & ~data["observed"].squeeze(-1)
     assert began.any()
     assert data["held"][began].eq(0).all()
-
-
-def test_in_workers_and_in_collectors():
-    env = SerialEnv(2, [lambda: held_env(seed=0, max_steps=4), lambda: held_env(seed=1, max_steps=7)])
-    check_env_specs(env)
-    data = env.rollout(30, break_when_any_done=False)
-    assert data["held"].equal(by_hand(data))
-    collector = Collector(held_env(batch_size=[2], max_steps=[3, 5]), None, frames_per_batch=80, total_frames=80)
-    for data in collector:
-        assert data["held"].equal(by_hand(data))
-    collector.shutdown()
 
 
 def test_environments_that_reset_by_themselves():
@@ -110,10 +92,3 @@ def test_an_lstm_needs_it(key, spoiled):
     assert after.any()
     assert data["features"][after].isnan().all() == spoiled
     assert data["features"].isnan().any() == spoiled
-
-
-def test_what_is_not_there_is_named():
-    seen, unseen = frames((1.0, True), (1.0, True))
-    assert_refused(KeyError, r"'reading'.*in_key=", HoldReading("reading")._reset, seen, seen)
-    assert_refused(KeyError, r"'mask'.*MissingFrames", HoldReading(observed_key="mask")._reset, seen, seen)
-    assert_refused(KeyError, r"'held'.*env\.reset", HoldReading()._step, seen.exclude("held"), unseen)

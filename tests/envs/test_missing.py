@@ -3,8 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
-from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
+from torchrl.envs import TransformedEnv, check_env_specs
 
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.envs import MissingFrames
@@ -56,14 +55,3 @@ def test_in_an_environment(batch):
     resets = torch.stack([env.reset()["observed"] for _ in range(60)])
     assert resets.any()
     assert not resets.all()
-
-
-def test_adds_the_mask_to_the_specs():
-    env = TransformedEnv(ContinuousActionVecMockEnv(), MissingFrames(0.5, in_keys=["observation"], observed_key="seen"))
-    check_env_specs(env)
-    assert env.observation_spec["seen"].shape == (1,)
-    assert env.rollout(3)["seen"].dtype == torch.bool
-    batched = SerialEnv(
-        2, lambda: TransformedEnv(ContinuousActionVecMockEnv(), MissingFrames(0.5, in_keys=["observation"]))
-    )
-    check_env_specs(batched)

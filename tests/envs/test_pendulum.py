@@ -4,14 +4,8 @@ import math
 
 import pytest
 import torch
-from torchrl.envs import check_env_specs
 
 from torch_denkf.envs import NoisyPendulumEnv
-
-
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_specs(batch):
-    check_env_specs(NoisyPendulumEnv(0.1, missing=0.5, batch_size=batch))
 
 
 def test_motion_and_reward_are_those_of_gymnasium():

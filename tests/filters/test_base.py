@@ -11,9 +11,7 @@ from torchrl.modules.utils import get_env_transforms_from_module
 
 from tests.filters.factories import (
     OBS,
-    A,
     FixedEnsemble,
-    M,
     NoisyLinear,
     assert_equal,
     linear_denkf,
@@ -129,18 +127,6 @@ def test_a_filter_with_other_keys(float64):
     assert all(out["two", name].equal(expected["belief", name]) for name in ("ensemble", "mean", "var"))
 
 
-def test_errors():
-    filter = toy_denkf()
-    with pytest.raises(KeyError, match=r"carries its belief in \('belief', 'ensemble'\)"):
-        filter.step(TensorDict({"measurement": torch.zeros(M), "action": torch.zeros(A)}))
-    with pytest.raises(KeyError, match="carries its belief"):
-        filter(TensorDict({"measurement": torch.zeros(M), "is_init": torch.tensor([True])}))
-    with pytest.raises(KeyError, match="'measurement'"):
-        filter.sequence(TensorDict({"action": torch.zeros(4, A)}, [4]))
-    with pytest.raises(ValueError, match="time as its last batch dimension"):
-        filter.sequence(TensorDict({"measurement": torch.zeros(M)}))
-
-
 def test_a_state_dict_is_all_that_is_learned(float64):
     filter, fresh = toy_denkf(), toy_denkf()
     frames = filter.draw_noise(toy_frames((2, 5)))
@@ -210,14 +196,3 @@ def test_policy_transform_and_sequence_agree(float64, update_at_reset, make):
     assert (by_sequence["belief", "mean"][:, 2] - by_sequence["belief", "mean"][:, 0]).norm(dim=-1).min() > 0.1
     # A slice starts from what is stored.
     assert_equal(filter.sequence(by_policy[:, 2:9].copy()), by_policy[:, 2:9], belief, atol=1e-13)
-
-
-def test_select_observation(float64):
-    # The paper's KITTI set-up: h selects known dimensions.
-    filter = linear_denkf()
-    filter = DEnKF(filter["transition"], None, Select([1]), ConstantNoise([0.5], in_key="y"),
-                   EnsembleAnalysis("etkf", observation_key="y"), initial=filter.initial)  # fmt: skip
-    out = filter.step(filter.initialise(TensorDict({"y": torch.zeros(1)})))
-    forecast = out["forecast", "ensemble"][:, 1]
-    gain = forecast.var() / (forecast.var() + 0.25)
-    torch.testing.assert_close(out["belief", "mean"][1], (1 - gain) * forecast.mean(), rtol=1e-12, atol=1e-14)

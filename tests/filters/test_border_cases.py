@@ -3,11 +3,10 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import FrameSkipTransform, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from tests.filters.beliefs_for_tests import BELIEF, COV, ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import (
-    FixedEnsemble,
     linear_denkf,
     linear_kalman,
     toy_denkf,
@@ -43,27 +42,6 @@ def test_stored_beliefs_start_anew_where_marks_say_so_and_nowhere_else(float64):
     out = filter.sequence(stored.copy())
     assert out[ENSEMBLE][1, 5].equal(stored[ENSEMBLE][1, 5])
     assert not out[ENSEMBLE][0, 5].equal(stored[ENSEMBLE][0, 5])
-
-
-class MeanIfThere(FixedEnsemble):
-    """An initial belief around a mean, if there is one."""
-
-    def __init__(self, members):
-        super().__init__(members)
-        self.optional_keys = [MEAN]
-
-    def compute(self, mean=None, *, batch_size):
-        ensemble, *others = super().compute(batch_size=batch_size)
-        return ensemble if mean is None else ensemble + mean.unsqueeze(-2), *others
-
-
-@pytest.mark.parametrize("run", ["initialise", "sequence"])
-def test_a_start_knows_nothing_of_the_belief_that_is_there(run):
-    filter = linear_denkf()
-    filter = filter.with_modules(initial=MeanIfThere(filter.initial.members))
-    frames = TensorDict({"observation": torch.randn(3, 5, 2)}, [3, 5]).set(MEAN, torch.ones(3, 5, 2))
-    out = filter.sequence(frames)[:, 0] if run == "sequence" else filter.initialise(frames[:, 0])
-    assert (out[ENSEMBLE] == filter.initial.members).all()
 
 
 # ----------------------------------------------------------------------------------------------------------- groups
@@ -122,18 +100,3 @@ def test_the_covariance_of_an_ensemble_on_request(float64):
 
 
 # ------------------------------------------------------------------------------------------------------ frame skips
-
-
-def test_behind_a_frame_skip_the_belief_takes_one_step_a_skip():
-    env = base_env(seed=0, batch_size=[2])
-    filter = linear_denkf()
-    skipping = TransformedEnv(TransformedEnv(env, DEnKFTransform(filter)), FrameSkipTransform(3))
-    rollout = skipping.rollout(2)
-    row = filter.step(
-        rollout[:, 0].select("belief", "action").copy().set("observation", rollout["next", "observation"][:, 0])
-    )
-    close(rollout["next"][:, 0], row, [MEAN], atol=1e-6)
-    inside = TransformedEnv(
-        TransformedEnv(base_env(seed=0, batch_size=[2]), FrameSkipTransform(3)), DEnKFTransform(filter)
-    )
-    close(inside.rollout(2), rollout, [MEAN], atol=1e-6)

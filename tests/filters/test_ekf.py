@@ -95,19 +95,6 @@ def test_all_parameters_have_the_gradient_of_a_difference(float64, name):
     directional_check(loss, filter.parameters())
 
 
-@pytest.mark.parametrize("name", ["EKF", "UKF"])
-def test_unobserved_nan_leaves_gradients_finite(float64, name):
-    frames = linear_frames(2, 10)
-    q = CholeskyNoise(2, r=0.3)
-    r = ConstantNoise([0.7, 0.5], trainable=True, in_key="observation")
-    filter = linear_filter(name, process_noise=q, noise=r)
-    out = filter.sequence(frames)
-    total = out["belief", "mean"].square().sum() + out["info", "log_likelihood"].sum()
-    for gradient in torch.autograd.grad(total, (q.raw, r.log_variance)):
-        assert gradient.isfinite().all()
-        assert (gradient != 0).all()
-
-
 # ------------------------------------------------------------------------------------------------------- training
 
 

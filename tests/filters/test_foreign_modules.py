@@ -3,10 +3,8 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
-from torch_denkf.filters import Filter
 from torch_denkf.modules import SubModel
 from torch_denkf.running import run_module
 
@@ -90,18 +88,3 @@ def test_noise_of_a_part_inside_is_found_by_its_place_inside():
     expected = belief @ F.mT + frames["noise", "transition.inner"][:, 1] @ root.mT
     for value in found:
         torch.testing.assert_close(value, expected)
-
-
-def test_one_module_may_be_all_of_a_step():
-    """It reads the belief and the frame, and writes over the belief: y1 is half of y0 and of the frame."""
-    mean = ("belief", "mean")
-    initial = TensorDictModule(torch.zeros_like, ["observation"], [mean])
-    filter = Filter(TensorDictModule(lambda m, o: (m + o) / 2, [mean, "observation"], [mean]), initial=initial)
-    frames = TensorDict({"observation": torch.arange(6.0).reshape(1, 6, 1)}, [1, 6])
-    frames["is_init"] = torch.zeros(1, 6, 1, dtype=torch.bool)
-    frames["is_init"][0, 3] = True
-    assert filter.sequence(frames.copy())[mean].flatten().tolist() == [0, 0.5, 1.25, 0, 2, 3.5]
-    row = frames[:, 5].copy().set(mean, torch.full((1, 1), 2.0))
-    assert filter.step(row)[mean].item() == 3.5
-    row = frames[:, 5].copy().set(("previous", *mean), torch.full((1, 1), 2.0))
-    assert filter(row)[mean].item() == 3.5

@@ -5,7 +5,6 @@ import warnings
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
 
 from tests.filters.beliefs_for_tests import BELIEF, ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import (
@@ -21,9 +20,8 @@ from tests.filters.particle_for_tests import bootstrap
 from tests.filters.test_several_analyses import reads
 from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter
-from torch_denkf.modules import ConstantNoise, FromSensor, GaussianPrior, LinearObservation, Update
+from torch_denkf.modules import ConstantNoise, FromSensor, GaussianPrior, LinearObservation
 from torch_denkf.modules.particles import with_weights
-from torch_denkf.smoothers import FixedLag
 
 LOG_WEIGHT = ("belief", "log_weight")
 
@@ -89,38 +87,6 @@ def test_only_readings_are_left_out_of_a_prediction(float64):
             filter.step(td, without=[name])
     with pytest.raises(TypeError, match="list of keys"):
         filter.step(td, without="observation")
-
-
-class Halfway(Update):
-    """An analysis that goes halfway to the reading, and holds a weight for each of two components."""
-
-    def __init__(self, named):
-        reads = [("forecast", "ensemble"), ("forecast", "observation"), "observation", ("sensor", "noise")]
-        writes = [("belief", name) for name in ("ensemble", "mean", "var")]
-        super().__init__(nn.Identity(), reads, writes, optional_keys=["observed"])
-        self.predicted_key, self.observed_key, self.info_prefix = self.in_keys[1], "observed", "info"
-        self.reading_keys = self.in_keys[2:] if named else []
-
-    def compute(self, forecast, predicted, reading, variance, observed=None):
-        seen = 0.5 if observed is None else 0.5 * observed.unsqueeze(-1)
-        moved = forecast + seen * torch.ones(2) * (reading.unsqueeze(-2) - predicted)[..., :1]
-        return moved, moved.mean(-2), moved.var(-2)
-
-
-def test_a_prediction_refuses_an_analysis_that_does_not_name_its_reading(float64):
-    td = TensorDict({"observation": torch.randn(2)})
-    named, nameless = (linear_denkf().with_modules(analysis=Halfway(named)) for named in (True, False))
-    start = named.initialise(td.clone())
-    still = named.predict(start.clone())
-    close(still, {MEAN: still["forecast", "ensemble"].mean(-2)}, [MEAN])
-    with pytest.raises(KeyError, match=r"Halfway at place 'analysis' .*reading_keys"):
-        nameless.predict(start)
-
-
-def test_an_analysis_that_cannot_take_a_past_says_what_to_write(float64):
-    lagged = FixedLag(linear_denkf().with_modules(analysis=Halfway(True)), lag=2)
-    with pytest.raises(RuntimeError, match=r"2 times 2 components: write Halfway.move_past"):
-        lagged.sequence(TensorDict({"observation": torch.randn(4, 2)}, [4]))
 
 
 def test_one_of_two_sensors_may_be_missing(float64):

@@ -7,7 +7,6 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system, toy_denkf, toy_frames
-from torch_denkf.filters import Filter
 
 MEAN, ENSEMBLE = ("belief", "mean"), ("belief", "ensemble")
 
@@ -112,35 +111,3 @@ def test_flipout_in_a_sensor_has_a_perturbation_of_its_own_at_each_time():
             given["noise", "sensor"] = filter["sensor"].draw_noise([3, 5], time=True, dtype=torch.float64)
         outs.append(filter.sequence(given)["sensor", "ensemble"])
     assert outs[0].equal(outs[1])
-
-
-class Normalised(nn.Module):
-    """Batch normalisation of all rows, which in training needs more than one."""
-
-    def __init__(self):
-        super().__init__()
-        self.norm = nn.BatchNorm1d(2)
-
-    def forward(self, reading):
-        return self.norm(reading.flatten(0, -2)).reshape(reading.shape)
-
-
-def test_a_batch_normalisation_does_not_notice_the_trial_step():
-    """It counts one batch a sequence, in training; and all noise is drawn in bulk."""
-    sensor = TensorDictModule(Normalised(), ["raw"], ["observation"])
-    plain = linear_denkf("perturbed", noisy=True)
-    filter = Filter({"normal": sensor, **dict(plain.module.named_children())}, initial=plain.initial)
-    frames = TensorDict({"raw": torch.randn(3, 5, 2)}, [3, 5])
-    drawn = filter.draw_noise(frames.copy())
-    assert sensor.module.norm.num_batches_tracked == 0
-    assert {*drawn["noise"].keys()} >= {"transition", "analysis"}
-    filter.sequence(frames)
-    assert sensor.module.norm.num_batches_tracked == 1
-    assert all(part.training for part in filter.modules())
-
-
-def test_a_draw_of_which_a_part_is_missing_is_drawn_whole():
-    filter, frames = toy_denkf(layer="flipout"), toy_frames((3, 5))
-    drawn = filter.draw_noise(frames.copy())["noise", "transition"].exclude("perturbation")
-    frames["noise", "transition"] = drawn
-    assert {*filter.draw_noise(frames)["noise", "transition"].keys()} == {"signs", "perturbation"}

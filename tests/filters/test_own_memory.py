@@ -132,12 +132,3 @@ def test_constructors_copy_what_they_are_given(name, kind):
     assert before
     for key, value in before.items():
         assert torch.equal(after[key], value), key
-
-
-def test_a_parameter_that_would_not_be_trained_is_refused():
-    learned = nn.Parameter(torch.eye(2))
-    with pytest.raises(ValueError, match="matrix asks for a gradient and would never be trained"):
-        LinearObservation(learned)
-    transition = LinearTransition(learned, torch.eye(2), trainable=True)
-    assert isinstance(transition.matrix, nn.Parameter)
-    assert transition.matrix is not learned

@@ -5,8 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.beliefs_for_tests import close
-from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
-from torch_denkf.imperfect import RejectReadings
+from tests.filters.factories import linear_denkf, linear_kalman
 from torch_denkf.modules import FromSensor
 
 FILTERS = {"DEnKF": linear_denkf, "Kalman": linear_kalman}
@@ -92,23 +91,6 @@ def test_the_action_before_drives_the_step_and_need_not_be_stored_twice():
     close(torch.stack([row.select(*filter.out_keys) for row in rows], 1), expected[:, 1:], filter.out_keys)
 
 
-def test_a_policy_carries_actions_that_need_not_be_there():
-    """A transition that can do without the action: the primer brings it all the same."""
-
-    class Coasting(NoisyLinear):
-        def __init__(self, matrix, control):
-            super().__init__(matrix, control=control)
-            self.in_keys, self.optional_keys = self.in_keys[:1], ["action"]
-
-    filter = linear_denkf()
-    filter = filter.with_modules(transition=Coasting(linear_system()[0], torch.tensor([[0.5], [-1.0]])))
-    assert ("previous", "action") in filter.make_tensordict_primer().actions.values()
-    td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
-    coasting = filter.predict(td.copy())["belief", "mean"]
-    driven = filter.predict(td.copy().set("action", torch.tensor([2.0])))["belief", "mean"]
-    torch.testing.assert_close(driven - coasting, torch.tensor([1.0, -2.0]))
-
-
 @every_filter
 @pytest.mark.parametrize("update_at_reset", [False, True])
 def test_a_reading_that_a_start_does_not_use_may_be_anything(name, update_at_reset):
@@ -127,27 +109,6 @@ def test_a_reading_that_a_start_does_not_use_may_be_anything(name, update_at_res
             filter(first)
     else:
         torch.testing.assert_close(filter(first)["belief", "mean"], filter(row.copy())["belief", "mean"])
-
-
-@every_filter
-@pytest.mark.parametrize("update_at_reset", [False, True])
-def test_so_may_it_in_the_sequence_that_a_loss_filters(name, update_at_reset):
-    """Compares at resets in a policy's data and in a recording; behind RejectReadings with gradients."""
-    filter = FILTERS[name](update_at_reset=update_at_reset)
-    data = policy_data(filter, anew=(0, 3))[0]
-    recording = data.select("observation").set("is_init", torch.arange(7).eq(3).expand(2, 7).unsqueeze(-1))
-    for given in (data, recording):
-        broken = given.copy().set("observation", given["observation"].clone())
-        broken["observation"][:, [0, 3]] = torch.nan
-        out = filter.sequence(broken.copy())
-        if update_at_reset:
-            assert out["belief", "mean"][:, 0].isnan().all(), "a sequence raises nothing"
-            continue
-        close(out, filter.sequence(given.copy()), filter.out_keys)
-        broken["observation"].requires_grad_()
-        out = filter.sequence(RejectReadings({"observation": "observed"})(broken.copy()))
-        (gradient,) = torch.autograd.grad(out["belief", "mean"].square().sum(), broken["observation"])
-        assert gradient.isfinite().all()
 
 
 def test_a_start_that_is_made_of_the_reading_uses_it():

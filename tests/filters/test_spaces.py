@@ -1,6 +1,5 @@
 """Filters and smoothers whose state is an orientation: against closed forms, other filters, and a turned world."""
 
-import shutil
 from functools import partial
 
 import numpy as np
@@ -11,7 +10,6 @@ from torch import nn
 
 from tests.filters.beliefs_for_tests import close
 from torch_denkf.baselines import BackpropKF
-from torch_denkf.deployment import export_step, load_step
 from torch_denkf.filters import EKF, UKF, DEnKF, ParticleFilter
 from torch_denkf.functional.manifolds import SO3, Circle, Euclidean, Opposite, Product
 from torch_denkf.fusion import FusedFilter, FusedSensor
@@ -35,7 +33,6 @@ SPACE = Product(SO3(), Euclidean(3))  # orientation, and a gyro's bias in rad/s
 STD, Q, R = [0.2] * 3 + [0.1] * 3, [0.02] * 3 + [0.01] * 3, [0.1] * 3  # standard deviations of tangents
 MEAN, VAR = ("belief", "mean"), ("belief", "var")
 KINDS = ("EKF", "UKF", "perturbed", "etkf", "significance", "fused", "gated", "particles")
-needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="no C++ compiler")
 
 
 @pytest.fixture(autouse=True)
@@ -361,19 +358,6 @@ def test_a_reading_that_is_missing_is_one_that_is_hidden(kind):
     close(out, filter.step(start.copy()), filter.belief_keys, atol=1e-12)
 
 
-@needs_compiler
-@pytest.mark.parametrize("kind", ["EKF", pytest.param("etkf", marks=pytest.mark.slow)])
-def test_packaged_is_eager(kind, tmp_path):
-    filter = make(kind)
-    data = with_noise(filter, log())
-    example = filter.initialise(data[0, 0].clone())
-    step = load_step(export_step(filter, example, tmp_path / "step.pt2", compiled=kind == "EKF"))
-    given = {name: example[tuple(name.split(".")) if "." in name else name] for name in step.inputs}
-    out = step(given)
-    eager = filter.step(example.clone())
-    assert (SPACE.minus(out["belief.mean"], eager[MEAN])).abs().max() < 1e-10
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_are_finite_also_behind_masks_and_half_a_turn_away(kind):
     filter, data = make(kind), log()
@@ -386,16 +370,6 @@ def test_gradients_are_finite_also_behind_masks_and_half_a_turn_away(kind):
     loss.backward()
     assert data["start"].grad.isfinite().all()
     assert data["pose"].grad.isfinite().all()
-
-
-@pytest.mark.parametrize("kind", ["EKF", "etkf"])
-def test_a_ceiling_holds_the_tangents(kind):
-    filter, data = make(kind, variance_ceiling=0.01), log()
-    data["observed"][:] = False
-    with pytest.warns(UserWarning, match="variance_ceiling"):
-        out = filter.sequence(with_noise(filter, data))
-    assert out[VAR][:, 1:].max() < 0.01 + 1e-12
-    assert (out[MEAN][..., :4].norm(dim=-1) - 1).abs().max() < 1e-12
 
 
 # -------------------------------------------------------------------------------------------------- what it is good for

@@ -10,7 +10,7 @@ from torch.distributions import MultivariateNormal
 from tests.functional.checks import assert_refused
 from torch_denkf.functional import analyse, ensemble_mean, kalman_update
 from torch_denkf.functional.inflation import random_rotation
-from torch_denkf.functional.moments import ensemble_anomalies, ensemble_cov
+from torch_denkf.functional.moments import ensemble_cov
 
 SCHEMES = ["sensor", "perturbed", "etkf", "sakov"]
 SPACES = ["observation", "ensemble"]
@@ -261,13 +261,6 @@ def test_errors_name_the_argument(change, message):
     assert_refused(ValueError, message, analyse, **arguments | change)
 
 
-def test_anomalies_of_the_square_root_sum_to_zero():
-    # Mean-preserving: otherwise the mean would drift; 12 members of size 1 leave about 1e-15.
-    problem = Problem(12, 4, 3)
-    result = problem.analyse("etkf")
-    assert ensemble_anomalies(result.ensemble).sum(0).abs().max() < 1e-12
-
-
 @pytest.mark.parametrize("scheme", ["sensor", "perturbed", "sakov"])
 def test_a_taper_of_blocks_is_one_analysis_for_each_block(scheme):
     problem = Problem(6, 5, 3, (2,), mask="partial")
@@ -287,20 +280,6 @@ def test_a_taper_of_blocks_is_one_analysis_for_each_block(scheme):
         torch.testing.assert_close(tapered.ensemble[..., rows], alone.ensemble, **EXACT)
         nis = nis + alone.nis
     torch.testing.assert_close(tapered.nis, nis, **EXACT)
-
-
-@pytest.mark.parametrize(
-    ("scheme", "space", "shape", "message"),
-    [
-        ("etkf", "auto", (3, 2), "not for scheme 'etkf'"),
-        ("sensor", "ensemble", (3, 2), "'ensemble'"),
-        ("sensor", "auto", (2, 3), r"state's taper must be \[\*B, 3, 2\]"),
-    ],
-)
-def test_a_taper_that_does_not_fit_is_refused(scheme, space, shape, message):
-    problem = Problem(5, 3, 2)
-    taper = torch.ones(shape, dtype=torch.float64), torch.ones(2, 2, dtype=torch.float64)
-    assert_refused(ValueError, message, problem.analyse, scheme, taper=taper, space=space)
 
 
 @pytest.mark.parametrize("space", SPACES)

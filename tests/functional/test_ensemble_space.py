@@ -81,17 +81,6 @@ def test_perturbations_are_drawn_tile_by_tile(small_tiles):
     torch.testing.assert_close(found.ensemble, expected.ensemble, **EXACT)
 
 
-def test_gradients_take_the_plain_route(small_tiles):
-    arguments = problem("sensor", 6, 300, 300)
-    gradients = []
-    for space in ("ensemble", "observation"):
-        forecast = arguments["forecast"].clone().requires_grad_()
-        analyse(**{**arguments, "forecast": forecast}, space=space).ensemble.square().sum().backward()
-        gradients.append(forecast.grad)
-    assert small_tiles == []
-    torch.testing.assert_close(*gradients, **EXACT)
-
-
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("count", [10, 100, 5000])  # observation space; ensemble space, whole and in tiles
 @pytest.mark.parametrize("noise", [1e-5, 1e-7])

@@ -15,9 +15,7 @@ from torch_denkf.filters import KalmanFilter
 from torch_denkf.imperfect import Visible
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, KalmanAnalysis, LinearObservation
 from torch_denkf.monitoring import Gated, GatedAnalysis, InnovationMonitor, Monitored, MonitoredSensor
-from torch_denkf.monitoring._calibration import chi_square_table
 from torch_denkf.monitoring.chi_square import chi_square_quantile
-from torch_denkf.monitoring.gating import adapt, disbelief
 
 FILTERS = {
     "etkf": lambda: linear_denkf("etkf", noisy=True),
@@ -272,16 +270,6 @@ def test_nothing_behind_the_mask_counts(response):
             assert torch.equal(out["gate", key][:, 4], out["gate", key][:, 7]), (name, key)
 
 
-@pytest.mark.parametrize("name", FILTERS)
-def test_steps_without_a_reading_keep_the_state(name):
-    gated = Gated(FILTERS[name](), DIM)
-    td = run(gated, data())[:, -1]
-    before = td["gate", "terms"].clone()
-    after = gated.predict(td.clone())
-    assert torch.equal(after["gate", "terms"], before)
-    assert (after["gate", "factor"] == 1).all()
-
-
 @pytest.mark.parametrize("response", RESPONSES)
 def test_steps_sequences_and_environments_agree(response):
     F = torch.tensor([[1.0, 0.1], [-0.1, 0.9]])
@@ -442,25 +430,6 @@ def test_with_an_adapted_spread_a_hidden_or_rejected_reading_is_as_good_as_none(
         for key in ("mean", "var"):
             torch.testing.assert_close(outs[kind]["belief", key], outs["none"]["belief", key])
     assert response != "reject" or outs["rejected"]["gate", "factor"].isinf().all()
-
-
-@pytest.mark.parametrize("response", RESPONSES)
-def test_gates_are_open_while_they_are_calibrated(response):
-    """The oracle is the filter without a gate: its innovations are what is calibrated to."""
-    clean = data(runs=20, steps=60, dtype=torch.float32)
-    plain = run(linear_kalman(), clean)["info", "nis"].flatten().double()
-    gated = Gated(linear_kalman(), response=response, window=1, rate=0.2)  # it would act in every fifth step
-    assert (run(gated, clean)["gate", "factor"] > 1).any()
-    gated.calibrate([clean])
-    expected = chi_square_table(plain[plain > 0], DIM).to(gated.gates[0].tables.dtype)
-    torch.testing.assert_close(gated.gates[0].tables[0], expected)
-    assert gated.gates[0].rate == 0.2
-
-
-def test_functions_refuse_and_hold():
-    with pytest.raises(ValueError, match="reject, student, huber"):
-        disbelief(torch.ones(1), torch.ones(1), "tukey")
-    assert torch.equal(adapt(torch.ones(2), torch.ones(2), torch.zeros(2), 0.1), torch.ones(2))
 
 
 def test_wrong_arguments_are_named():

@@ -225,15 +225,6 @@ def test_a_marked_beginning_forgets():
     assert torch.allclose(replayed["gps", "cusum"][:, 16:], alone["gps", "cusum"][:, 1:], atol=1e-5)
 
 
-@pytest.mark.slow
-def test_compiled_steps_give_the_same():
-    data = simulate(2, 9)
-    eager = Monitored(kalman(), monitor(window=3)).sequence(data.clone())
-    compiled = Monitored(kalman(), monitor(window=3)).compile(chunk=2, backend="aot_eager").sequence(data.clone())
-    for key in (("gps", "p_value"), ("gps", "cusum"), "alarm"):
-        assert torch.allclose(eager["monitor", key].double(), compiled["monitor", key].double(), atol=1e-6)
-
-
 def test_a_claimed_noise_that_jumps_raises_the_alarm():
     """A sensor that says itself that it sees nothing has innovations that are too small, not too large."""
     generator = torch.Generator().manual_seed(0)

@@ -55,18 +55,3 @@ def test_a_filter_with_a_prefix_has_the_same_terms(float64, loss):
         losses.append(loss(filter)(frames))
     assert list(losses[0].keys()) == list(losses[1].keys())
     assert all(losses[0][key].equal(losses[1][key]) for key in losses[0].keys())  # noqa: SIM118
-
-
-def test_the_tensordict_is_left_as_it_is():
-    filter = toy_denkf()
-    frames, _ = problem(filter)
-    before = frames.clone()
-    DEnKFLoss(filter)(frames)
-    assert set(frames.keys(True, True)) == set(before.keys(True, True))
-    assert (frames == before).all()
-
-
-def test_a_misspelt_entry_is_named_beside_those_that_exist():
-    loss = DEnKFLoss(toy_denkf())
-    with pytest.raises(ValueError, match=r"^DEnKFLoss reads no 'sensr'; set_keys takes state, [a-z_, ]+$"):
-        loss.set_keys(sensr="x")

@@ -4,12 +4,9 @@ from functools import cache
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import nn
 from torchrl.objectives import DDPGLoss
 
 from tests.objectives.test_torchrl_losses import (
-    MEAN,
     with_other_beliefs,
 )
 from tests.test_docs import BLOCK, ROOT
@@ -88,58 +85,3 @@ def test_what_was_believed_after_the_start_of_a_slice_does_not_matter(name):
     for key in set(losses[0].keys()) & {"loss_actor", "loss_qvalue", "loss_value"}:
         assert losses[0][key].equal(losses[1][key])
         assert losses[0][key] != 0
-
-
-class Regulator(nn.Module):
-    """The linear-quadratic regulator of the page's mass, held at what the motor can do."""
-
-    def __init__(self):
-        super().__init__()
-        moves, motor, cost = torch.tensor([[1.0, 0.1], [-0.1, 0.98]]), torch.tensor([[0.0], [0.2]]), torch.zeros(2, 2)
-        cost[0, 0] = 1.0
-        worth = cost
-        for _ in range(500):  # Riccati's recursion
-            self.gain = torch.linalg.solve(0.1 + motor.mT @ worth @ motor, motor.mT @ worth @ moves)
-            worth = cost + moves.mT @ worth @ (moves - motor @ self.gain)
-
-    def forward(self, state):
-        return (-state @ self.gain.mT).clamp(-1, 1)
-
-
-class Still(nn.Module):
-    """No push."""
-
-    def forward(self, state):
-        return torch.zeros_like(state[..., :1])
-
-
-def with_policy(names, policy, call):
-    names["policy"], before = policy, names["policy"]
-    try:
-        return call()
-    finally:
-        names["policy"] = before
-
-
-def regulated(names):
-    """The page's return of a regulator on the belief of a filter that knows the motor."""
-    weight = names["motion"].weight
-    before = weight.detach().clone()
-    policy = TensorDictSequential(names["denkf"], TensorDictModule(Regulator(), [MEAN], ["action"]))
-    try:
-        weight.data.copy_(torch.tensor([[1.0, 0.1, 0.0], [-0.1, 0.98, 0.2]]))
-        return with_policy(names, policy, names["test"])
-    finally:
-        weight.data.copy_(before)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "rounds"), [("ppo", 25), ("sac", 20), ("ddpg", 20)])
-def test_a_program_learns(name, rounds):
-    """The loss against a regulator that knows everything but the state is a quarter of that of no push, at most."""
-    names = {}
-    exec(code(name).replace("ROUNDS, SEED = 2,", f"ROUNDS, SEED = {rounds},"), names)
-    assert names["ROUNDS"] == rounds
-    best = regulated(names)
-    still = with_policy(names, TensorDictModule(Still(), ["state"], ["action"]), names["test"])
-    assert names["test"]() > best + 0.25 * (still - best)

@@ -19,7 +19,7 @@ from torch_denkf.baselines import LSTMFilter
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.modules import DiagonalNoise, GaussianLikelihood, Select
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
-from torch_denkf.smoothers import EnKS, EnRTS
+from torch_denkf.smoothers import EnKS
 
 LOSSES = {
     "DEnKFLoss": lambda **options: DEnKFLoss(linear_denkf("etkf"), **options),
@@ -127,11 +127,6 @@ def test_missing_entries(left_out, loss, make, options, words):
     refuses(lambda: loss(make(), **options)(frames), *words, error=KeyError)
 
 
-def test_a_step_takes_two_times():
-    frames, _ = problem(toy_denkf())
-    refuses(lambda: TransitionLoss(linear_kalman())(frames[0, 0]), "two times")
-
-
 # --------------------------------------------------------------------------------------------- another kind of belief
 
 
@@ -189,23 +184,6 @@ def test_weights_count_and_noise_that_is_trained_gets_its_gradient(float64):
 
 
 # ------------------------------------------------------------------------------------------------ keys and callables
-
-
-@pytest.mark.parametrize("key", [5, 1.5, ("a", 3), (), "", ["state"], True])
-@pytest.mark.parametrize("name", ["state", "state_observed", "target_observation", "observed", "belief"])
-def test_what_is_no_key(name, key):
-    for loss in (DEnKFLoss(toy_denkf()), GaussianLoss(linear_kalman()), MixtureLoss(toy_filter())):
-        refuses(lambda loss=loss: loss.set_keys(**{name: key}), name, "is a key", repr(key), error=TypeError)
-    if name == "belief":
-        refuses(lambda: TransitionLoss(linear_kalman(), belief=key), name, repr(key), error=TypeError)
-
-
-def test_what_makes_no_smoother():
-    options = {"state": 0.0, "transition": 0.0, "smoothed": 1.0}
-    for smoother in (EnRTS(toy_denkf()), "EnRTS", 3):
-        make = lambda smoother=smoother: DEnKFLoss(toy_denkf(), **options, smoother=smoother)  # noqa: E731
-        refuses(make, "smoother", error=TypeError)
-    refuses(lambda: DEnKFLoss(toy_denkf(), **options, smoother=lambda filter: filter), "Smoother", error=TypeError)
 
 
 def test_nothing_of_this_hides_a_sound_batch(float64):

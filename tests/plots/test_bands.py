@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
 from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import DT, ensemble_run, kalman_runs
@@ -130,27 +129,6 @@ def test_angles_stay_beside_the_mean():
     np.testing.assert_allclose(line(axes, "readings")[1], theta + 0.2, atol=1e-5)
     np.testing.assert_allclose(low, np.quantile(ensemble[..., 0], 0.05, axis=1, method="weibull"), atol=1e-5)
     assert (high - low).max() < 0.8
-
-
-def test_errors_say_what_to_do():
-    run = ensemble_run()
-    with pytest.raises(ValueError, match="2 Axes are needed, one a component; got 1"):
-        plot_bands(run, dims=[0, 1], ax=Figure().add_subplot())
-    with pytest.raises(ValueError, match="names needs one entry a drawn component, 3; got 1"):
-        plot_bands(run, names=["x"])
-    with pytest.raises(ValueError, match=r"readings of \[2\] belong to no drawn component"):
-        plot_bands(run, dims=[0], readings={2: torch.zeros(40)})
-    with pytest.raises(ValueError, match=r"must be \[40\]; got 39"):
-        plot_bands(run, readings={2: torch.zeros(39)})
-    with pytest.raises(ValueError, match="40 increasing seconds"):
-        plot_bands(run, time=torch.zeros(40))
-    points = TensorDict({"belief": {"mean": torch.zeros(40, 4), "var": torch.ones(40, 3)}}, [40])
-    with pytest.raises(ValueError, match="pass space="):
-        plot_bands(points)
-    with pytest.raises(ValueError, match='pass band="variance"'):
-        plot_bands(kalman_runs()[0], band="ensemble")
-    with pytest.raises(ValueError, match=r"in \(0, 1\); got 90"):
-        plot_bands(run, level=90)
 
 
 def spans(axes) -> list[tuple[float, float]]:

@@ -73,14 +73,3 @@ def test_particles_count_with_their_weights():
         for axes, other in zip(panels, wanted, strict=True):
             np.testing.assert_allclose(bars(axes), bars(other), atol=1e-9)
             assert axes.get_legend_handles_labels()[1] == other.get_legend_handles_labels()[1]
-
-
-def test_errors_say_what_to_do():
-    with pytest.raises(ValueError, match='pass kind="pit"'):
-        plot_calibration(kalman_runs(), kind="rank")
-    with pytest.raises(ValueError, match="19 members have 20 ranks, too few for 21 bins"):
-        plot_calibration(ensemble_run(), bins=21)
-    with pytest.raises(ValueError, match="every must be at least 1"):
-        plot_calibration(ensemble_run(), every=0)
-    with pytest.raises(ValueError, match="the truth is missing"):
-        plot_calibration(ensemble_run().exclude("state"))

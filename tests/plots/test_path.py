@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
 from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import ensemble_run, kalman_runs
@@ -92,34 +91,3 @@ def test_ellipses_of_an_ensemble_are_those_of_its_covariance():
         squares = np.linalg.eigvalsh(np.cov(run["belief", "ensemble"][step, :, :2].double().numpy().T))
         wanted = 2 * math.sqrt(-2 * math.log(0.1)) * np.sqrt(squares)
         np.testing.assert_allclose([patch.height, patch.width], wanted, rtol=1e-5)
-
-
-def test_errors_say_what_to_do():
-    run = ensemble_run()
-    with pytest.raises(KeyError, match=r"no \(\"belief\", \"mean\"\)"):
-        plot_path(run.select("state"))
-    with pytest.raises(KeyError, match="no 'pose' among"):
-        plot_path(run, "pose")
-    with pytest.raises(ValueError, match="one sequence"):
-        plot_path(kalman_runs())
-    with pytest.raises(ValueError, match=r'pass spread="ellipses"'):
-        plot_path(kalman_runs()[0], spread="ensemble")
-    with pytest.raises(ValueError, match="variance or a covariance"):
-        plot_path(run["belief", "mean"], spread="ellipses")
-    with pytest.raises(ValueError, match="two dimensions, or three"):
-        plot_path(run, dims=[0])
-    with pytest.raises(ValueError, match="three need projection"):
-        plot_path(run, dims=[0, 1, 2], ax=Figure().add_subplot())
-    with pytest.raises(IndexError, match="dimension 3 of a state of 3"):
-        plot_path(run, dims=[0, 3])
-    with pytest.raises(ValueError, match="truth must be"):
-        plot_path(run, run["state"][:5])
-
-
-@pytest.mark.parametrize("forward_up", [False, True])
-def test_readings_are_dots_where_they_were_read(forward_up):
-    readings = torch.tensor([[1.0, 2.0], [float("nan"), 3.0], [4.0, 5.0]])
-    axes = plot_path(torch.zeros(3, 4), readings=readings, dims=(2, 3), forward_up=forward_up)
-    (dots,) = [line for line in axes.get_lines() if line.get_label() == "readings"]
-    x, y = (dots.get_xdata().tolist(), dots.get_ydata().tolist())
-    assert (x, y) == (([-2.0, -5.0], [1.0, 4.0]) if forward_up else ([1.0, 4.0], [2.0, 5.0]))

@@ -104,25 +104,3 @@ def test_the_belief_lies_on_the_picture(tmp_path, bands):
         down, across = marked.max(0)  # the dot is the last mark to the right, and the lowest
         assert across - 3.5 == pytest.approx((column + 0.5) / 32 * (right - left), abs=2)
         assert down - 3.5 == pytest.approx((row + 0.5) / 20 * (bottom - top), abs=2)
-
-
-def test_errors_say_what_to_do(tmp_path):
-    run = ensemble_run(steps=4)
-    with pytest.raises(ValueError, match=r"ends with \.mp4 or \.gif; got 'a\.avi'"):
-        write_video(tmp_path / "a.avi", smooth_frames(), 10)
-    with pytest.raises(ValueError, match="at most 50 for a GIF"):
-        write_video(tmp_path / "a.gif", smooth_frames(), 60)
-    for ending in ("mp4", "gif"):
-        with pytest.raises(ValueError, match="needs frames"):
-            write_video(tmp_path / f"a.{ending}", [], 10)
-        with pytest.raises(ValueError, match="frame 1 has shape"):
-            write_video(tmp_path / f"a.{ending}", [np.zeros((8, 8)), np.zeros((8, 9))], 10)
-    with pytest.raises(ValueError, match="nothing to draw"):
-        belief_video(tmp_path / "a.gif", run)
-    for given in ({}, {"pixels": torch.zeros(4, 3, 8, 8), "path": {"forward_up": True}}):
-        with pytest.raises(ValueError, match="on_picture needs pixels, and a path of two dims without forward_up"):
-            belief_video(tmp_path / "a.gif", run, on_picture=True, **given)
-    with pytest.raises(KeyError, match="no 'image' among"):
-        belief_video(tmp_path / "a.gif", run, "image")
-    with pytest.raises(ValueError, match="a picture a step, 4; got 3"):
-        belief_video(tmp_path / "a.gif", run, torch.zeros(3, 3, 8, 8))

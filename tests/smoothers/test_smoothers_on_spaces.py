@@ -5,7 +5,6 @@ import torch
 from torch import nn
 
 from tests.filters.beliefs_for_tests import close
-from tests.filters.factories import stepwise
 from tests.filters.test_spaces import (
     DT,
     SPACE,
@@ -164,18 +163,6 @@ def test_a_turned_world_turns_the_iterated_smoother_and_nothing_else(turn):
     here, there = turned_beliefs(filter, turn, data)
     assert_turned(here, there, turn, 1e-8)
     close(there["info"], here["info"], ["nis", "log_likelihood"], atol=1e-7)
-
-
-def test_iterated_steps_are_the_sequence_and_gradients_are_finite():
-    filter, data = orientations_iterated(), log()
-    data["is_init"] = (torch.arange(T) % 8 == 0).reshape(1, T, 1).expand(B, T, 1).clone()
-    data = filter.draw_noise(data)
-    data["pose"][0, 6] = SO3().plus(data["pose"][0, 5], torch.tensor([torch.pi, 0.0, 0.0]))
-    data["start"].requires_grad_()
-    out = filter.sequence(data.clone())
-    close(stepwise(filter, data.clone().detach()), out.detach(), filter.belief_keys, atol=1e-9)
-    (out["smoothed", "var"].sum() + SPACE.minus(out["belief", "mean"], data["state"]).square().sum()).backward()
-    assert data["start"].grad.isfinite().all()
 
 
 def test_the_iterated_smoother_takes_the_mean_of_samples_that_are_points():

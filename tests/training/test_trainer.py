@@ -1,7 +1,5 @@
 """Oracles: a training loop written out by hand, the maximum of a closed-form likelihood, scripted validations."""
 
-import sys
-
 import pytest
 import torch
 from scipy.optimize import minimize_scalar
@@ -297,29 +295,6 @@ def test_hooks_of_torchrl(tmp_path, capfd):
         tmp_path / "logs/csv/scalars/fit/loss.csv"
     ).read_text()
     assert capfd.readouterr() == ("", "")  # no bar where no terminal is
-
-
-def test_the_bar_shows_terms_and_errors(tmp_path, monkeypatch):
-    shown = []
-
-    class Bar:
-        def __init__(self, **kwargs):
-            shown.append({key: kwargs[key] for key in ("total", "initial", "desc", "unit", "disable")})
-
-        __enter__ = lambda self: self  # noqa: E731
-        __exit__ = update = lambda self, *_: None
-
-        def set_postfix(self, values, refresh):
-            shown.append(sorted(values))
-
-    monkeypatch.setattr(sys.modules["torch_denkf.deployment.progress"], "tqdm", Bar)
-    net = nn.Linear(2, 1)
-    trainer = FilterTrainer(net, [line_stage(net)], out=tmp_path, device="cpu", validate=lambda: {"error": 1.0})
-    trainer.fit()
-    assert shown == [
-        {"total": 6, "initial": 0, "desc": "fit", "unit": "it", "disable": False},
-        ["error", "loss", "loss_bias", "loss_square"],
-    ]
 
 
 def test_mistakes(tmp_path):

@@ -1,11 +1,8 @@
 """The transform's options: what is stored, gradients, priors and masks given to resets, diagnostics, buffers."""
 
-from functools import partial
-
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.envs import (
     ClipTransform,
@@ -23,18 +20,7 @@ from torchrl.envs import (
 from tests.filters.factories import assert_equal, linear_kalman, linear_system
 from tests.transforms import envs_for_tests as envs
 from torch_denkf.envs import LinearGaussianEnv
-from torch_denkf.filters import KalmanFilter
 from torch_denkf.transforms import DEnKFTransform
-
-
-def test_plain_sequential_with_its_initial_belief():
-    filter = envs.fixed_filter()
-    plain = TensorDictSequential(*filter)
-    rollouts = [
-        envs.random_rollout(TransformedEnv(envs.base_env(batch_size=[3], max_steps=[3, 5, 9]), transform))
-        for transform in (DEnKFTransform(filter), DEnKFTransform(plain, initial=filter.initial))
-    ]
-    assert_equal(rollouts[0]["next"], rollouts[1]["next"], envs.BELIEF)
 
 
 @pytest.mark.parametrize("use_buffers", [False, True])
@@ -57,12 +43,6 @@ def test_store_ensemble_false_in_a_collector(use_buffers):
     for key in envs.BELIEF[1:]:
         assert small["next", key].equal(full["next", key])
         assert small[key].equal(full[key])
-
-
-def test_store_ensemble_false_inside_of_workers_raises():
-    make = partial(envs.filtered_env, transform={"store_ensemble": False})
-    with pytest.raises(RuntimeError, match="cannot live inside a SerialEnv or ParallelEnv"):
-        SerialEnv(2, make).reset()
 
 
 @pytest.mark.parametrize("no_grad", [True, False])
@@ -167,42 +147,6 @@ def test_diagnostics(float64, update_at_reset):
     if not update_at_reset:  # an initial belief has no innovation, and is its own forecast
         assert all((rollout[key][:, 0] == 0).all() for key in keys[:2])
         assert rollout["forecast", "ensemble"][:, 0].equal(rollout["belief", "ensemble"][:, 0])
-
-
-class Doubled(envs.Changed):
-    """Twice the observation; it declares what it writes, unless it is told not to."""
-
-    def __init__(self, declares=True):
-        super().__init__(lambda td: td.set("doubled", 2 * td["observation"]))
-        self.declares = declares
-
-    def transform_observation_spec(self, observation_spec):
-        if self.declares:
-            observation_spec["doubled"] = observation_spec["observation"].clone()
-        return observation_spec
-
-
-def test_a_function_that_writes_an_entry_does_not_declare_it():
-    """torchrl takes a function in the place of a transform, and no one knows what it writes: the message says so."""
-    one = torch.eye(2)
-
-    def kalman(scale, key):
-        options = {"mean": torch.zeros(2), "cov": one, "observation_key": key}
-        return DEnKFTransform(
-            KalmanFilter(0.9 * one, scale * one, process_noise_cov=one, noise_cov=scale**2 * one, **options)
-        )
-
-    for undeclared in (lambda td: td.set("doubled", 2 * td["observation"]), Doubled(declares=False)):
-        env = TransformedEnv(envs.base_env(), Compose(undeclared, kalman(2, "doubled")))
-        with pytest.raises(KeyError, match=r"declare it, in its transform_observation_spec; a function .* nothing"):
-            env.rollout(2)
-
-    rollouts = []  # twice the reading, with twice its deviation, says what the reading says
-    for transforms in ((kalman(1, "observation"),), (Doubled(), kalman(2, "doubled"))):
-        env = TransformedEnv(envs.base_env(), Compose(*transforms))
-        env.set_seed(0)
-        rollouts.append(env.rollout(5)["next"])
-    assert_equal(*rollouts, [("belief", "mean"), ("belief", "cov")], atol=1e-6)
 
 
 # ----------------------------------------------------------------------------------- transforms that come behind it

@@ -11,7 +11,6 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 import pytest
 import torch
-from torchrl.data import SliceSampler
 
 from tests.data.lerobot.lerobot_folder import (
     SIZE,
@@ -195,55 +194,6 @@ def test_tables_that_are_damaged_or_contradict_the_metadata(tmp_path):
     file.write_bytes(whole)
     (tmp_path / "meta/episodes.jsonl").write_text('{"episode_index": 0, "length": 7}')
     fails(ValueError, r"000000.parquet has 6 rows of episode 0, but the metadata says 7", tmp_path)
-
-
-def test_slices_and_caches(tmp_path):
-    write_version_2(tmp_path, [4, 9], images="bytes")
-    for options in ({"slice_len": 5}, {"num_slices": 2}, {"sampler": SliceSampler(slice_len=5)}):
-        fails(
-            ValueError, r"slices have 5 rows, .* shorter: \{'episode_000000': 4\}", tmp_path, batch_size=10, **options
-        )
-    assert len(open_all(tmp_path, batch_size=10, slice_len=5, strict_length=False).sample()) > 0
-    (tmp_path / "file").write_text("")
-    fails(
-        OSError,
-        r"cannot write the cache at .*file.* pass cache=FOLDER or cache=None",
-        tmp_path,
-        cache=tmp_path / "file/x",
-    )
-
-
-def test_damage_in_av1(tmp_path):
-    """A damaged packet is skipped; at least the keyframes behind it are there (two frames a group)."""
-    write_version_2(tmp_path, [12], codec="av1", suffix="mp4")
-    import av
-
-    video = tmp_path / f"videos/chunk-000/{CAMERA}/episode_000000.mp4"
-    with av.open(str(video)) as container:
-        packets = [(p.pos, p.size) for p in container.demux(video=0) if p.size]
-    before, data = open_all(tmp_path)[:]["pixels"], bytearray(video.read_bytes())
-    place, size = packets[4]
-    data[place : place + size] = b"\xff" * size
-    video.write_bytes(data)
-    with pytest.warns(UserWarning, match=r"episode_000000.mp4: of episode 0 these frames .*: 4"):
-        rows = open_all(tmp_path)[:]
-    seen = rows["observed"].flatten()
-    assert not seen[4]
-    assert seen.sum() >= 9
-    after = seen.clone()
-    after[5] = False  # predicted from frame 4
-    assert rows["pixels"][after].equal(before[after])
-
-
-def test_cv2_reads_in_colour(tmp_path):
-    """Grey and transparent images come as three channels."""
-    write_version_2(tmp_path, [2], images="folder")
-    folder = tmp_path / "images/observation.images.top/episode_000000"
-    cv2.imwrite(str(folder / "frame_000000.png"), np.full(SIZE, 77, np.uint8))
-    cv2.imwrite(str(folder / "frame_000001.png"), np.full((*SIZE, 4), (1, 2, 3, 255), np.uint8))
-    pixels = open_all(tmp_path)[:]["pixels"] * 255
-    assert (pixels[0].round() == 77).all()
-    assert (pixels[1].mean((1, 2)).round() == torch.tensor([3.0, 2, 1])).all()
 
 
 @pytest.mark.parametrize("key", ["data_path", "video_path"])

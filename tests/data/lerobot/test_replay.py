@@ -107,19 +107,6 @@ def test_frames_follow_the_clock_and_not_the_count(tmp_path):
     check_rows(open_all(tmp_path), [6])
 
 
-def test_options(root):
-    small = open_all(root, size=(24, 32), camera="top")
-    for episode in small.episodes:
-        mine = small[:][episode.start : episode.start + episode.length]
-        expected = expected_pixels(episode.number, episode.length, (24, 32))
-        torch.testing.assert_close(mine["pixels"], expected, rtol=0, atol=0)
-    assert "action" not in open_all(root, action_key=None)[:]
-    other = open_all(root, state_key="action", action_key="timestamp", camera="observation.images.top")
-    assert other[:]["state"].equal(small[:]["action"])
-    assert other[:]["action"].flatten().tolist() == other[:]["time"].float().flatten().tolist()
-    assert other.names is None
-
-
 # Splits, samples, statistics ------------------------------------------------------------------------------------------
 
 
@@ -143,13 +130,6 @@ def test_splits_are_by_episode_and_stay(tmp_path):
     (tmp_path / "meta/episodes.jsonl").write_text(next(lines[k] for k in range(5) if k not in sets["test"]))
     with pytest.raises(ValueError, match=r"none of the 1 episodes in .* is in the split 'test', .*pass split='all'"):
         open_all(tmp_path, split="test")
-
-
-@pytest.mark.parametrize("options", shared.ways_to_slice())
-def test_slices_are_contiguous_and_in_one_episode(root, options):
-    shared.check_slices(
-        open_all(root, **{"batch_size": 24, **options}), options, "step", ("pixels", "state", "action", "time")
-    )
 
 
 def test_statistics_by_numpy(root):
@@ -200,14 +180,6 @@ def test_changed_files_are_read_anew(tmp_path):
     assert after[[0, 1, 2, 3, 4, 5, 7]].equal(before[[0, 1, 2, 3, 4, 5, 7]])
 
 
-def test_a_bar_counts_frames(root, tmp_path, monkeypatch):
-    bars = shared.counting_bars(monkeypatch)
-    open_all(root, cache=tmp_path)
-    open_all(root, cache=tmp_path)  # from the cache: no bar
-    open_all(root, progress=False)
-    assert [(bar.n, bar.total, bar.closed) for bar in bars] == [(sum(LENGTHS), sum(LENGTHS), True)]
-
-
 # What is optional -----------------------------------------------------------------------------------------------------
 
 
@@ -244,14 +216,6 @@ def test_some_numbers_of_the_state(root, dims):
     assert data.statistics["state", "std"].equal(whole.statistics["state", "std"][[2, 0]])
     assert whole.names == tuple(NAMES)
     shared.check_contract(data)
-
-
-@pytest.mark.parametrize("dims", [[3], [-1], ["hand"], []])
-def test_numbers_that_the_state_has_not(root, dims):
-    with pytest.raises(ValueError, match=r"^dims=.* others than the 3 numbers there are, shoulder, elbow, wrist$"):
-        open_all(root, dims=dims)
-    with pytest.raises(ValueError, match=r"^action_dims=\[2\] .* the 2 numbers there are$"):
-        open_all(root, action_dims=[2])
 
 
 def test_names_and_actions_are_optional(tmp_path):

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.data.recordings.own_files import SIZE, write_csv, write_images
+from tests.data.recordings.own_files import SIZE, write_csv
 from tests.real_data import SHARED
 from torch_denkf import KalmanFilter
-from torch_denkf.data import Images, Recording, RecordingReplay, Table
+from torch_denkf.data import Recording, RecordingReplay, Table
 
 CAR = SHARED / "logs" / "car.csv"
 WHEELS = sorted((SHARED / "logs").glob("wheels_gyro_*.txt"))
@@ -233,18 +233,6 @@ def test_times_that_no_log_has(tmp_path, time, seen):
     file = write_csv(tmp_path / "run.csv", time=time, x=np.arange(len(time)))
     with pytest.warns(UserWarning, match=rf"run.csv: 'time' {seen}.*pass unit='ms', 'us' or 'ns'"):
         Table(file).read()
-
-
-def test_times_of_pictures(tmp_path):
-    write_images(tmp_path / "images", [f"{k * 33_000_000}.png" for k in range(8)])
-    with pytest.warns(
-        UserWarning, match="images: 'time' has steps of usually 3.3e\\+07 s.*pass unit='ms', 'us' or 'ns'"
-    ):
-        replay(camera=Images(tmp_path / "images"))
-    assert len(replay(camera=Images(tmp_path / "images", unit="ns"))) == 8
-    masked = np.ma.masked_equal(np.arange(8.0), 3.0)
-    with pytest.raises(ValueError, match=r"times of .*images has masked elements"):
-        replay(camera=Images(tmp_path / "images", times=masked))
 
 
 def test_times_that_logs_have(tmp_path):

@@ -7,20 +7,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as parquet
 import pytest
-import torch
-from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import check_env_specs
 
-import torch_denkf.data.recordings.frames as frames_module
 from tests.data import replay_for_tests as shared
 from tests.data.recordings.own_files import SIZE, pixels, write_csv, write_images, write_video
 from torch_denkf.data import Images, Recording, RecordingReplay, Table, Video
-from torch_denkf.data.cache_entry import CachedTensor
 from torch_denkf.data.episodes import hashed_share
-from torch_denkf.envs import ReplayEnv
-from torch_denkf.filters import DEnKF
-from torch_denkf.objectives import DEnKFLoss
-from torch_denkf.transforms import DEnKFTransform
 
 open_runs = partial(RecordingReplay, size=SIZE, cache=None, progress=False)
 
@@ -223,38 +214,4 @@ def test_recordings_are_episodes(runs, tmp_path):
     )
 
 
-def test_pictures_are_decoded_once(runs, run, tmp_path, monkeypatch):
-    cached = partial(RecordingReplay, size=SIZE, cache=tmp_path, progress=False)
-    first = cached(runs)
-    video = cached(Recording(**streams(run)))
-    assert len(list(tmp_path.iterdir())) == 5
-    with monkeypatch.context() as patch:
-        patch.setattr(frames_module, "decode_picture", None)
-        patch.setattr(frames_module, "decoded_frames", None)
-        again = cached(runs, split="all")
-        other = cached(Recording(**streams(run)), clock=25.0)  # another clock, the same pictures
-    assert (again[:] == first[:]).all()
-    assert isinstance(again._pictures.stores[0], CachedTensor)
-    assert other[0]["pixels"].equal(torch.from_numpy(pixels(1)))
-    assert "pixels" not in video._storage[:]
-    cached(runs, size=(12, 16))
-    assert len(list(tmp_path.iterdir())) == 9
-
-
 # Filters --------------------------------------------------------------------------------------------------------------
-
-
-def test_an_environment_a_filter_and_a_loss(runs):
-    data = open_runs(runs, num_slices=3, slice_len=5)
-    denkf = DEnKF.paper(state_dim=2, observation_dim=2, image_shape=(3, *SIZE), ensemble_size=4)
-    env = TransformedEnv(ReplayEnv(data, batch_size=[2]), DEnKFTransform(denkf))
-    check_env_specs(env)
-    env.set_seed(0)
-    rollout = env.rollout(20)
-    assert rollout.batch_size == (2, 8)
-    assert rollout["next", "belief", "mean"].isfinite().all()
-    assert rollout["next", "state"][1, :, 0].tolist() == pytest.approx([1 + k / 100 for k in range(1, 9)])
-    losses = DEnKFLoss(denkf, transition=0.0, sensor=0.0)(data.sample())
-    losses["loss_state"].backward()
-    assert all(p.grad.isfinite().all() for p in denkf.parameters() if p.grad is not None)
-    assert any(p.grad is not None and p.grad.any() for p in denkf.parameters())

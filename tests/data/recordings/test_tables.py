@@ -74,15 +74,3 @@ def test_many_columns_take_no_longer_than_their_number(tmp_path):
 def test_other_encodings_are_refused_with_the_file(tmp_path, encoding):
     with pytest.raises(ValueError, match=r"run.csv is no text in UTF-8 .*store it anew"):
         read(tmp_path, GOOD.replace("y", "größe"), encoding=encoding)
-
-
-def test_parquet_without_numbers(tmp_path):
-    pyarrow = pytest.importorskip("pyarrow")
-    parquet = pytest.importorskip("pyarrow.parquet")
-    for column, match in (
-        (pyarrow.array([0, 1], pyarrow.timestamp("us")), r"'time' holds timestamp\[us\]; store it as a number"),
-        (pyarrow.array([0.0, 1e39]), "row 1 .*'time' is 1e"),
-    ):
-        parquet.write_table(pyarrow.table({"time": column, "x": [1, 2]}), tmp_path / "run.parquet")
-        with pytest.raises(ValueError, match=match):
-            Table(tmp_path / "run.parquet").read()
