@@ -6,6 +6,8 @@ from tensordict import TensorDict
 from benchmarks.lorenz96.frontier import COLUMNS, candidates, row_of
 from benchmarks.lorenz96.schemes import simulate
 
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("DEnKF, etkf", "EKF", "UKF")]
+
 
 @pytest.fixture(scope="module")
 def records():
@@ -14,7 +16,7 @@ def records():
     return dict(zip(("validation", "test"), data.split(2), strict=True))
 
 
-@pytest.mark.parametrize("name", ["DEnKF, stochastic", "DEnKF, etkf", "DEnKF, sakov", "EKF", "UKF"])
+@pytest.mark.parametrize("name", ["DEnKF, stochastic", "DEnKF, sakov", *SLOW])
 def test_filters_follow_lorenz96_better_than_its_readings(name, records):
     found = candidates((24,))
     size = 1 if name in ("EKF", "UKF") else 24

@@ -65,7 +65,7 @@ def test_intervals_hold_what_they_claim_of_errors_that_are_drawn():
     assert_close(Claim(mean, var / 4, truth).held(), torch.full((2,), 0.589), rtol=0, atol=0.03)
 
 
-@pytest.mark.parametrize("kind", [pytest.param("EKF", marks=pytest.mark.slow), "DEnKF"])
+@pytest.mark.parametrize("kind", ["EKF", pytest.param("DEnKF", marks=pytest.mark.slow)])
 def test_relative_motions_are_as_far_off_as_a_filter_claims(kind):
     """Drives that are what the filter takes them for, with errors that last: over 1, 10 and 100 rows."""
     data, poses = driven()
@@ -99,6 +99,7 @@ def test_corners_are_lost_or_wrong_as_a_condition_says():
     assert rows["corners"].eq(0).all()
 
 
+@pytest.mark.slow
 def test_a_smoothed_step_is_nearer_than_a_reading_and_than_a_filtered_step():
     data, poses = driven(120, slips=False)
     out = run(RTSSmoother(car_filter("EKF")), prepared(and_one_more(data)))

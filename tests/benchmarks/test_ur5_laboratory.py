@@ -28,6 +28,7 @@ def seen():
     drawn.close()
 
 
+@pytest.mark.slow
 def test_the_camera_is_found(seen):
     frames, joints, _ = seen
     found, share = find_camera(frames, joints, ((20, 4.0, 5), (30, 1.5, 5)))

@@ -72,7 +72,7 @@ def test_recorded_is_eager_forward_and_backward(float64, reruns, chunk):
         assert_same(graph.step(row.copy())["belief"].values(), eager.step(row.copy())["belief"].values())
 
 
-@pytest.mark.parametrize("resets", [False, True])
+@pytest.mark.parametrize("resets", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_one_compiled_step_is_recorded_as_often_as_the_sequence_is_long(float64, reruns, resets):
     torch._dynamo.reset()
     torch._dynamo.utils.counters.clear()

@@ -110,6 +110,7 @@ def test_what_changes_after_compiling_is_noticed(monkeypatch):
     assert means[-1].dtype == torch.double
 
 
+@pytest.mark.slow
 def test_a_new_filter_of_other_modules_or_options_compiles_its_own(float64):
     frames = toy_frames((2, 3), masks=0, resets=False)
     filter = toy_denkf().double().eval()

@@ -142,7 +142,7 @@ def test_random_stretches_are_uniform_and_follow_the_seed():
     ("data", "kind"),
     [
         *((name, SerialEnv) for name in SETS),
-        ("own", ParallelEnv),
+        pytest.param("own", ParallelEnv, marks=pytest.mark.slow),
         pytest.param("kitti", ParallelEnv, marks=pytest.mark.slow),
     ],  # processes take 10 s to start
     indirect=["data"],

@@ -80,6 +80,7 @@ def with_carry(frames, beliefs):
     return frames.copy().set(BELIEF[0], beliefs[BELIEF[0]])
 
 
+@pytest.mark.slow
 @all_at_once
 def test_compiled_is_eager(float64, features):
     filter, frames, carry = prepared(features)

@@ -9,7 +9,9 @@ from tests.waits import NothingWaits
 from torch_denkf.functional.kernels import small_system
 from torch_denkf.functional.linalg import inverse_square_root
 
-deviced = pytest.mark.parametrize("device", ["meta", None], ids=["device", "no device"])
+deviced = pytest.mark.parametrize(
+    "device", ["meta", pytest.param(None, marks=pytest.mark.slow)], ids=["device", "no device"]
+)
 
 
 @pytest.fixture(autouse=True)

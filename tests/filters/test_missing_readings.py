@@ -134,7 +134,7 @@ def test_a_start_without_the_reading_is_the_prior(float64, case):
         filter.initialise(given, without=["y2"])
 
 
-@pytest.mark.parametrize("kind", ["ensemble", "kalman", "particles"])
+@pytest.mark.parametrize("kind", ["ensemble", "kalman", pytest.param("particles", marks=pytest.mark.slow)])
 def test_an_unstable_system_that_nobody_observes_stays_finite_and_comes_back(kind):
     """Unheld it overflows at step 872 in float32: the standard deviation grows by a tenth a step."""
     F, one = 1.1 * torch.eye(1), torch.eye(1)

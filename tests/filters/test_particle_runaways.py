@@ -102,6 +102,7 @@ def test_particles_that_run_away_leave_the_others_as_they_are(resampling, dtype)
     assert abs(error - np.sqrt(((mean - states[EVERY - 1 :]) ** 2).mean())) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The variance")
 @pytest.mark.parametrize("ceiling", [1e12, pytest.param(None, marks=pytest.mark.slow)])
 def test_a_loop_a_sequence_and_a_compiled_sequence_are_the_same(ceiling):

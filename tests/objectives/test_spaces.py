@@ -176,7 +176,7 @@ def test_one_member_is_scored_by_its_distance():
     torch.testing.assert_close(value("members, energy", data, space=space)[0], distance)
 
 
-@pytest.mark.parametrize("space", [SO3(), SE3()], ids=repr)
+@pytest.mark.parametrize("space", [SO3(), pytest.param(SE3(), marks=pytest.mark.slow)], ids=repr)
 def test_members_that_are_drawn_like_the_truth_score_best(space):
     """The score's gradient is zero there: by the members' mean, and by the spread along each axis."""
     count, size = 20_000, space.tangent_dim

@@ -201,6 +201,7 @@ def test_they_learn_through_the_filter(model, log):
     assert gradients[next(name for name in gradients if name.startswith("mean"))] is not None
 
 
+@pytest.mark.slow
 def test_the_shipped_filter_knows_feet_that_slide():
     """Against contacts that a threshold tells alone, with the noises of its validation, where friction is .2."""
     base = quadruped_env(friction=0.2, seed=7)

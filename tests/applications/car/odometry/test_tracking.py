@@ -141,6 +141,7 @@ def messages(drive, factor=1.0, **options):
     return [str(warning.message) for warning in caught if warning.category is UserWarning]
 
 
+@pytest.mark.slow
 def test_a_camera_that_does_not_fit_is_noticed(moving):
     assert messages(moving) == []
     (message,) = messages(moving, 1.5)
