@@ -6,10 +6,9 @@ from tensordict import TensorDict
 
 pytest.importorskip("dm_control", reason="dm_control is not installed: pip install dm-control 'mujoco<4'")
 
-from benchmarks.arms.arms import ARMS, NOISE, SIDE, Encoders, make_one, wrap
+from benchmarks.arms.arms import ARMS, NOISE, Encoders, make_one, wrap
 from benchmarks.arms.filters import DRIFT, LENGTH, ArmTransition
-from benchmarks.arms.sensor import CELLS, FromPlaces, JointPlaces, JointSensor
-from benchmarks.arms.study import scores
+from benchmarks.arms.sensor import FromPlaces, JointPlaces
 
 
 def physics_at(name, seed):
@@ -94,39 +93,3 @@ def test_the_first_belief_shares_a_reading_between_places_and_biases():
     # What is read is place plus bias; the first place is on a circle, though, and so is compared across the link.
     spread = (JointPlaces(arm).compute(ensemble) - reading)[:, :2] @ torch.tensor([-angles[0].sin(), angles[0].cos()])
     assert spread.std().item() == pytest.approx(0.004, rel=0.03)  # the biases are taken away again
-
-
-def test_the_sensor_reads_where_its_maps_are_bright():
-    arm = ARMS["manipulator"]
-    sensor, angles = JointSensor(arm), torch.tensor([[0.9, -0.4, 0.5, 0.2], [-0.6, -0.8, 0.9, 0.9]])
-    places = arm.places(angles)
-    column, row = ((1 + sign * places[..., part] / arm.view) * CELLS / 2 - 0.5 for part, sign in ((0, 1), (1, -1)))
-    cells = torch.arange(float(CELLS))
-    bumps = -0.5 * ((cells - column[..., None, None]) ** 2 + (cells[:, None] - row[..., None, None]) ** 2)
-
-    class Bumps(torch.nn.Module):
-        def forward(self, pixels):
-            return bumps
-
-    sensor.module = Bumps()
-    pixels = torch.zeros(2, 1, SIDE, SIDE)
-    torch.testing.assert_close(sensor.compute(pixels), places.flatten(-2), atol=1e-4, rtol=0)
-    losses = sensor.losses(pixels, arm.join(angles, angles))
-    assert losses["loss_places"] < 1e-6
-    # The entropy of a Gaussian with a standard deviation of one cell in the plane: 1 + log(2 pi).
-    assert losses["loss_maps"].item() == pytest.approx(2.8379, abs=1e-3)
-
-
-def test_scores_of_an_estimate_that_is_off_by_a_constant():
-    arm = ARMS["reacher"]
-    angles, goal = torch.zeros(3, 8, 2), torch.zeros(3, 8, 2)
-    state, off = arm.join(angles, angles), arm.join(angles + torch.tensor([0.1, 0.0]), angles + 2)
-    episodes = TensorDict(
-        {"next": {"state": state, "held": off, "reward": torch.ones(3, 8, 1)}, "goal": goal, "action": angles + 0.5},
-        [3, 8],
-    )
-    (row, *_), length = scores(arm, episodes, "held"), 24 * 2 * torch.sin(torch.tensor(0.05)).item()
-    assert row["angle"] == pytest.approx(0.1 * 57.29578 / 2**0.5, rel=1e-4)
-    assert (row["velocity"], row["return"], row["effort"]) == pytest.approx((2.0, 8.0, 0.25))
-    assert row["tip"] == pytest.approx(0.0, abs=1e-5)  # cm: the arm is where it should be, and believes otherwise
-    assert (row["error"], row["offset"]) == pytest.approx((length, length), rel=1e-4)

@@ -1,11 +1,10 @@
 """What the studies share: options, jobs that are done once, rows that survive their file."""
 
 from functools import partial
-from pathlib import Path
 
 import pytest
 
-from benchmarks.common.jobs import once, read_rows, same_settings
+from benchmarks.common.jobs import once, read_rows
 from benchmarks.common.tables import Columns, head, line, pick
 
 
@@ -28,16 +27,6 @@ def test_a_job_is_done_once_and_leaves_nothing_half(tmp_path):
     file.write_text(file.read_text()[:-4])
     with pytest.raises(ValueError, match=r"a\.json is damaged .* remove it"):
         read_rows([file])
-
-
-def test_a_folder_has_the_settings_it_was_begun_with(tmp_path):
-    """The same again, tuples and paths among them, is no change; what changed is named, and what is there stays."""
-    same_settings(tmp_path, {"seed": 0, "size": (1, 2), "root": Path("a")})
-    same_settings(tmp_path, {"seed": 0, "size": (1, 2), "root": Path("a")})
-    with pytest.raises(SystemExit, match=r"begun with seed=0 \(now 1\)\. Give another --out"):
-        same_settings(tmp_path, {"seed": 1, "size": (1, 2), "root": Path("a")})
-    with pytest.raises(SystemExit, match=r"root='a' \(now None\)"):
-        same_settings(tmp_path, {"seed": 0, "size": (1, 2)})
 
 
 def test_rows_survive_their_file_sorted_and_with_five_digits(tmp_path):

@@ -108,22 +108,3 @@ def test_advantages_and_targets_are_those_of_a_constant_critic():
         torch.testing.assert_close(found.sort().values, expected, atol=1e-4, rtol=1e-4)
         torch.testing.assert_close(target, found + value, atol=1e-4, rtol=1e-4)
     assert reward.equal(data["next", "reward"])  # the collected ones stay as they were
-
-
-def test_the_actors_loss_filters_slices_from_what_was_stored_and_trains_the_filter():
-    """Without process noise all is determined: the policy is the one that collected, and the ratio is one."""
-    torch.manual_seed(0)
-    task, arm = TASKS["pendulum"], ARMS["belief mean, end to end"]
-    filter = task.unlearned(8)
-    with torch.no_grad():
-        filter["transition"].module["noise"].log_variance.fill_(-60.0)
-    env = make_env(task, arm, 3, (0.2, 0.3), 0, filter)
-    ppo = PPO(arm, Inputs(0, 1, torch.tensor(task.scale), task.limit), task.settings, 1, filter=filter)
-    data = rollout(env, ppo.policy, 80, ExplorationType.RANDOM)
-    said = []
-    ppo.loss.register_forward_hook(lambda *args: said.append(args[-1]["kl_approx"].item()))
-    before = {name: parameter.detach().clone() for name, parameter in filter.named_parameters()}
-    ppo.update(data)
-    assert abs(said[0]) < 1e-4
-    still = {name for name, parameter in filter.named_parameters() if parameter.equal(before[name])}
-    assert still == {"module.transition.module.noise.log_variance"}  # that of e^-60 has no gradient

@@ -1,7 +1,6 @@
 """The parts of the KITTI study that a wrong table could come from."""
 
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,7 +12,7 @@ from benchmarks.kitti.recipes import FILTERS
 from benchmarks.kitti.sensors import SENSORS, SensorOfFold
 from benchmarks.kitti.streams import DISTURBANCES, LONGEST, Stream
 from benchmarks.kitti.tables import by_drive
-from benchmarks.kitti.training import calibration_error, log_gains, run_filter
+from benchmarks.kitti.training import log_gains, run_filter
 from tests.applications.car.odometry.test_streams import readings
 from torch_denkf.applications.car import dead_reckoning
 from torch_denkf.applications.car.modules.pairs import PairObservation
@@ -91,16 +90,6 @@ def test_every_filter_predicts_what_a_sensor_with_a_gain_reads():
         read = h.module(torch.tensor([10.0, 0.5]))
         torch.testing.assert_close(read, torch.tensor([9.0, 0.5]))
         assert "logarithm" not in " ".join(model.state_dict())
-
-
-def test_the_calibration_counts_the_path_and_the_crps_of_the_velocities(monkeypatch):
-    run = TensorDict({"state": torch.zeros(1, 9, 5), "belief": {"mean": torch.zeros(1, 9, 5)}}, [1, 9])
-    run["belief", "mean"][..., :2] = torch.tensor([3.0, -4.0])  # 5 m off
-    run["belief", "var"] = torch.full((1, 9, 5), 4.0)
-    monkeypatch.setattr("benchmarks.kitti.training.run_all", lambda *_: [run, run])
-    recipe = SimpleNamespace(unit=torch.tensor([1.0, 2.0]))
-    crps = 2.0 * (math.sqrt(2) - 1) / math.sqrt(math.pi)  # of a Gaussian whose mean is right
-    assert calibration_error(recipe, None, []) == pytest.approx(5.0 * (crps + crps / 2) / 2, rel=1e-6)
 
 
 def row(drive, seed, value, **entries):

@@ -32,16 +32,6 @@ def test_the_fitted_model_is_the_library_filter_and_smoother(float64, target):
         assert_close(real.mean_square(mean, series.truth), square, rtol=1e-7, atol=1e-9)
 
 
-def test_fitting_makes_the_smoother_better(float64):
-    series = [series_for_tests(count=8)]
-
-    def error(parameters):
-        mean = gaussian.believe(gaussian.model_of(parameters, series), series[0], 2)[1]
-        return float((mean - series[0].truth)[:, 3:-2].square().mean(1).log().mean())
-
-    assert error(gaussian.fit(series, 2, 12)) < error(gaussian.fit(series, 2, 0)) - 0.1
-
-
 def test_weights_find_what_only_later_readings_say(float64):
     reading = torch.randn(4, 60, 2)
     truth = torch.zeros_like(reading)

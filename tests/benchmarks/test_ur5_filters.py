@@ -7,7 +7,6 @@ import torch
 
 from benchmarks.ur5.glimpse import project
 from benchmarks.ur5.motion import ArmMotion, open_loop, with_rates
-from benchmarks.ur5.recipes.denkf import localisation
 from benchmarks.ur5.sensors import TurnedWrist, side_of, wrist_of
 from tests.benchmarks.ur5_for_tests import FACTS, states
 from torch_denkf.applications.ur5.simulation.domains import Domain
@@ -82,17 +81,3 @@ def test_places_project_as_a_pinhole_has_it():
     # Another camera, from above: its target is in the middle, too.
     above = Domain(camera=(-0.1, 0.02, 2.0), target=(-0.2, 0.0, 0.1), field=40.0)
     assert project(torch.tensor([-0.2, 0.0, 0.1]), above).abs().max() < 1e-6
-
-
-def test_localisation_keeps_covariances_and_the_gripper_apart():
-    state, reading = localisation(34)
-    assert torch.linalg.eigvalsh(reading).min() > -1e-6  # its product with a covariance is one (Schur)
-    assert torch.equal(state[24:], reading)  # biases
-    assert torch.equal(state[:7], state[10:17])  # rates go with their joints
-    assert torch.equal(state[:7], state[17:24])  # and so do accelerations
-    gripper = [6, 16, 23, 30]
-    arm = [index for index in range(34) if index not in gripper]
-    assert (state[arm, 6] == 0).all()
-    assert (state[gripper][:, [0, 1, 2, 3, 4, 5, 7, 8, 9]] == 0).all()
-    assert (state[gripper, 6] == 1).all()
-    assert torch.equal(localisation(24)[0], state[:24])

@@ -5,17 +5,14 @@ import re
 import pytest
 import torch
 from tensordict import TensorDict
-from torch._subclasses.fake_tensor import FakeTensorMode
 from torchrl.envs import ExcludeTransform, TransformedEnv
 
 from tests.filters.factories import M, S, linear_denkf, linear_kalman, linear_system, toy_denkf
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf import RejectReadings
-from torch_denkf._checks import has_values
 from torch_denkf.baselines import LSTMFilter
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter, ParticleFilter
-from torch_denkf.functional import soft_resample, systematic_resample
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
@@ -268,23 +265,6 @@ def test_a_reading_that_no_particle_can_explain():
     assert out["info", "log_likelihood"].item() == -torch.inf
 
 
-@pytest.mark.parametrize("resample", [systematic_resample, soft_resample])
-def test_weights_that_are_not_a_number_stay_so(resample):
-    """And no index is out of bounds; the other rows are as they were."""
-    generator = torch.Generator().manual_seed(0)
-    points, weights = (
-        torch.randn(2, 16, 2, generator=generator),
-        torch.randn(2, 16, generator=generator).log_softmax(-1),
-    )
-    uniform = torch.rand(2, 1, generator=generator)
-    expected = resample(points, weights, uniform)
-    weights[0, 3] = torch.nan
-    moved, after = resample(points, weights, uniform)
-    assert after[0].isnan().all()
-    assert moved[1].equal(expected[0][1])
-    assert after[1].equal(expected[1][1])
-
-
 def test_only_what_nobody_can_look_at_is_passed_over():
     """Under vmap and of tensors without values nothing is said."""
     filter, check = linear_denkf(), RejectReadings({"observation": "observed"}, on_bad="raise")
@@ -301,14 +281,3 @@ def test_only_what_nobody_can_look_at_is_passed_over():
     for run in (means, torch.func.jacrev(means)):
         with pytest.raises(ValueError, match="observation"):
             run(readings[1])
-
-
-def test_whether_values_can_be_looked_at():
-    seen = []
-    torch.vmap(lambda row: seen.append(has_values(row)) or row)(torch.zeros(2))
-    torch.func.grad(lambda row: seen.append(has_values(row)) or row.sum())(torch.zeros(2))
-    torch.vmap(torch.func.grad(lambda row: seen.append(has_values(row)) or row.sum()))(torch.zeros(2, 2))
-    with FakeTensorMode():
-        seen.append(has_values(torch.zeros(2)))
-    seen += [has_values(torch.zeros(2, device="meta")), has_values(torch.zeros(2))]
-    assert seen == [False, True, False, False, False, True]

@@ -85,17 +85,6 @@ print(sorted(step.carry))
     assert done.stdout.strip() == "['belief.ensemble']"
 
 
-def test_what_does_not_fit_is_named(package):
-    step = load_step(package[2])
-    good = {name: package[1][tuple(name.split("."))] for name in step.inputs}
-    with pytest.raises(KeyError, match=r"needs 'reading' \[2\]"):
-        step({name: value for name, value in good.items() if name != "reading"})
-    with pytest.raises(ValueError, match=r"'reading' must be torch.float32 \[2\], got torch.float32 \[3\]"):
-        step({**good, "reading": torch.zeros(3)})
-    with pytest.raises(ValueError, match=r"'reading' must be torch\.float32"):
-        step({**good, "reading": torch.zeros(2, dtype=torch.float64)})
-
-
 def test_noise_drawn_inside_follows_the_seed_and_differs_from_step_to_step(tmp_path):
     filter = small_filter()
     example = TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)})

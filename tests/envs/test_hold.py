@@ -1,11 +1,8 @@
 """Oracle: held readings written down by hand, and a loop over what was emitted."""
 
-import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.envs import InitTracker, TransformedEnv
-from torchrl.modules import LSTMModule
+from torchrl.envs import TransformedEnv
 
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.envs import HoldReading
@@ -78,17 +75,3 @@ def test_environments_that_reset_by_themselves():
         [3],
     )
     assert HoldReading()._reset_on_native_autoreset(both, both)["held"].tolist() == [[7.0], [2.0], [0.0]]
-
-
-@pytest.mark.parametrize(("key", "spoiled"), [("observation", True), ("held", False)])
-def test_an_lstm_needs_it(key, spoiled):
-    """A missing reading makes all that an LSTM writes NaN until the episode ends, without an error."""
-    width = base_env().observation_spec["observation"].shape[-1]
-    memory = LSTMModule(input_size=width, hidden_size=4, in_key=key, out_key="features")
-    env = held_env(seed=0).append_transform(InitTracker()).append_transform(memory.make_tensordict_primer())
-    actor = TensorDictModule(torch.nn.Linear(4, env.action_spec.shape[-1]), ["features"], ["action"])
-    data = env.rollout(20, TensorDictSequential(memory, actor))
-    after = (~data["observed"]).cumsum(0).squeeze(-1) > 0
-    assert after.any()
-    assert data["features"][after].isnan().all() == spoiled
-    assert data["features"].isnan().any() == spoiled

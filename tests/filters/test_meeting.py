@@ -73,24 +73,6 @@ def test_noise_that_depends_on_the_action_is_no_transition(float64, place):
     torch.testing.assert_close(stepwise(filter, frames)[MEAN], out[MEAN], rtol=0, atol=1e-12)
 
 
-class Reads(SubModel):
-    """A transition that reads what another module makes of the action."""
-
-    def __init__(self):
-        super().__init__(nn.Identity(), [("belief", "ensemble"), ("sensor", "noise")], [("forecast", "ensemble")])
-
-    def compute(self, ensemble, variance):
-        return ensemble + variance.unsqueeze(-2)
-
-
-def test_a_transition_behind_a_module_of_the_action_is_refused():
-    filter = driven(0)
-    with pytest.raises(
-        ValueError, match=r"'transition' forecasts the belief and reads .* which 'noise' makes of the act"
-    ):
-        Filter({**dict(filter.module.named_children()), "transition": Reads()}, initial=filter.initial)
-
-
 # ------------------------------------------------------------------------------------------------ marks, known beliefs
 
 
@@ -243,32 +225,4 @@ def test_a_belief_that_torchrl_would_not_reset_is_refused(each):
         TransformedEnv(Groups(each=each), LastAction({("agents", "action"): "last"})).rollout(2)
 
 
-def test_a_belief_under_the_name_of_the_group_is_reset_with_it():
-    filter = random_walk(prefix="agents", observation_key=("agents", "x"))
-    env = TransformedEnv(Groups(each=False), DEnKFTransform(filter))
-    rollout = env.rollout(7, break_when_any_done=False)
-    x, mean = rollout["agents", "x"].squeeze(-1), rollout["agents", "belief", "mean"].squeeze(-1)
-    assert x[0].tolist() == [0, 10, 20, 0, 10, 20, 0]
-    assert mean[0, :3].tolist() == mean[0, 3:6].tolist()
-    assert mean[0, [0, 3, 6]].tolist() == [0, 0, 0]
-    assert (mean[1].diff() > 0).all()
-
-
 # --------------------------------------------------------------------------------------------------------- messages
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"observed_key": 5}, "observed_key of KalmanFilter is a key"),
-        ({"observation_key": ()}, "observation_key of KalmanFilter is a key"),
-        ({"init_key": b"is_init"}, "init_key of KalmanFilter is a key"),
-        ({"control_keys": "action"}, "control_keys of KalmanFilter is a list of keys"),
-        ({"prefix": 3}, "prefix of KalmanFilter is a name"),
-        ({"update_at_reset": 1}, "update_at_reset of KalmanFilter is True or False"),
-        ({"observd_key": "seen"}, "KalmanFilter takes no argument 'observd_key'; it takes transition,"),
-    ],
-)
-def test_arguments_are_checked_under_the_name_of_the_class_that_was_called(arguments, message):
-    with pytest.raises(TypeError, match=message):
-        random_walk(**arguments)

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system, toy_denkf, toy_frames
+from tests.filters.factories import FixedEnsemble, linear_denkf, linear_system, toy_denkf, toy_frames
 
 MEAN, ENSEMBLE = ("belief", "mean"), ("belief", "ensemble")
 
@@ -74,30 +74,6 @@ def test_sizes_that_only_the_entries_tell_are_enough_to_draw_in_bulk(case):
     for out in outs[1:]:
         torch.testing.assert_close(out, outs[0], rtol=0, atol=1e-12)
     assert filter.compiled._functions
-
-
-class SizeAtTheStep(NoisyLinear):
-    """A transition that asks for a size of its own."""
-
-    def draw_noise(self, batch_size, *, members=None, here=False, **kwargs):
-        return super().draw_noise(batch_size, members=members, **kwargs) if here else None
-
-    def noise_sizes(self, *values):
-        return {**super().noise_sizes(*values), "here": True}
-
-
-def test_a_size_that_only_the_step_knows_is_found_by_a_trial():
-    F, Q, _, _ = linear_system()
-    filter, frames, outs = linear_denkf("perturbed", noisy=True), readings(3, 5), []
-    filter = filter.with_modules(transition=SizeAtTheStep(F, torch.linalg.cholesky(Q)))
-    for chunk in (0, 2):
-        filter.compile(chunk=chunk, backend="eager")
-        torch.manual_seed(1)
-        outs.append(filter.sequence(frames.copy()))
-        assert filter.step(outs[-1][:, -1].copy())[MEAN].isfinite().all()
-    torch.testing.assert_close(outs[1][MEAN], outs[0][MEAN], rtol=0, atol=1e-12)
-    assert filter.compiled._functions
-    assert set(filter.draw_noise(frames.copy())["noise"].keys()) == {"transition", "analysis"}
 
 
 def test_flipout_in_a_sensor_has_a_perturbation_of_its_own_at_each_time():

@@ -9,10 +9,8 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.modules.utils import get_env_transforms_from_module
 
 from tests.filters.composed import ReplayedFrames
-from tests.filters.factories import linear_denkf, linear_kalman, random_walk
+from tests.filters.factories import random_walk
 from tests.filters.test_contract import FILTERS, every_filter, readings
-from torch_denkf.objectives import DEnKFLoss, GaussianLoss
-from torch_denkf.smoothers import EnRTS, RTSSmoother
 from torch_denkf.transforms import DEnKFTransform
 
 MEAN, VAR = ("belief", "mean"), ("belief", "var")
@@ -114,17 +112,3 @@ def test_the_belief_of_one_is_the_reading_of_another(float64):
         inner = by_hand(reading[row].flatten().tolist())
         assert out["inner", "belief", "mean"][row].flatten().tolist() == pytest.approx(inner, abs=1e-12)
         assert out["belief", "mean"][row].flatten().tolist() == pytest.approx(by_hand(inner), abs=1e-12)
-
-
-@pytest.mark.parametrize("make", [lambda **k: RTSSmoother(linear_kalman(**k)), lambda **k: EnRTS(linear_denkf(**k))])
-def test_smoothers_and_losses_of_a_filter_with_a_prefix(float64, make):
-    torch.manual_seed(0)
-    frames = TensorDict({"observation": torch.randn(2, 7, 2), "state": torch.randn(2, 7, 2)}, [2, 7])
-    plain, other = make(), make(prefix="imu")
-    out, expected = other.sequence(frames.copy()), plain.sequence(frames.copy())
-    for name in ("mean", "var"):
-        assert torch.equal(out["imu", "smoothed", name], expected["smoothed", name])
-    loss = GaussianLoss if isinstance(plain, RTSSmoother) else DEnKFLoss
-    named_loss, plain_loss = (loss(smoother.filter, nll=1.0)(frames) for smoother in (other, plain))
-    assert dict(named_loss.items()) == dict(plain_loss.items())
-    assert named_loss["loss_nll"] != 0

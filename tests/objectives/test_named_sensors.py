@@ -6,10 +6,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
 
-from tests.filters.factories import NoisyLinear
-from torch_denkf.filters import EKF, DEnKF
 from torch_denkf.fusion import FusedFilter, FusedSensor
-from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, MomentPrior, Select
+from torch_denkf.modules import GaussianPrior, LearnedTransition, MomentPrior, Select
 from torch_denkf.monitoring import BlackIsMissing
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, ObservationLoss, SensorLoss
 from torch_denkf.submodel import Sensor
@@ -113,16 +111,3 @@ def test_the_observation_model_is_that_of_the_sensor():
     with pytest.raises(KeyError, match=r"several sensors: name one, set_keys\(sensor="):
         ObservationLoss(fused("ensemble", lidar=True))(drive)
     torch.testing.assert_close(loss(drive)["loss_observation"], torch.tensor(4.0))
-
-
-@pytest.mark.parametrize("score", ["SensorLoss", "whole"])
-@pytest.mark.parametrize("kind", [EKF, DEnKF])
-def test_a_filter_of_one_sensor_with_keys_of_its_own(kind, score):
-    """The mask is the one that its update reads, the samples are those that its sensor writes."""
-    drive, gaussian = data(), kind is EKF
-    sensor = TensorDictSequential(BlackIsMissing(), Camera(("eye", "ensemble")))
-    parts = {"transition": NoisyLinear(torch.eye(2)), "sensor": sensor, "observation": Select([0])}
-    noise = ConstantNoise([NOISE], in_key=("eye", "ensemble"))
-    filter = kind(**parts, noise=noise, initial=start(gaussian), observed_key="seen", process_noise=[0.1, 0.1])
-    loss = SensorLoss(filter) if score == "SensorLoss" else (GaussianLoss if gaussian else DEnKFLoss)(filter)
-    torch.testing.assert_close(loss(drive)["loss_sensor"], off(drive).abs().mean())

@@ -88,19 +88,6 @@ def test_a_loaded_scale_counts_other_dimensions():
 # ------------------------------------------------------------------------------------- filters without a sensor
 
 
-def test_a_missing_target_names_the_cures():
-    filter = toy_denkf()
-    frames, _ = problem(filter)
-    assert DEnKFLoss(filter).weights["sensor"] == 1.0
-    for loss in (DEnKFLoss(filter), SensorLoss(filter)):
-        with pytest.raises(KeyError, match=r"target_observation.*Add the entry.*sensor=0\.0"):
-            loss(frames.exclude("target_observation"))
-    loss = SensorLoss(filter, noise=1.0)
-    loss.set_keys(noise=("forecast", "noise"))
-    with pytest.raises(KeyError, match="R must follow from frames alone"):
-        loss(frames)
-
-
 # --------------------------------------------------------------------------------------------------- one member
 
 

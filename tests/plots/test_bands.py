@@ -81,20 +81,6 @@ def test_readings_are_dots_where_they_were_observed():
     assert labels == ["not observed", "90 % of the belief", "truth", "belief", "readings"]
 
 
-@pytest.mark.parametrize("width", [0, 1, 2])
-def test_what_was_not_observed_is_shaded(width):
-    run = ensemble_run()
-    seen = run["observed"][:, 0].clone()
-    run["observed"] = seen if width == 0 else seen.unsqueeze(-1).repeat(1, width)
-    if width == 2:
-        run["observed"][20, 0] = False  # one of two readings is there
-    for axes in plot_bands(run, dims=[0, 1], time=DT):
-        spans = [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in axes.patches]
-        np.testing.assert_allclose(spans, [(0.95, 1.45), (2.95, 3.05)])
-        assert "not observed" in axes.get_legend_handles_labels()[1]
-    assert not plot_bands(run, dims=[0], observed=torch.ones(40, 1, dtype=torch.bool))[0].patches
-
-
 def test_each_component_is_shaded_by_its_own_sensors_mask():
     run = ensemble_run()
     gps = torch.ones(40, 1, dtype=torch.bool)
@@ -141,11 +127,6 @@ def slow_sensor(lost: int) -> TensorDict:
     sequence["observed"] = (torch.arange(500) % 100 == 50).unsqueeze(-1)
     sequence["observed"][50 + 100 * lost] = False
     return sequence
-
-
-def test_a_slow_sensor_is_shaded_where_it_lost_a_reading_alone():
-    (axes,) = plot_bands(slow_sensor(lost=2), time=0.01)
-    assert spans(axes) == [pytest.approx((1.505, 3.495))]  # from behind the reading at 1.5 s to the one at 3.5 s
 
 
 @pytest.mark.parametrize(("gap", "count"), [(2.0, 0), (1.99, 1), (0.99, 3), (0.0, 5)])

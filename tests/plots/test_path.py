@@ -32,15 +32,6 @@ def test_lines_are_the_paths():
     assert labels == ["members", "truth", "dead reckoning", "belief"]
 
 
-def test_a_cars_path_drives_up():
-    run = ensemble_run()
-    drawn = lines(plot_path(run, forward_up=True))
-    np.testing.assert_allclose(drawn["truth"][:, 0], -run["state"][:, 1], rtol=1e-6)
-    np.testing.assert_allclose(drawn["truth"][:, 1], run["state"][:, 0], rtol=1e-6)
-    axes = plot_path(run, forward_up=True, unit="cm")
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("right, cm", "forward, cm")
-
-
 @pytest.mark.parametrize("forward_up", [False, True])
 def test_ellipses_hold_their_share_of_the_belief(forward_up):
     cov = torch.tensor([[4.0, 1.5], [1.5, 1.0]], dtype=torch.float64).expand(3, 2, 2)
@@ -82,12 +73,3 @@ def test_particles_are_summed_up_with_their_weights():
     axes = plot_path(TensorDict({"ensemble": particles, "log_weight": log_weight}, [1]))
     np.testing.assert_allclose(lines(axes)["belief"], [[1.0, 0.0]])
     np.testing.assert_allclose([axes.patches[0].width, axes.patches[0].height], [2 * 2.1460, 0], atol=1e-3)
-
-
-def test_ellipses_of_an_ensemble_are_those_of_its_covariance():
-    run = ensemble_run()
-    for patch in plot_path(run, spread="ellipses").patches:
-        step = int(patch.get_gid().removeprefix("step "))
-        squares = np.linalg.eigvalsh(np.cov(run["belief", "ensemble"][step, :, :2].double().numpy().T))
-        wanted = 2 * math.sqrt(-2 * math.log(0.1)) * np.sqrt(squares)
-        np.testing.assert_allclose([patch.height, patch.width], wanted, rtol=1e-5)

@@ -87,20 +87,3 @@ def test_the_belief_grows_beside_the_camera(tmp_path, ending):
 
 def vermilion(frame):
     return (np.abs(frame.astype(int) - (213, 94, 0)).max(-1) <= 60).sum()
-
-
-@pytest.mark.parametrize("bands", [None, {"dims": [0]}])
-def test_the_belief_lies_on_the_picture(tmp_path, bands):
-    at = torch.stack([4.0 + 2 * torch.arange(12), 3 + torch.arange(12)], -1)  # columns and rows, in pixels
-    pixels = torch.zeros(12, 3, 20, 32)
-    pixels[:, 1] = 0.6
-    settings = {"bands": bands, "path": {"spread": "none"}, "size": (8, 4)}
-    got, _ = decoded(belief_video(tmp_path / "a.gif", at, pixels, on_picture=True, **settings))
-    places = np.argwhere((np.abs(got[0].astype(int) - (0, 153, 0)) < 12).all(-1))
-    (top, left), (bottom, right) = places.min(0), places.max(0) + 1
-    assert (right - left) / (bottom - top) == pytest.approx(32 / 20, rel=0.02)  # pixels are squares
-    for frame, (column, row) in zip(got, at.tolist(), strict=True):
-        marked = np.argwhere(blue(frame[top:bottom, left:right]))
-        down, across = marked.max(0)  # the dot is the last mark to the right, and the lowest
-        assert across - 3.5 == pytest.approx((column + 0.5) / 32 * (right - left), abs=2)
-        assert down - 3.5 == pytest.approx((row + 0.5) / 20 * (bottom - top), abs=2)

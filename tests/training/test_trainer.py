@@ -151,16 +151,6 @@ def test_updates_with_readings_that_are_not_finite_are_left_out_and_said_once(tm
         torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
-def test_too_many_such_updates_in_a_row_end_it_with_the_key(tmp_path):
-    filter = small_filter()
-    trainer = FilterTrainer(
-        filter, [filter_stage(filter, range(2, 20), 20)], out=tmp_path, device="cpu", save_every=1, max_skipped=3
-    )
-    with pytest.raises(FloatingPointError, match=r"update 6: .* in 4 updates in a row.*\['observation'\]"):
-        trainer.fit()
-    assert read_checkpoint(tmp_path / "last.pt")["updates"]["in_a_row"] == 3
-
-
 def test_the_likelihood_reaches_its_maximum(tmp_path, float64):
     truth, Q, R, T, rows_ = 0.8, 0.3, 0.2, 12, 64
     x, readings = torch.randn(rows_), []

@@ -8,7 +8,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from tests.filters.factories import assert_equal, linear_denkf, linear_kalman
+from tests.filters.factories import assert_equal, linear_denkf
 from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import (
     BELIEF,
@@ -67,20 +67,7 @@ def test_observed_nan_raises_and_names_the_key(make_base, make_filter):
     assert_equal(make(reject).rollout(8)["next"], make(honest=True).rollout(8)["next"], BELIEF)
 
 
-def test_divergence_is_told_apart():
-    filter = linear_denkf()
-    filter["transition"].matrix.mul_(1e30)
-    assert_refused(ValueError, "the filter diverged", TransformedEnv(base_env(), DEnKFTransform(filter)).rollout, 5)
-
-
 # ------------------------------------------------------------------------------------------------------ errors
-
-
-def test_missing_key_names_key_and_environment():
-    filter = linear_kalman(observation_key="gps")
-    assert_refused(KeyError, r"'gps'.*LinearGaussianEnv", TransformedEnv(base_env(), DEnKFTransform(filter)).reset)
-    with pytest.raises(KeyError, match=r"'gps'.*LinearGaussianEnv"):
-        _ = TransformedEnv(base_env(), DEnKFTransform(filter)).observation_spec
 
 
 def test_float64_environment_and_float32_filter():

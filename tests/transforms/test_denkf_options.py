@@ -3,7 +3,6 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 from torchrl.envs import (
     ClipTransform,
     Compose,
@@ -21,28 +20,6 @@ from tests.filters.factories import assert_equal, linear_kalman, linear_system
 from tests.transforms import envs_for_tests as envs
 from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.transforms import DEnKFTransform
-
-
-@pytest.mark.parametrize("use_buffers", [False, True])
-def test_store_ensemble_false_in_a_collector(use_buffers):
-    def collect(store):
-        env = envs.filtered_env(
-            envs.random_filter, transform={"store_ensemble": store}, batch_size=[2], max_steps=[3, 5]
-        )
-        check_env_specs(env)
-        torch.manual_seed(1)
-        collector = Collector(env, None, frames_per_batch=16, total_frames=32, use_buffers=use_buffers)
-        data = [batch.clone() for batch in collector]
-        collector.shutdown()
-        return torch.cat(data, -1)
-
-    full, small = collect(True), collect(False)
-    # A collector's buffers hold what env.reset() gives: an ensemble there would be data, of zeros.
-    assert set(small["belief"].keys()) == set(small["next", "belief"].keys()) == {"mean", "var"}
-    assert full["belief", "ensemble"].shape[-2:] == (6, 2)
-    for key in envs.BELIEF[1:]:
-        assert small["next", key].equal(full["next", key])
-        assert small[key].equal(full[key])
 
 
 @pytest.mark.parametrize("no_grad", [True, False])
@@ -180,21 +157,6 @@ def test_a_transform_that_writes_over_the_carry_is_named(float64, make, key):
     ) as e:
         env.rollout(2)
     assert repr(key) in str(e.value)
-
-
-def test_transforms_that_leave_the_carry_alone(float64):
-    plain = env_with(linear_kalman()).rollout(5)
-    normed = env_with(linear_kalman(), ObservationNorm(in_keys=[MEAN], out_keys=["policy"], **NORM)).rollout(5)
-    assert_equal(normed["next"], plain["next"], [MEAN, ("belief", "cov")])
-    torch.testing.assert_close(normed["next", "policy"], 10 * plain["next", "belief", "mean"])
-    # In front of the filter, or over a mean that an ensemble does not carry.
-    first = TransformedEnv(envs.base_env(batch_size=[3]), ObservationNorm(in_keys=["observation"], **NORM))
-    first.append_transform(DEnKFTransform(linear_kalman()))
-    first.rollout(2)
-    plain = env_with(envs.random_filter()).rollout(5)
-    normed = env_with(envs.random_filter(), ObservationNorm(in_keys=[MEAN], **NORM)).rollout(5)
-    assert normed["belief", "ensemble"].equal(plain["belief", "ensemble"])
-    torch.testing.assert_close(normed["next", "belief", "mean"], 10 * plain["next", "belief", "mean"])
 
 
 @pytest.mark.parametrize("given", ["mean", "cov"])

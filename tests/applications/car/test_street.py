@@ -1,7 +1,6 @@
 """The drawing of rendered drives: pictures are where poses and geometry put them, on hills too; cars move."""
 
 import dataclasses
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -9,9 +8,8 @@ import pytest
 
 from torch_denkf.applications.car.kitti.render import roadside_scene
 from torch_denkf.applications.car.street.camera import HEIGHT, Camera
-from torch_denkf.applications.car.street.path import Path as Way
 from torch_denkf.applications.car.street.renderer import Renderer
-from torch_denkf.applications.car.street.scene import RESOLUTION, Box, Mover
+from torch_denkf.applications.car.street.scene import RESOLUTION
 from torch_denkf.applications.car.street.terrain import SMOOTH
 from torch_denkf.applications.car.street.textures import TILE
 from torch_denkf.applications.car.vision.poses import KITTI_DT, poses_to_state
@@ -114,61 +112,3 @@ def test_dots_on_the_road_are_where_the_poses_put_them(road, reach):
     assert found > 20
     assert (np.median(errors, 0) < 0.35).all()
     assert (errors.max(0) < 1.4).all()
-
-
-def test_a_moving_car_moves_by_itself_and_stands_on_the_hill():
-    poses, height = hill()
-    way = Way.of(poses_to_state(poses, KITTI_DT), poses[:, 1, 3] + HEIGHT)
-    red = [np.full((32, 32, 3), (0, 0, 255), np.uint8)]
-    camera = Camera.odometry((250, 828))
-    for pace, aside in ((-9.0, 3.5), (6.8, 0.0)):
-        time = KITTI_DT * np.arange(-6, 7)
-        track = way.at(way.along[40] + 20 + pace * time, aside)
-        track[:, 2:] *= np.sign(pace)
-        car = Mover(34, track, 4.0, 1.8, 1.5, [red] * 4)
-        renderer = Renderer(empty(poses, traffic=[car]), camera)
-        assert car.at(33) is None
-        assert car.at(47) is None
-        places = []
-        for number in (38, 42, 46):
-            picture = renderer.render(poses[number], number).astype(int)
-            seen = (picture[..., 2] - picture[..., 1] > 90).nonzero()
-            middle = poses[40, 2, 3] + 20 + pace * KITTI_DT * (number - 40)
-            x, z = np.meshgrid([-aside - 0.9, -aside + 0.9], [middle - 2, middle + 2])
-            x, z = x.ravel(), z.ravel()
-            feet = np.stack([x, height(x, z), z], -1)
-            heads = feet.copy()
-            heads[:, 1] = feet[:, 1].mean() - 1.5
-            corners, _ = project(camera, poses[number], np.concatenate([feet, heads]))
-            for k, axis in ((0, seen[1]), (1, seen[0])):
-                assert abs(axis.min() - corners[:, k].min()) < 1.6
-                assert abs(axis.max() - corners[:, k].max()) < 1.6
-            places.append((seen[1].mean(), len(seen[0])))
-        sizes = np.array(places)[:, 1]
-        if pace < 0:  # comes nearer by 1.6 m a frame, of 20 m: grows fast
-            assert sizes[2] > 2.5 * sizes[0]
-        else:  # as fast as the camera: a car that stood would come 5.6 m nearer
-            assert 0.9 < sizes[2] / sizes[0] < 1.15
-        assert (renderer.render(poses[40])[..., 2].astype(int) - renderer.render(poses[40])[..., 1] < 90).all()
-
-
-def test_nothing_stands_on_any_stretch_of_the_road():
-    # A figure of eight that is driven twice: crossings, and the second time along the first.
-    angle = np.linspace(0, 4 * np.pi, 700)
-    x, y = 60 * np.sin(angle), 40 * np.sin(2 * angle)
-    theta = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
-    for seed in range(3):
-        scene = roadside_scene(np.column_stack([x, y, theta]), np.random.default_rng(seed))
-        assert len(scene.objects) > 30
-        for item in scene.objects:
-            outline = (
-                [item.foot]
-                if not isinstance(item, Box)
-                else [
-                    a + t * (b - a)
-                    for a, b in pairwise([*item.corners, item.corners[0]])
-                    for t in np.linspace(0, 1, 24)
-                ]
-            )
-            gap = np.linalg.norm(scene.road[:, None] - np.array(outline), axis=-1).min()
-            assert gap > scene.road_width / 2 - 0.6, (seed, item)  # the map of the roads has cells of 0.5 m

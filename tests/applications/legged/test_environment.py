@@ -5,7 +5,6 @@ import torch
 
 from torch_denkf.applications.legged import QUADRUPED, LeggedErrors, quadruped_env, trot
 from torch_denkf.applications.legged.environment import LeggedEnv
-from torch_denkf.applications.legged.humanoid import humanoid_env
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.functional.manifolds import SO3, rotate
 from torch_denkf.motions.inertial import move_inertially
@@ -82,27 +81,3 @@ def test_feet_slide_on_ice():
             before = place
         slides.append(moved)
     assert slides[1] > 2 * slides[0]
-
-
-def test_a_soft_floor_gives_way():
-    heights = []
-    for softness in (0.01, 0.1):
-        env = quadruped_env(PERFECT, softness=softness)
-        env.reset()
-        heights.append(env.data.geom_xpos[[env.model.geom(foot).id for foot in QUADRUPED["feet"]], 2].mean())
-    assert heights[1] < heights[0] - 0.01
-
-
-@pytest.mark.parametrize("make", [quadruped_env, humanoid_env])
-def test_a_force_from_outside_acts_until_it_is_taken_off(make):
-    """As ropes pull that an environment around this one sets: the robot gives way, and the force is not overwritten."""
-    places = []
-    for force in (0.0, 100.0):
-        env = make(PERFECT)
-        td = env.reset()
-        env.data.xfrc_applied[1, 1] = force
-        for _ in range(30):
-            td = env.step(td.set("action", torch.zeros(env.action_spec.shape)))["next"]
-        assert env.data.xfrc_applied[1].tolist() == [0.0, force, 0.0, 0.0, 0.0, 0.0]
-        places.append(td["true", "position"][1])
-    assert places[1] - places[0] > 2e-3

@@ -16,7 +16,6 @@ from torch_denkf import KalmanFilter
 from torch_denkf.data import Recording, RecordingReplay, Table
 
 CAR = SHARED / "logs" / "car.csv"
-WHEELS = sorted((SHARED / "logs").glob("wheels_gyro_*.txt"))
 
 
 def replay(**streams):
@@ -127,14 +126,6 @@ def test_a_fix_that_is_repeated_counts_once(tmp_path):
     assert inside["dropped"] > 0.9 > 0.75 > inside["kept"]
 
 
-def test_one_slow_column_among_fast_ones(tmp_path):
-    walk, gps, _ = fixes()
-    file = write_csv(tmp_path / "run.csv", time=np.arange(len(walk)) / 10, gyro=walk, gps=gps)
-    with pytest.warns(UserWarning, match=r"'gps' repeats .* in a Table of its own, columns=\['gps'\]"):
-        replay(imu=Table(file))
-    replay(imu=Table(file, repeats="keep"))
-
-
 def test_what_is_no_repeat(tmp_path):
     """A robot that stands, an encoder's ticks, a temperature, commands that are held."""
     random, count = np.random.default_rng(0), 400
@@ -177,15 +168,6 @@ def test_the_log_of_a_car():
     assert_close(rows["gps"].double().numpy(), degrees - [51.04, 13.79], rtol=0, atol=1e-9)
     degrees = torch.from_numpy(degrees)
     assert 0.2 < (degrees.float().double() - degrees).abs().max() * 111_200 < 0.22  # m, without an origin
-
-
-@pytest.mark.skipif(not WHEELS, reason="the logs are not here")
-def test_the_logs_of_a_wheeled_robot(tmp_path):
-    """Nothing is wrong in them."""
-    for file in WHEELS:
-        lines = [",".join(line.split()) for line in file.read_text().splitlines()]
-        (tmp_path / "run.csv").write_text("\n".join(lines))
-        assert len(replay(state=Table(tmp_path / "run.csv", time="t"))) == len(lines) - 1
 
 
 def queued(rate, count=2000):

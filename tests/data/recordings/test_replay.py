@@ -4,8 +4,6 @@ from contextlib import nullcontext
 from functools import partial
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as parquet
 import pytest
 
 from tests.data import replay_for_tests as shared
@@ -90,14 +88,6 @@ def test_a_rate_shows_each_picture_once(run):
         assert (rows["pixels"][row].numpy() == (pixels(int(frame[row])) if new[row] else 0)).all()
 
 
-def test_the_clock_of_a_table(run):
-    rows = open_runs(Recording(**streams(run)), clock="action")[:]
-    assert rows["time"].flatten().tolist() == [0.25 * k for k in range(6)]  # 0.25, 0.5, ... 1.5 s
-    assert rows["action"].flatten().tolist() == [1, 2, 3, 4, 5, 6]
-    for row, number in enumerate((2, 5, 7, 10, 12, 15)):
-        assert (rows["pixels"][row].numpy() == pixels(number)).all()
-
-
 def test_old_readings_are_missing_beyond_the_tolerance(run):
     table = Table(run / "commands.csv", tolerance=0.12)
     rows = open_runs(Recording(camera=Video(run / "run1.mkv"), speed=table))[:]
@@ -105,34 +95,6 @@ def test_old_readings_are_missing_beyond_the_tolerance(run):
     held = age <= 0.12 + 1e-6
     expected = np.where(held, np.floor(np.arange(20) / 2.5 + 1e-9), 0)
     assert rows["speed"].flatten().tolist() == expected.tolist()
-
-
-def test_images_and_parquet(tmp_path):
-    """Images that are named by their times in ns, and a table of the same clock."""
-    stamps = [1_700_000_000_000_000_000 + 100_000_000 * k for k in range(8)]
-    write_images(tmp_path / "run7", [f"{stamp}.png" for stamp in stamps])
-    times = np.array(stamps[0] + 50_000_000 * np.arange(-2, 18), dtype=np.int64)
-    table = {"stamp": pa.array(times), "x": pa.array(np.arange(20.0)), "n": pa.array(np.arange(20)), "note": ["-"] * 20}
-    parquet.write_table(pa.table(table), tmp_path / "state.parquet")
-    state = Table(tmp_path / "state.parquet", ["n", "x"], time="stamp", unit="ns")
-    data = open_runs(Recording(eye=Images(tmp_path / "run7", unit="ns"), state=state), size=(12, 16))
-    rows = data[:]
-    assert data.episodes[0].name == "run7"
-    np.testing.assert_allclose(rows["time"].flatten(), np.arange(8) / 10, atol=1e-6)
-    assert rows["state"].tolist() == [[2 + 2 * k, 2 + 2 * k] for k in range(8)]
-    expected = np.stack([pixels(k)[:, :12, :16] for k in range(8)])
-    assert (rows["pixels"].numpy() == expected).all()
-    # The same pictures at a rate, and with times from a table; img_10 comes after img_9.
-    write_images(tmp_path / "plain", [f"img_{k}.png" for k in range(12)])
-    write_csv(tmp_path / "times.csv", time=np.arange(12) ** 1.5)
-    for images, expected in (
-        (Images(tmp_path / "plain", rate=4.0, start=3.0), 3 + np.arange(12) / 4),
-        (Images(tmp_path / "plain", times=tmp_path / "times.csv"), np.arange(12) ** 1.5),
-        (Images(tmp_path / "plain", times=list(range(12)), unit="ms"), np.arange(12) / 1000),
-    ):
-        data = open_runs(Recording(eye=images))
-        np.testing.assert_allclose(data[:]["time"].flatten() + data.episodes[0].begin, expected)
-        assert (data[:]["pixels"].numpy() == np.stack([pixels(k) for k in range(12)])).all()
 
 
 def test_images_are_in_the_order_of_their_numbers(tmp_path):

@@ -1,7 +1,6 @@
 """The reader, on a layout written by hand with known numbers, and on a few real frames where they are."""
 
 import math
-import os
 import shutil
 
 import cv2
@@ -9,13 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-import torch_denkf.applications.car.kitti.drive as module
 from tests.real_data import KITTI
 from torch_denkf.applications.car import dead_reckoning, read_kitti_drive
 from torch_denkf.applications.car.kitti.files import read_poses
 from torch_denkf.applications.car.vision.poses import poses_to_state, state_to_poses
-from torch_denkf.data import cache_entry
-from torch_denkf.data.cache_entry import CachedTensor
 
 cv2.setNumThreads(1)
 
@@ -144,35 +140,6 @@ def test_damaged_images_are_missing_frames(tmp_path):
         read_kitti_drive(tmp_path, "00", cache=None)
 
 
-def test_the_cache(tmp_path, monkeypatch):
-    root, cache = make(tmp_path / "kitti"), tmp_path / "cache"
-    first = read_kitti_drive(root, "00", cache=cache)
-    assert isinstance(first["image"], CachedTensor)
-    entries = list(cache.iterdir())
-    assert len(entries) == 1
-    # From now on the cache alone is read: images are not opened again.
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "_decode", None)
-        again = read_kitti_drive(root, "00", cache=cache)
-        assert (again == first).all()
-        monkeypatch.setenv("TORCH_DENKF_CACHE", str(cache))
-        assert (read_kitti_drive(root, "00") == first).all()
-    # Other options are other entries; a changed file is read anew.
-    read_kitti_drive(root, "00", size=(20, 60), cache=cache)
-    assert len(list(cache.iterdir())) == 2
-    make(root, poses=range(0, 12, 2))
-    os.utime(root / "poses/00.txt", ns=(1, 1))
-    changed = read_kitti_drive(root, "00", cache=cache)
-    assert changed["state"][1, 0] == 2
-    # A damaged entry is made anew, and nothing else is left behind.
-    for entry in cache.iterdir():
-        (entry / cache_entry.MANIFEST).write_text("{")
-    assert (read_kitti_drive(root, "00", cache=cache) == changed).all()
-    assert not [entry for entry in cache.iterdir() if entry.name.startswith(".")]
-    assert not [entry for entry in root.rglob("*") if entry.suffix == ".bin"]
-    assert not isinstance(read_kitti_drive(root, "00", cache=None)["image"], CachedTensor)
-
-
 def test_errors_name_the_file(tmp_path):
     make(tmp_path)
 
@@ -220,36 +187,6 @@ def test_errors_name_the_file(tmp_path):
     fails(ValueError, r"calib.txt:3: 'P2:' is there 2 times")
     calibration.unlink()
     fails(FileNotFoundError, r"no calibration at .*calib.txt")
-
-
-@pytest.mark.parametrize(
-    ("file", "row", "text", "match"),
-    [
-        (
-            "poses/00.txt",
-            3,
-            "1 0 0 1000000 0 1 0 0 0 0 1 3",
-            r"00.txt:4: the position is 1e\+06 m from .*, 0.1 s earlier",
-        ),
-        ("poses/00.txt", 0, "1 0 0 0 0 1 0 0 0 0 1 -31", r"00.txt:2: the position is 32 m from that of the row before"),
-        ("poses/00.txt", 3, "1 0 0 0 0 1 0 0 0 0 1 1_3", r"00.txt:4: expected 12 finite numbers"),
-        ("sequences/00/calib.txt", 2, "P2: 7_0 0 0 0 0 9 0 0 0 0 1 0", r"calib.txt:3: expected 12 finite numbers"),
-        ("sequences/00/times.txt", 3, "0_3", r"times.txt:4: expected 1 finite number \(seconds\), got 1 words: '0_3'"),
-        (
-            "sequences/00/times.txt",
-            None,
-            "0\n103\n206\n309\n412\n515\n",
-            r"times is 103 s, .*; write the times in seconds",
-        ),
-    ],
-)
-def test_what_cannot_be_a_drive_is_refused(tmp_path, file, row, text, match):
-    """A leap, numbers that Python alone reads as such, and times in ms."""
-    path = make(tmp_path) / file
-    lines = path.read_text().splitlines()
-    path.write_text(text if row is None else "\n".join([*lines[:row], text, *lines[row + 1 :]]))
-    with pytest.raises(ValueError, match=match):
-        read_kitti_drive(tmp_path, "00", cache=None)
 
 
 # Real frames ---------------------------------------------------------------------------------------------------------

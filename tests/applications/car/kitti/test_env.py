@@ -3,7 +3,6 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs.utils import check_env_specs
 
 from torch_denkf.applications.car import KITTIReplayEnv, dead_reckoning, read_kitti_drive, write_drives
 from torch_denkf.applications.car.kitti.frames import drive_frames
@@ -50,39 +49,6 @@ def test_a_rollout_is_the_drives_frames(root, tmp_path, colour):
     # The gap blinds two frames.
     assert (~rollout["observed"]).flatten().nonzero().flatten().tolist() == [0, 9, 10]
     assert env.dt == pytest.approx(0.103)
-
-
-@pytest.mark.parametrize("images", [True, False])
-def test_flow_and_road_are_emitted_where_the_drive_has_them(drive, images):
-    drive = drive.copy() if images else drive.exclude("image")
-    drive["flow"], drive["road"] = torch.randn(ROWS, 3, 2, 5).half(), torch.randn(ROWS, 4, 6).half()
-    env = KITTIReplayEnv(drive, batch_size=[2], start=[0, 6], length=5)
-    check_env_specs(env)
-    keys = {"pixels", "flow", "road", "state"} if images else {"flow", "road", "state"}
-    assert keys - set(env.observation_spec.keys()) == set()
-    assert ("pixels" in env.observation_spec.keys()) == images  # noqa: SIM118
-    rollout, frames = env.rollout(10), drive_frames(drive)
-    same(rollout, frames, torch.tensor([[0, 1, 2, 3], [6, 7, 8, 9]]), keys)
-    assert (rollout["flow"][0, 2] == drive["flow"][2].float()).all()
-
-
-def test_only_rows_that_end_start_anew(drive):
-    env = KITTIReplayEnv(drive, batch_size=[3], start=[0, 4, 12], length=[3, 5, 12])
-    rollout = env.rollout(11, break_when_any_done=False)
-    expected = torch.tensor(
-        [
-            [0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0],
-            [4, 5, 6, 7, 4, 5, 6, 7, 4, 5, 6],
-            [12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22],
-        ]
-    )
-    frames = drive_frames(drive)
-    same(rollout, frames, expected)
-    starts = torch.tensor([[0], [4], [12]])
-    assert (rollout["is_init"].squeeze(-1) == (expected == starts)).all()
-    ends = torch.tensor([[2], [8], [23]])
-    same(rollout["next"], frames, expected + 1)
-    assert (rollout["next", "truncated"].squeeze(-1) == (expected + 1 == ends)).all()
 
 
 def test_the_pair_that_shows_a_speed_is_labelled_with_it():

@@ -7,7 +7,6 @@ import torch
 
 import torch_denkf.applications.car.kitti.motion as motion_module
 from tests.applications.car.vision.drives_for_tests import rendered
-from tests.applications.car.vision.plane_for_tests import as_image, random_texture
 from torch_denkf.applications.car import with_motion
 from torch_denkf.applications.car.vision.motion import image_motion
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
@@ -67,21 +66,6 @@ def test_rows_without_a_pair_are_zero(drive):
                 assert out[key][row].abs().max() > 0.01
 
 
-def test_the_second_call_reads_the_cache(drive, tmp_path, count):
-    fresh = with_motion(drive, cache=None)
-    assert len(count) == ROWS - 1
-    first = with_motion(drive, cache=tmp_path)
-    assert len(count) == 2 * (ROWS - 1)
-    again = with_motion(drive.clone(), cache=str(tmp_path))
-    # Neither what does not enter the computation nor where the drive lies matters.
-    light = with_motion(drive.clone().set("state", drive["state"] + 1), cache=tmp_path, keep_images=False)
-    assert len(count) == 2 * (ROWS - 1)
-    for out in (first, again, light):
-        for key in ("flow", "road"):
-            assert out[key].equal(fresh[key])
-    assert len(list(tmp_path.glob("motion-*"))) == 1
-
-
 def one_pixel(drive):
     drive["image"][3, 0, 20, 70] += 1
 
@@ -124,26 +108,6 @@ def test_flow_is_in_tangents_of_the_drives_camera(drive):
     # quarter of a pixel, on motions of 4 pixels and more.
     assert (far - 2 * near).abs().median() < 0.004
     assert torch.corrcoef(torch.stack([near.flatten(), far.flatten()]))[0, 1] > 0.8
-
-
-def test_colours_are_weighed_in_rgb_order(drive):
-    """0.299 R + 0.587 G + 0.114 B: of a red world that moves and a blue one that stands, the red one is seen."""
-    red, blue = (random_texture(seed, blur=2.5)[:50, :160] for seed in (5, 6))
-    pairs = {"red moves": [], "blue moves": [], "mixed": []}
-    for moved in (4, 0):
-        r, b = as_image(red[:, moved : moved + 150]), as_image(blue[:, :150])
-        pairs["red moves"].append(np.stack([r, np.full_like(r, 128), b]))
-        pairs["blue moves"].append(pairs["red moves"][-1][::-1])
-        pairs["mixed"].append(np.tile(as_image(0.299 * r + 0.587 * 128 + 0.114 * b), (3, 1, 1)))
-    flows = {}
-    for name, images in pairs.items():
-        two = drive[:2].clone().set("image", torch.from_numpy(np.stack(images)))
-        flows[name] = with_motion(two, cache=None)["flow"][1].float()
-    shift = 4 / drive["calibration"][0, 0].item()
-    assert flows["red moves"][0].median() > 0.8 * shift
-    assert flows["blue moves"][0].median() < 0.2 * shift
-    # Red, green and blue that are equal give that grey; OpenCV's weights are rounded to 1/2^15.
-    assert (flows["red moves"][0] - flows["mixed"][0]).abs().median() < 0.01 * shift
 
 
 def test_mirrored_images_give_the_mirrored_flow():

@@ -1,7 +1,6 @@
 """Rendered drives: what is read back is what was generated, and images move as the recorded motion says."""
 
 import dataclasses
-import json
 import zlib
 
 import cv2
@@ -170,22 +169,3 @@ def test_a_box_appears_where_its_corners_project():
         for found, expected in ((seen[1], u), (seen[0], v)):
             assert abs(found.min() - expected.min()) < 1.01
             assert abs(found.max() - expected.max()) < 1.01
-
-
-def test_drives_that_are_there_are_kept(tmp_path):
-    write_drives(tmp_path, ["a"], frames=3)
-    picture = tmp_path / "sequences/a/image_2/000001.png"
-    before = picture.stat().st_mtime_ns
-    write_drives(tmp_path, ["a"], frames=3)
-    assert picture.stat().st_mtime_ns == before
-    with pytest.raises(FileExistsError, match=r"sequences/a .* with other options .*overwrite=True"):
-        write_drives(tmp_path, ["a"], frames=4)
-    write_drives(tmp_path, ["a"], frames=4, overwrite=True)
-    assert len(read_kitti_drive(tmp_path, "a", cache=None)) == 4
-    assert json.loads((tmp_path / "sequences/a/drive.json").read_text())["frames"] == 4
-    # A recorded drive is never replaced.
-    (tmp_path / "sequences/a/drive.json").unlink()
-    with pytest.raises(FileExistsError, match=r"not rendered.*choose another name or folder"):
-        write_drives(tmp_path, ["a"], frames=3, overwrite=True)
-    assert len(list(tmp_path.glob("sequences/*"))) == 1
-    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["poses", "sequences"]

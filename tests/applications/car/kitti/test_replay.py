@@ -8,12 +8,10 @@ import pytest
 import torch
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 
-import torch_denkf.applications.car.kitti.drive as kitti_module
 from tests.data import replay_for_tests as shared
 from torch_denkf.applications.car import KITTIOdometryExperienceReplay, read_kitti_drive, write_drives
 from torch_denkf.applications.car.kitti.frames import drive_frames
 from torch_denkf.applications.car.kitti.mirror import mirror_drive
-from torch_denkf.data.cache_entry import CachedTensor
 
 SIZE = (12, 36)
 LENGTHS = {"hill": 14, "lane": 9, "town": 23}
@@ -97,21 +95,6 @@ def test_statistics_by_hand(root):
     assert statistics["pixels", "mean"].shape == (6, 1, 1)
     others = open_dataset(root).statistics
     assert abs(others["velocity", "mean"][0] - statistics["velocity", "mean"][0]) > 0.01  # the lane would count
-
-
-def test_the_cache_is_mapped_and_opens_without_decoding(root, tmp_path, monkeypatch):
-    options = {"cameras": "both", "mirrored": True, "cache": tmp_path}
-    first = open_dataset(root, **options)
-    entries = sorted(path.name for path in tmp_path.iterdir())
-    assert len(entries) == 5  # mirror images take no space
-    with monkeypatch.context() as patch:
-        patch.setattr(kitti_module, "_decode", None)
-        again = open_dataset(root, **options)
-    assert all(isinstance(drive["image"], CachedTensor) for drive in again._drives)
-    assert (again[:] == first[:]).all()
-    assert "pixels" not in again._storage[:]
-    assert sum(value.nbytes for value in again._storage[:].values(True, True)) < 120 * len(again)
-    assert sorted(path.name for path in tmp_path.iterdir()) == entries
 
 
 # The rest of torchrl's interface -------------------------------------------------------------------------------------

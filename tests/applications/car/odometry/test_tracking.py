@@ -1,9 +1,7 @@
 """Tracking frame by frame equals filtering the whole drive; cameras that do not fit are noticed."""
 
-import os
 import warnings
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -13,7 +11,6 @@ from torch_denkf.applications.car import read_kitti_drive, track, with_motion
 from torch_denkf.applications.car.kitti.gaps import bridge_gaps
 from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.applications.car.odometry.filter import car_filter
-from torch_denkf.applications.car.odometry.images import read_frames
 from torch_denkf.pretrained import from_pretrained
 
 
@@ -179,19 +176,3 @@ def test_a_frame_of_one_colour_is_missing(blank, checkpoint, drive):
     assert [belief.observed for belief in whole] == [False, True, True, True, True, True]
     with pytest.raises(ValueError, match=r"no two frames .* black or of one colour all over do not count"):
         list(track(car, [covered] * 4, good))
-
-
-def test_a_folder_of_images_that_counts_a_frame_twice_or_hangs(tmp_path):
-    for name in ("000001.png", "000002.png", "000003.png"):
-        cv2.imwrite(str(tmp_path / name), np.zeros((4, 6), np.uint8))
-    assert len(list(read_frames(tmp_path))) == 3
-    (tmp_path / "000002.jpg").write_bytes((tmp_path / "000002.png").read_bytes())
-    with pytest.raises(ValueError, match=r"000002.png and 000002.jpg are two images of one name"):
-        read_frames(tmp_path)
-    (tmp_path / "000002.jpg").rename(tmp_path / "2.jpg")
-    with pytest.raises(ValueError, match=r"has two images of one number, 2.jpg, 000002.png"):
-        read_frames(tmp_path)
-    (tmp_path / "2.jpg").unlink()
-    os.mkfifo(tmp_path / "000004.png")
-    with pytest.raises(ValueError, match=r"000004.png is no file, but a pipe"):
-        read_frames(tmp_path)

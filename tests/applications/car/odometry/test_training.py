@@ -4,16 +4,12 @@ import shutil
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from tests.applications.car.odometry.conftest import OPTIONS
-from torch_denkf.applications.car.odometry.batches import ReadingSampler
 from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter, markdown_table, write_rows
-from torch_denkf.applications.car.odometry.filter import CarSettings, car_filter
 from torch_denkf.applications.car.odometry.roles import assign_roles
-from torch_denkf.applications.car.odometry.scores import calibrate
 from torch_denkf.applications.car.odometry.streams import Drive, all_frames, read_spans
-from torch_denkf.applications.car.odometry.training import Updates, train_car_filter
+from torch_denkf.applications.car.odometry.training import train_car_filter
 from torch_denkf.training import FilterTrainer
 
 
@@ -24,24 +20,6 @@ def test_roles_are_disjoint_and_cover_all_drives():
         assert sorted(name for part in roles.values() for name in part) == names
     assert [len(part) for part in assign_roles([str(n) for n in range(20)]).values()] == [2, 5, 13]
     assert assign_roles(["a"]) == {"validation": [], "filter": ["a"], "sensor": []}
-
-
-@pytest.mark.parametrize(("apart", "best"), [({1.0: 1.0, 1.05: 3.0}, 1.0), ({1.0: 3.0, 1.05: 1.0}, 1.05)])
-def test_the_inflation_is_chosen_by_the_path_too(monkeypatch, apart, best):
-    """A spread that suits the velocities less is taken where the path is so much nearer to the truth."""
-    car = car_filter(ensemble_size=4)
-    car.inflation = 1.2
-
-    def run(filtered, _):
-        out = TensorDict({"state": torch.zeros(1, 5, 5), "belief": {"mean": torch.zeros(1, 5, 5)}}, [1, 5])
-        out["belief", "mean"][..., 0] = apart.get(filtered.inflation, 9.0)
-        # The CRPS of a Gaussian whose mean is right grows with its standard deviation.
-        out["belief", "var"] = torch.full((1, 5, 5), filtered.inflation**2)
-        return [out]
-
-    monkeypatch.setattr("torch_denkf.applications.car.odometry.scores._all", run)
-    assert calibrate(car, []) == best
-    assert car.inflation == 1.2  # as it was
 
 
 class Killed(Exception):
@@ -71,26 +49,6 @@ def test_a_killed_training_goes_on_to_the_same_weights(stage, root, trained, tmp
     for name, value in trained[1].state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
     assert resumed.inflation == trained[1].inflation
-
-
-def test_mistakes_say_what_to_do(root, trained, tmp_path):
-    with pytest.raises(
-        ValueError, match=r"2 drives are too few: none is left for \['validation'\]. Pass three or more"
-    ):
-        train_car_filter(tmp_path, root=root, drives=["a", "b"], **OPTIONS)
-    with pytest.raises(FileNotFoundError, match=r"no drives \['z'\] with images and poses below .*it has \['a', 'b'"):
-        train_car_filter(tmp_path, root=root, drives=["z"], **OPTIONS)
-    with pytest.raises(ValueError, match=r"last\.pt is of another training: seed \(3, now 4\)"):
-        train_car_filter(trained[0], root=root, **{**OPTIONS, "seed": 4})
-    with pytest.raises(ValueError, match="filter of Updates must be a whole number, at least 1; got 0"):
-        Updates(filter=0)
-    with pytest.raises(ValueError, match=r"dt must be finite and above 0; got 0.0"):
-        car_filter(dt=0.0)
-    with pytest.raises(ValueError, match=r"longest is 1 to lags \+ 1 = 3"):
-        CarSettings(lags=2, longest=4)
-    readings = [TensorDict({"state": torch.zeros(16, 5)}, [16])]
-    with pytest.raises(ValueError, match="windows of 40 steps do not fit in drives of 16 frames"):
-        ReadingSampler(readings, [1.0], 40, 0.0)
 
 
 def test_evaluation_beside_the_floor(trained, root, tmp_path):

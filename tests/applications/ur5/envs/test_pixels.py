@@ -1,7 +1,5 @@
 """Oracles: pictures taken otherwise, the pinhole formula, moments of the noise, what a missing library raises."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -9,7 +7,6 @@ import torch
 from tests.envs.opengl import mujoco, needs_opengl
 from torch_denkf.applications.ur5 import UR5TableEnv
 from torch_denkf.applications.ur5.envs.expert import UR5Expert
-from torch_denkf.applications.ur5.simulation import domains
 from torch_denkf.applications.ur5.simulation.camera import distortion_map
 
 SMALL = {"size": (48, 64), "max_steps": 30}
@@ -25,29 +22,6 @@ def demo(steps=30, **kwargs):
     rollout = env.rollout(steps, UR5Expert(env))
     env.close()
     return rollout
-
-
-@pytest.fixture
-def variant(monkeypatch):
-    """Domains that differ from the simulator in one thing."""
-
-    def add(**kwargs):
-        monkeypatch.setitem(domains.DOMAINS, "variant", replace(domains.SIM, **kwargs))
-        return "variant"
-
-    return add
-
-
-def test_types_and_seeds():
-    one, other, bytes_ = demo(seed=1), demo(seed=1), demo(seed=1, pixels_dtype=torch.uint8)
-    assert (one == other).all()  # pixels included, bit for bit
-    assert one["pixels"].shape == (30, 3, 48, 64)
-    torch.testing.assert_close(one["pixels"], bytes_["pixels"].float() / 255)
-    noisy = [demo(seed=1, domain="real_like") for _ in range(2)]
-    assert (noisy[0] == noisy[1]).all()
-    assert one["observed"].all()
-    blind = make(seed=1, from_pixels=False)
-    assert blind.rollout(30, UR5Expert())["next", "state"].equal(one["next", "state"])
 
 
 def test_few_frames_of_an_episode():
@@ -107,21 +81,6 @@ def test_the_arm_is_in_view_and_where_the_pinhole_formula_has_it():
     assert abs(where[0] - row[5]) < 1.5
     assert abs(where[1] - column[5]) < 1.5
     env.close()
-
-
-def test_delay(variant):
-    now, late = demo(seed=1), demo(seed=1, domain=variant(delay=1))
-    assert late["pixels"][0].equal(now["pixels"][0])
-    assert late["next", "pixels"].equal(now["pixels"])
-    assert late["next", "state"].equal(now["next", "state"])
-
-
-def test_motion_blur(variant):
-    sharp, blurred = demo(seed=1, steps=30), demo(seed=1, steps=30, domain=variant(exposures=2))
-    assert blurred["pixels"][0].equal(sharp["pixels"][0])  # at rest
-    difference = (blurred["pixels"] - sharp["pixels"]).abs().mean((1, 2, 3))
-    assert difference[-1] > 0  # in motion
-    assert difference.max() < (sharp["pixels"][-1] - sharp["pixels"][-8]).abs().mean()
 
 
 def test_lens():

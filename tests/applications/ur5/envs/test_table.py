@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 
 pytest.importorskip("mujoco", reason="mujoco is not installed: pip install 'mujoco>=3.17,<4'")
 
@@ -84,49 +83,6 @@ def test_speeds_are_limited():
         sent = torch.from_numpy(env._scene.target).float() - start
         assert sent[0].item() == pytest.approx(min(1.0, step * torch.pi * 0.08), abs=1e-4)
         assert sent[6].item() == pytest.approx(-min(start[6].item(), step * 0.12), abs=1e-4)
-
-
-def test_seeds_are_episodes():
-    def run(task="pick", seed=None, episodes=1, **kwargs):
-        env = blind(task, max_steps=25, **kwargs)
-        if seed is not None:
-            env.set_seed(seed)
-        return torch.stack([env.rollout(25, UR5Expert(env)) for _ in range(episodes)])
-
-    for task in TASKS:
-        one, other = run(task, 3, episodes=2), run(task, 3, episodes=2)
-        assert (one == other).all()  # every key, bit for bit
-        assert (one["state"][0] != one["state"][1]).any()  # the next episode is another
-        assert (run(task, 4)["state"][0, 0] != one["state"][0, 0]).any()
-    constructed = blind(seed=3, max_steps=25)
-    assert (constructed.rollout(25, UR5Expert()) == run(seed=3)[0]).all()
-    state = torch.get_rng_state()
-    blind(seed=5).reset()
-    assert torch.get_rng_state().equal(state), "its own generator"
-
-
-@pytest.mark.parametrize("task", ["pick", "push", "put_down"])
-def test_an_episode_leaves_nothing_to_the_next(task):
-    env = blind(task)
-    env.set_seed(1)
-    env.rollout(350, UR5Expert(env))
-    for seed in (2, 3):  # to the end: differences in the last bit take their time
-        fresh = blind(task)
-        env.set_seed(seed)
-        fresh.set_seed(seed)
-        assert (env.rollout(350, UR5Expert(env)) == fresh.rollout(350, UR5Expert(fresh))).all()
-
-
-def test_expert_noise():
-    planned = torch.zeros(4000, 7)
-    read = TensorDict({"expert": {"action": planned}}, [4000])
-    assert UR5Expert()(read.clone())["action"].equal(planned)
-    action = UR5Expert(noise=0.02, generator=torch.Generator().manual_seed(0))(read.clone())["action"]
-    # 24,000 draws: the standard error of their standard deviation is 0.5 %.
-    assert action[:, :6].std().item() == pytest.approx(0.02, rel=0.025)
-    assert (action[:, 6] == 0).all()
-    again = UR5Expert(noise=0.02, generator=torch.Generator().manual_seed(0))(read.clone())["action"]
-    assert again.equal(action)
 
 
 def test_joints_of_the_real_like_arm_stand_off():
