@@ -7,7 +7,7 @@ from torchrl.data import SliceSampler
 
 import torch_denkf
 import torch_denkf.data
-from tests.data.replay_for_tests import check_contract
+from tests.data.replay_for_tests import check_contract, check_slices, ways_to_slice
 from torch_denkf.applications.car import write_drives
 from torch_denkf.data import Episode, EpisodeReplay, LeRobotReplay
 from torch_denkf.data.episodes import hashed_share
@@ -40,6 +40,11 @@ def test_a_split_keeps_the_contract():
 
 
 # Samples --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", ways_to_slice(), ids=lambda options: " ".join(options))
+def test_slices_are_in_one_episode(options):
+    check_slices(make(5, **{"batch_size": 24, **options}), options, "step", ("state", "action", "time"))
 
 
 def test_user_transforms_see_slices():
