@@ -54,6 +54,8 @@ setup(
     extras_require={
         # Parquet files, and AV1 videos, which OpenCV's wheels do not decode: 280 MB, for LeRobot and own recordings.
         "lerobot": ["pyarrow>=15", "av>=14"],
+        # ROS 1, ROS 2 and MCAP bags, read without ROS, and YAML of robot_localization: 10 MB.
+        "ros": ["rosbags>=0.11", "pyyaml"],
         # torch_denkf.plots, and the GIF files of its videos.
         "plots": ["matplotlib", "pillow"],
         "examples": ["matplotlib", "tensorboard"],
@@ -82,6 +84,8 @@ setup(
         ],
         "test": [
             "evo",
+            "rosbags>=0.11",
+            "pyyaml",
             "pyarrow>=15",
             "av>=14",
             "onnx>=1.23",

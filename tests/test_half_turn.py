@@ -20,7 +20,7 @@ from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter, ParticleFilter
 from torch_denkf.functional.localisation import Neighbours
 from torch_denkf.functional.manifolds import Circle, Euclidean, Flat, Opposite
 from torch_denkf.fusion import FusedFilter, FusedSensor, SensorAttention
-from torch_denkf.imperfect import FadingBias, Visible
+from torch_denkf.imperfect import Contaminated, FadingBias, Visible
 from torch_denkf.modules import (
     ConstantNoise,
     EKFTransition,
@@ -208,6 +208,17 @@ def heeding(make):
     return heeds
 
 
+def contaminated(make):
+    """The filter, of whose readings a share is wrong."""
+
+    def doubts(turn):
+        filter = make(turn)
+        divergence = 0.0 if isinstance(filter, ParticleFilter) else 0.1
+        return filter.with_modules(analysis=Contaminated(filter["analysis"], 0.3, width=3.0, divergence=divergence))
+
+    return doubts
+
+
 def gated(make, **options):
     return lambda turn: Gated(make(turn), **options)
 
@@ -234,7 +245,8 @@ FILTERS = {
     "particles": particles(),
     "particles, learned": particles(learned_likelihood),
     **{
-        f"{name} that heeds visibility": heeding(make)
+        f"{name} that {does}": around(make)
+        for does, around in {"heeds visibility": heeding, "doubts readings": contaminated}.items()
         for name, make in {
             "ensemble": ensemble(),
             "ensemble of samples": ensemble("sensor", "samples"),

@@ -8,15 +8,17 @@ from typing import Any, TypeGuard
 import torch
 from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
-from torch import nn
+from torch import Tensor, nn
 
 from torch_denkf._registered import diagnosis
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.submodel import EXPLAINED, Call, Entries, Sensor, SubModel, role
 
 __all__ = [
     "check_module",
     "in_sequences",
     "is_sequence",
+    "linearise",
     "marks_of",
     "named_modules_of",
     "random_parts",
@@ -76,6 +78,20 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
         raise diagnosis().missing_entry(type(module).__name__, missing, entries)
     tensordict = module(tensordict)
     return {key: tensordict.get(key) for key in map(unravel_key, module.out_keys)}
+
+
+def linearise(
+    module: TensorDictModuleBase, entries: Entries, call: Call
+) -> tuple[Entries, Tensor, tuple[Space, Space] | None] | None:
+    """Returns what a module says of itself, see :meth:`SubModel.linearised`; ``None`` where only autograd knows."""
+    if not isinstance(module, SubModel) or type(module).forward is not SubModel.forward:
+        return None
+    if module._forward_hooks or module._forward_pre_hooks:
+        return None
+    try:
+        return module.linearised(entries, call)
+    except (KeyError, *EXPLAINED):  # a run says what is wrong
+        return None
 
 
 def run_modules(modules: Iterable[tuple[str, TensorDictModuleBase]], entries: Entries, call: Call) -> Entries:

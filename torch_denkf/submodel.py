@@ -24,6 +24,10 @@ __all__ = ["Call", "Entries", "Initial", "Noise", "Sensor", "SubModel", "Transit
 
 R = TypeVar("R", bound="SubModel")
 
+#: The methods that decide what a sub-model computes, and those that know its Jacobian.
+_COMPUTES = frozenset({"compute", "on_entries", "forward", "observe", "move", "features", "_run"})
+_JACOBIANS = ("jacobian", "linearised", "gradient", "move_and_gradient")
+
 #: Tensors by unravelled key: what a step of a filter works on.
 Entries: TypeAlias = dict[NestedKey, Tensor]
 #: The noise of one call of a sub-model: one tensor, several by name, or ``None`` for the deterministic forward.
@@ -103,12 +107,17 @@ class SubModel(Checked, TensorDictModule):
 
     else:
         noise_names = ()
+    tangents_of: tuple[Space, Space] | None = None
     _wants: frozenset[str] = frozenset()
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
         # tensordict wraps every __init__ and so must come first; what compute asks for is looked up once a class.
         cls._wants = frozenset({"noise", "batch_size"} & inspect.signature(cls.compute).parameters.keys())
+        if vars(cls).keys().isdisjoint(_JACOBIANS) and not _COMPUTES.isdisjoint(vars(cls)):
+            # What is inherited is that of another function.
+            for name in ("jacobian", "linearised"):
+                setattr(cls, name, getattr(SubModel, name))
 
     def __init__(
         self,
@@ -134,6 +143,27 @@ class SubModel(Checked, TensorDictModule):
                 ``noise_names``, for ``noise``: what :meth:`draw_noise` drew, or ``None`` for the deterministic forward.
         """
         raise TypeError(f"{type(self).__name__} has no compute(): write it, see SubModel.")
+
+    def jacobian(self, *values: Any) -> tuple[Tensor, Tensor] | None:
+        """Returns what :meth:`compute` does without noise, and its Jacobian by what it reads first, if it is known.
+
+        Otherwise automatic differentiation finds it, which takes ten times as long. A subclass that writes a new
+        :meth:`compute` or the like, and no new Jacobian, has none.
+
+        Args:
+            *values: as :meth:`compute` takes them, of which the first are states ``[*B, E, S]``.
+
+        Returns:
+            The result ``[*B, E, N]``, and the Jacobian ``[*B, E, N, S]``, or ``[N, S]`` if it is constant; between
+            tangents where the sub-model has ``tangents_of``, the spaces of what it reads and writes. ``None`` where it
+            is not known.
+        """
+        return None
+
+    def linearised(self, entries: Entries, call: Call) -> tuple[Entries, Tensor, tuple[Space, Space] | None] | None:
+        """Returns what :meth:`on_entries` does, the :meth:`jacobian`, and between whose tangents it leads, if known."""
+        found = self.jacobian(*self.values(entries))
+        return None if found is None else ({self.out_keys[0]: found[0]}, found[1], self.tangents_of)
 
     def draw_noise(
         self,

@@ -155,7 +155,7 @@ def library_rows(
         yield scored(IMU, kind, attitude_filter(kind, gyro, up_noise), **up)
     learns = attitude_filter("EKF", gyro, learned)
     yield scored(IMU, "EKF, learned noise", learns)
-    significance = {"localisation": "significance"}
+    significance = {"localisation": "significance", "threshold": 3.0}
     for members in (32,) if smoke else (32, 64):
         for label, options in (("", {}), (", significance", significance)):
             model = attitude_filter("etkf", gyro, up_noise, members=members, **options)

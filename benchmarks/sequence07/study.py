@@ -205,7 +205,7 @@ def main() -> None:
     if study.ukf:
         models.append(("UKF", "UKF", "", {}))
     for members, smoother in ((32, ""), (64, "EnRTS, 64 members")):
-        options = {"members": members, "localisation": "significance"}
+        options = {"members": members, "localisation": "significance", "threshold": 3.0}
         models.append((f"DEnKF, {members} members", "DEnKF", smoother, options))
     for row, path in alone(study, data, poses, count):
         rows.append(row)

@@ -28,6 +28,7 @@ PAIRS = (
     "against_dapper",
     "against_floor",
     "packaged_step",
+    "one_row",
     "training_step",  # and these are commands of their own
     "transform_cost",
     "scaling",

@@ -13,7 +13,7 @@ from torch_denkf.baselines import BackpropKF
 from torch_denkf.filters import EKF, UKF, DEnKF, ParticleFilter
 from torch_denkf.functional.manifolds import SO3, Circle, Euclidean, Opposite, Product
 from torch_denkf.fusion import FusedFilter, FusedSensor
-from torch_denkf.imperfect import FadingBias, Visibility
+from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
@@ -426,8 +426,6 @@ def test_what_does_not_fit_is_refused():
     sensor = FusedSensor(Orientation(), R, reading_space=SO3(), sensor_error=plain["sensor_error"])
     with pytest.raises(ValueError, match=error):
         FusedFilter(Turning(), {"pose": sensor}, initial=around, process_noise=[0.1] * 7)
-    with pytest.raises(TypeError, match="EKFAnalysis is on a space"):
-        make("EKF", visibility=Visibility(3, encoding_key="pose"))
 
 
 # --------------------------------------------------------------------------------------------- several in one update

@@ -256,3 +256,18 @@ def test_noise_of_each_reading_in_every_way_to_run(float64, covariance):
     without = filter.step(filter.initialise(rows[0].copy()).update(left_out), without=["pose"])
     assert not without["info", "nis"].any()
     assert whole["info", "nis"][1] > 0
+
+
+def test_a_sensor_that_drives_and_makes_no_rows_is_a_mean_over_each_step():
+    """Of a line its mean is that of the middle of each step; without, all 100 messages are rows."""
+    log = [(0.01 * k, "imu", [0.03 * k]) for k in range(101)]
+    log += [(0.25 * k, "gps", [1.0]) for k in range(1, 5)]
+    assert len(message_rows(log, driving=["imu"])) > 100
+    rows = message_rows(log, driving=["imu"], rows_of=["gps"], start=0.0, dtype=torch.float64)
+    torch.testing.assert_close(rows["stamp"][:, 0], 0.25 * torch.arange(5, dtype=torch.float64))
+    torch.testing.assert_close(rows["imu"][1:, 0], 3 * (0.25 * torch.arange(4, dtype=torch.float64) + 0.125))
+    assert rows["gps_observed"][:, 0].tolist() == [False, True, True, True, True]
+    with pytest.raises(ValueError, match=r"rows_of=\['imu'\] leaves out \['gps'\], which do not drive"):
+        message_rows(log, driving=["imu"], rows_of=["imu"])
+    with pytest.raises(KeyError, match=r"rows_of names \['lidar'\]"):
+        message_rows(log, driving=["imu"], rows_of=["gps", "lidar"])

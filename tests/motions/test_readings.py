@@ -3,10 +3,13 @@
 import mujoco
 import pytest
 import torch
+from tensordict import TensorDict
 from torch.testing import assert_close
 
 from tests.motions.steps_for_tests import INERTIAL, observe, random_points
 from torch_denkf.functional.manifolds import SE2, SE3, SE23, SO3, Circle, Euclidean, Product, rotation_matrix
+from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.modules import LearnedTransition, MomentPrior
 from torch_denkf.motions import Gravity, Magnetic, PoseOf, PositionInBody, RangeBearing
 
 LANDMARKS = [[1.0, 2.0, 3.0], [-4.0, 5.0, 6.0]]
@@ -106,7 +109,9 @@ def test_the_jacobian_is_that_of_differences(float64, make):
         (lambda: PositionInBody(SO3(), [1.0, 2.0, 3.0]), "PositionInBody reads a part"),
         (lambda: PositionInBody(SE3(), [1.0, 2.0]), r"landmark is \[3\] or \[2, 3\]; got \[2\]"),
         (lambda: RangeBearing(SE3(), [1.0, 2.0, 3.0]), "RangeBearing reads a part"),
-        (lambda: RangeBearing(SE2(), [[1.0, 2.0]]), r"landmark is one, \[2\]"),
+        (lambda: RangeBearing(SE2(), [[1.0, 2.0, 3.0]]), r"landmark is \[2\] or \[1, 2\]"),
+        (lambda: RangeBearing(SE2()), "takes landmark=, or landmark_key="),
+        (lambda: RangeBearing(SE2(), [1.0, 2.0], landmark_key="post"), "takes landmark=, or landmark_key="),
         (lambda: PositionInBody(SE2(), [1.0, float("nan")]), "landmark must be finite"),
     ],
 )
@@ -123,3 +128,51 @@ def test_a_part_begins_behind_the_points_of_those_before_it(space):
     assert observe(PoseOf(space, part=len(space.parts) - 1), state).equal(pose)
     expected = observe(PositionInBody(SE2(), [3.0, 4.0]), pose)
     assert observe(PositionInBody(space, [3.0, 4.0], part=len(space.parts) - 1), state).equal(expected)
+
+
+@pytest.mark.parametrize("kind", [PositionInBody, RangeBearing])
+def test_landmarks_that_stand_in_the_data(float64, kind):
+    """Each row reads its own ones, as the same landmarks given as constants are read."""
+    pose, posts = torch.randn(5, 4, 3), torch.randn(5, 6)
+    key = ("forecast", "observation")
+    td = TensorDict({("forecast", "ensemble"): pose, "posts": posts}, [5])
+    found = kind(SE2(), landmark_key="posts", count=3)(td)[key]
+    for row in range(5):
+        one = TensorDict({("forecast", "ensemble"): pose[row]})
+        assert_close(kind(SE2(), posts[row].reshape(3, 2))(one)[key], found[row])
+    with pytest.raises(ValueError, match=r"'posts' is \[\*B, 4\], 2 landmarks of 2 numbers; got \[5, 6\]"):
+        kind(SE2(), landmark_key="posts", count=2)(td)
+
+
+def test_a_robot_that_recognises_landmarks(float64):
+    """Filters of one landmark a row by its entry, and of all with a mask, believe the same, and find the robot."""
+    posts = torch.tensor([[4.0, 0.0], [0.0, 5.0], [-3.0, -2.0]])
+    true, noise = torch.tensor([0.4, 0.5, -0.3]), [0.1, 0.02]
+    seen = RangeBearing(SE2(), posts)(TensorDict({("forecast", "ensemble"): true.unsqueeze(0)}))
+    seen = seen["forecast", "observation"].reshape(3, 2)
+    which = torch.arange(12) % 3
+    data = TensorDict({"each": seen[which], "post": posts[which], "all": seen.reshape(1, 6).expand(12, 6)}, [12])
+    data["all_observed"] = torch.nn.functional.one_hot(which, 3).bool().repeat_interleave(2, -1)
+    data["each_observed"] = torch.ones(12, 1, dtype=torch.bool)
+    initial = MomentPrior(torch.zeros(3), torch.eye(3), space=SE2())
+    still = LearnedTransition(torch.nn.Identity(), residual=False)
+    means = []
+    for name, model, deviations in (
+        ("each", RangeBearing(SE2(), landmark_key="post"), noise),
+        ("all", RangeBearing(SE2(), posts), noise * 3),
+    ):
+        sensor = FusedSensor(model, deviations, reading_space=model.reading_space)
+        filter = FusedFilter(still, {name: sensor}, initial=initial, process_noise=[1e-3] * 3)
+        means.append(filter.sequence(data.clone())["belief", "mean"])
+    assert_close(means[0], means[1])
+    assert_close(means[0][-1], true, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("kind", [PositionInBody, RangeBearing])
+def test_the_jacobian_of_landmarks_that_stand_in_the_data(float64, kind):
+    """Against differences along the tangents of the pose."""
+    model, pose, posts = kind(SE2(), landmark_key="posts", count=2), torch.randn(1, 3), torch.randn(4)
+    _, matrix = model.jacobian(pose, posts)
+    steps = 1e-6 * torch.eye(3)
+    ahead, behind = (model.compute(SE2().plus(pose, sign * steps), posts) for sign in (1, -1))
+    assert_close(matrix[0], (ahead - behind).T / 2e-6, rtol=0, atol=1e-7)

@@ -22,6 +22,7 @@ _EXTRAS = {
     "plots": (("matplotlib", "PIL"), "pictures"),
     "examples": (("matplotlib", "tensorboard"), "the example programs"),
     "lerobot": (("pyarrow", "av"), "LeRobot recordings"),
+    "ros": (("rosbags", "yaml"), "ROS bags and settings"),
     "onnx": (("onnx", "onnxscript", "onnxruntime"), "steps as ONNX models"),
     "ray": (("ray",), "collection over machines"),
 }

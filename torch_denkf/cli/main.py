@@ -13,6 +13,7 @@ __all__ = ["commands", "main"]
 
 _OWN = {
     "info": ("torch_denkf.cli.info:Info", "versions, devices, OpenGL, cache, optional extras"),
+    "log": ("torch_denkf.cli.log:Log", "what is in a log: streams, rates, gaps, units, delays"),
     "cache": ("torch_denkf.cli.cache:Cache", "list, check or clear what is kept of earlier runs"),
 }
 

@@ -11,6 +11,7 @@ from torch_denkf.compilation.captured import CapturedSteps as CapturedSteps
 from torch_denkf.compilation.captured import strategy as strategy
 from torch_denkf.compilation.compared import refuse_other_numbers as refuse_other_numbers
 from torch_denkf.compilation.compiled import CompiledSteps as CompiledSteps
+from torch_denkf.compilation.in_time import rts_in_time as rts_in_time
 from torch_denkf.compilation.libraries import clear_damaged_libraries as clear_damaged_libraries
 from torch_denkf.compilation.libraries import clear_full_cache as clear_full_cache
 from torch_denkf.compilation.options import need_compiler as need_compiler

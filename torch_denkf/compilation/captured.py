@@ -15,7 +15,8 @@ from torch.autograd.function import once_differentiable
 
 from torch_denkf._checks import check_count
 from torch_denkf.compilation.compared import placed, put_back, tensors
-from torch_denkf.compilation.compiled import CompiledSteps
+from torch_denkf.compilation.compiled import CompiledSteps, of_one_kind
+from torch_denkf.compilation.in_time import InTime
 from torch_denkf.filters.scan import Steps
 from torch_denkf.filters.structure import Structure
 from torch_denkf.submodel import Call, Entries
@@ -89,7 +90,7 @@ class CapturedSteps(CompiledSteps):
     A number that is no tensor, such as an inflation, is the one of the recording.
 
     Args:
-        chunk: steps of a sequence in one graph; ``None`` for all. What is left over is a graph, too.
+        chunk: steps of a sequence in one graph; ``None`` for all.
         options: ``mode="graph"``; with others of ``torch.compile``, it compiles one step, and graphs hold that.
     """
 
@@ -107,8 +108,8 @@ class CapturedSteps(CompiledSteps):
     def _compiler_options(self) -> dict | None:
         return {name: value for name, value in self.options.items() if name != "mode"} or None
 
-    def _length(self, left: int) -> int:
-        return min(self.chunk or left, left)
+    def _length(self, count: int) -> int:
+        return min(self.chunk or count, count)
 
     def _made(self, make: partial, steps: Steps, device: torch.device) -> Callable:
         if device.type != "cuda" and self.recorder is CudaRecorder:
@@ -161,7 +162,7 @@ class StepByStep(NamedTuple):
         """Takes one step after the other, all of one kind: where one may reset rows, each may."""
         time, outputs = len(call.batch_size), []
         for t, cut in enumerate(cuts):
-            carry = {key: _of_one_kind(value.detach() if cut else value) for key, value in carry.items()}
+            carry = {key: of_one_kind(value.detach() if cut else value) for key, value in carry.items()}
             reset, start = resets, starts
             if resets is not None:
                 may = t < resets.shape[time]
@@ -172,12 +173,6 @@ class StepByStep(NamedTuple):
                 carry, out = self.compiled.scan(self.steps, carry, now, call, reset, start, (False,), keep)
             outputs.append(out)
         return carry, {key: torch.cat([out[key] for out in outputs], time) for key in keep}
-
-
-def _of_one_kind(value: Tensor) -> Tensor:
-    """Lays a belief out as any step's, with a gradient as any step's: torch.compile compiles again for another."""
-    free = torch.is_grad_enabled() and value.is_floating_point() and not value.requires_grad
-    return (value.detach().requires_grad_() if free else value).contiguous()
 
 
 def _at(entries: Entries, time: int, t: int) -> Entries:
@@ -393,12 +388,12 @@ def _warn_of(waits: Sequence[str], what: str) -> None:
     )
 
 
-def strategy(chunk: int | None, options: dict[str, Any]) -> CompiledSteps:
+def strategy(chunk: int | None, options: dict[str, Any]) -> CompiledSteps | InTime:
     """Returns the strategy that :meth:`torch_denkf.filters.Filter.compile` asks for.
 
     Args:
         chunk: steps of a sequence in one graph; ``None`` for the strategy's default.
-        options: of ``torch.compile``, or ``mode="graph"``.
+        options: of ``torch.compile``, or ``mode="graph"``, or ``mode="in time"``.
 
     Raises:
         ValueError: if ``chunk`` is no number of steps.
@@ -407,4 +402,6 @@ def strategy(chunk: int | None, options: dict[str, Any]) -> CompiledSteps:
         check_count("chunk", chunk, least=0, cure="It is a number of steps, or 0 for none")
     if options.get("mode") == "graph":
         return CapturedSteps(chunk, options)
+    if options.get("mode") == "in time":
+        return InTime(options)
     return CompiledSteps(4 if chunk is None else chunk, options)

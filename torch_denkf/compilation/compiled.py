@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
+from threading import Timer
 from types import FunctionType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,7 +24,11 @@ from torch_denkf.submodel import Call, Entries
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
 
-__all__ = ["CompiledSteps"]
+__all__ = ["CompiledSteps", "filled", "of_one_kind"]
+
+_LOG = logging.getLogger("torch_denkf")
+#: Seconds of silence of a first call.
+PATIENCE = 2.0
 
 #: Where an episode goes on, among the names of what a chunk takes. It is compared like a frame's mask: where the first
 #: call resets all rows, nothing of the transition would show.
@@ -74,29 +81,37 @@ class CompiledSteps:
 
     def scan(self, steps: Steps, carry, inputs, call: Call, resets, starts, cuts, keep) -> tuple[Entries, Entries]:
         """Returns what :meth:`Steps.scan` does, in chunks; all noise is among the inputs."""
-        time, count, batch = len(call.batch_size), len(cuts), call.batch_size
-        keys, start_keys = tuple(inputs), tuple(starts)
-        carry, outputs, begin = tuple(carry.values()), [], 0
-        while begin < count:
-            length = self._length(count - begin)
-            here = tuple(cuts[begin : begin + length])
-            now = tuple(inputs[key].narrow(time, begin, length) for key in keys)
-            marked = max(0, min(length, resets.shape[time] - begin))
-            goes_on = ~resets.narrow(time, begin, marked) if marked else None
-            now_starts = tuple(value.narrow(time, begin, marked) for value in starts.values()) if marked else ()
-            kind = ("chunk", marked, keys, start_keys, batch, here, keep)
+        time, batch, count = len(call.batch_size), call.batch_size, len(cuts)
+        keys, start_keys, length = tuple(inputs), tuple(starts), self._length(count)
+        whole, named = count, {**inputs}
+        if resets is not None:
+            # One graph for all chunks: each step may reset rows, and what is left over is a chunk whose last steps are
+            # of no use. They begin anew, so that no number of theirs grows without bound.
+            whole = -(-count // length) * length
+            named |= {
+                _GOES_ON: filled(~resets, time, count, True),
+                **{("start", key): value for key, value in starts.items()},
+            }
+        cuts = (*cuts, *[False] * (whole - count))
+        pieces = [_pieces(value, time, length, whole, name == _GOES_ON) for name, value in named.items()]
+        names = (*steps.structure.carry, *keys, *(() if resets is None else (_GOES_ON, *start_keys)))
+        writes, carry, outputs = (*steps.structure.carry, *keep), tuple(map(of_one_kind, carry.values())), []
+        for number, now in enumerate(zip(*pieces, strict=True)):
+            here = cuts[number * length : (number + 1) * length]
             make = partial(_chunk, steps, keys, start_keys, keep, batch, here)
-            names = (*steps.structure.carry, *keys, *((_GOES_ON, *start_keys) if marked else ()))
-            given, writes = (carry, now, goes_on, now_starts), (*steps.structure.carry, *keep)
-            carry, values = self._call(kind, steps, make, given, names, writes)
+            mark, *begins = now[len(keys) :] or (None,)
+            given = (carry, now[: len(keys)], mark, tuple(begins))
+            carry, values = self._call(
+                ("chunk", keys, start_keys, batch, here, keep), steps, make, given, names, writes
+            )
             outputs.append(values)
-            begin += length
-        whole = outputs[0] if len(outputs) == 1 else [torch.cat(parts, time) for parts in zip(*outputs, strict=True)]
-        return dict(zip(steps.structure.carry, carry, strict=True)), dict(zip(keep, whole, strict=True))
+        joined = outputs[0] if len(outputs) == 1 else [torch.cat(parts, time) for parts in zip(*outputs, strict=True)]
+        out = (value.narrow(time, 0, count) if whole > count else value for value in joined)
+        return dict(zip(steps.structure.carry, carry, strict=True)), dict(zip(keep, out, strict=True))
 
-    def _length(self, left: int) -> int:
-        """Returns the number of steps in the next graph of a sequence."""
-        return self.chunk if left >= self.chunk else 1
+    def _length(self, count: int) -> int:
+        """Returns the number of steps in each graph of a sequence of ``count``."""
+        return self.chunk
 
     def _call(self, kind: tuple, steps: Steps, make: partial, inputs: tuple, names: tuple, writes: tuple) -> tuple:
         """Runs the compiled function of a kind; on a miss, compiles it and compares it with the eager one.
@@ -120,20 +135,24 @@ class CompiledSteps:
         function, compared = self._functions[kind]
         mode = torch.is_grad_enabled(), some.dtype  # torch.compile compiles again for each
         if mode not in compared and self._checked(device) and has_values(some):
-            refuse_other_numbers(
-                function,
-                make(),
-                inputs,
-                names=names,
-                outputs=writes,
-                frames=_frames(steps, names),
-                # Who records gradients of single steps seldom wants them; a backward pass takes as long to compile.
-                parameters=None if kind[0] == "step" else _parameters(steps),
-                state=[value for _, module in steps.structure.modules for value in module.buffers()],
-                what=f"{self.made} {'step' if kind[0] == 'step' else 'sequence'}",
-                cure=self.cure,
-                maker=self.maker,
-            )
+            what = f"{self.made} {'step' if kind[0] == 'step' else 'sequence'}"
+            with said_when_long(
+                f"The {what} of the filter is made: once for each kind of call, and for later processes."
+            ):
+                refuse_other_numbers(
+                    function,
+                    make(),
+                    inputs,
+                    names=names,
+                    outputs=writes,
+                    frames=_frames(steps, names),
+                    # Who records gradients of single steps seldom wants them; a backward pass takes long to compile.
+                    parameters=None if kind[0] == "step" else _parameters(steps),
+                    state=[value for _, module in steps.structure.modules for value in module.buffers()],
+                    what=what,
+                    cure=self.cure,
+                    maker=self.maker,
+                )
             compared.add(mode)
         out = function(*inputs)
         return placed(out, (value.clone() for value in tensors(out))) if self._overwrites(device) else out
@@ -187,6 +206,46 @@ class BoundSteps(NamedTuple):
     def scan(self, *args: Any) -> tuple[Entries, Entries]:
         """Takes one step after the other, see :meth:`torch_denkf.filters.scan.Steps.scan`."""
         return self.compiled.scan(self.steps, *args)
+
+
+@contextmanager
+def said_when_long(text: str) -> Iterator[None]:
+    """Logs what is done where it takes longer than :data:`PATIENCE` seconds."""
+    timer = Timer(PATIENCE, _LOG.warning, (text,))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def of_one_kind(value: Tensor) -> Tensor:
+    """Lays a belief out as any step's, with a gradient as any step's: torch.compile compiles again for another."""
+    free = torch.is_grad_enabled() and value.is_floating_point() and not value.requires_grad
+    return _laid_out(value.detach().requires_grad_() if free else value)
+
+
+def _laid_out(value: Tensor) -> Tensor:
+    """In the order of its dimensions, for the same reason; dimensions along which nothing changes take no memory."""
+    return value if 0 in value.stride() else value.contiguous().view(value.shape)
+
+
+def _pieces(value: Tensor, time: int, length: int, whole: int, mark: bool) -> Sequence[Tensor]:
+    """Splits a value ``[*B, T, ...]`` into chunks, all laid out alike, however long the sequence is."""
+    value = filled(value, time, whole, False if mark else None)
+    if 0 not in value.stride():
+        value = _laid_out(value.movedim(time, 0)).movedim(0, time)
+    return value.split(length, time)
+
+
+def filled(value: Tensor, time: int, count: int, fill: bool | None = None) -> Tensor:
+    """Continues a value ``[*B, T, ...]`` to ``count`` steps, with its last one where it is not said what with."""
+    lack = count - value.shape[time]
+    if lack <= 0:
+        return value
+    last = value.narrow(time, -1, 1) if fill is None else torch.full_like(value.narrow(time, 0, 1), fill)
+    return torch.cat([value, last.expand(*last.shape[:time], lack, *last.shape[time + 1 :])], time)
 
 
 def _frames(steps: Steps, names: tuple) -> list[NestedKey]:

@@ -34,6 +34,8 @@ def options_for_processors() -> dict[str, Any]:
                 "post_grad_custom_post_pass": FewCalls(),
                 "_post_fusion_custom_pass": ShortFunctions(),
                 "guard_filter_fn": worth_checking,
+                # Otherwise ten programs are compiled to see what the compiler knows of this processor.
+                "cpp.vec_isa_ok": True,
             }
         except ImportError as error:
             reason = f"could not be imported ({error})"

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch_denkf.data.video import EXTRA
 
-__all__ = ["read_parquet"]
+__all__ = ["parquet_names", "read_parquet"]
 
 MOST_ROWS = 10**8
 MOST_BYTES, MOST_RATIO = 1 << 30, 64  # more than so many bytes may not be more than so many times the file
@@ -39,6 +39,14 @@ def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
             return opened.read(None if columns is None else list(columns))
     except (arrow.ArrowException, OSError) as error:
         raise ValueError(f"{file} is no complete parquet file ({error}); download or copy it anew") from error
+
+
+def parquet_names(file: Path) -> list[str]:
+    """Names of the columns of a parquet file; raises as :func:`read_parquet`."""
+    read_parquet(file, [])
+    import pyarrow.parquet as parquet
+
+    return list(parquet.read_schema(file).names)
 
 
 def _refuse_bombs(file: Path, metadata: Any) -> None:

@@ -21,6 +21,7 @@ __all__ = [
     "look_at_numbers",
     "look_at_repeats",
     "look_at_times",
+    "repeats",
     "warn_of_log",
 ]
 
@@ -37,6 +38,7 @@ _FEW = 0.02  # a share of stamps: if more go back, nobody has sorted them
 _ENOUGH = 100  # steps from which on their distribution is judged
 _TINY, _SHORT, _WIDE = 0.01, 0.05, 6.0  # mean steps: of bursts, there are many below the one, and some above the other
 _RESOLVED = 20  # steps of a column have at least so many steps of its dtype
+_NONE = 1e-12  # of a number: moves below are rounding of float64
 _READERS = ("torch_denkf", "torchrl", "tensordict")  # torchrl's data sets are made by a function of its own
 
 
@@ -157,7 +159,7 @@ def look_at_numbers(
     for column, name in zip(values.T, columns, strict=True):
         column = column[np.isfinite(column)]
         moves = np.abs(np.diff(column))
-        moves = moves[moves > 0]
+        moves = moves[moves > _NONE * np.abs(column).max(initial=0.0)]
         if not len(moves):
             continue
         tensor = torch.from_numpy(np.ascontiguousarray(column))
@@ -199,7 +201,7 @@ def look_at_repeats(values: np.ndarray, columns: Sequence[str], place: object) -
         >>> print(str(said[0].message)[:75])
         run1.csv: 'north' repeats its last reading in 80 % of the rows, and each ro
     """
-    slow = [name for column, name in zip(values.T, columns, strict=True) if _repeats(column)]
+    slow = [name for column, name in zip(values.T, columns, strict=True) if repeats(column)]
     if not slow:
         return
     kept = 1 + int((np.diff(values[:, [name in slow for name in columns]], axis=0) != 0).any(1).sum())
@@ -217,7 +219,8 @@ def look_at_repeats(values: np.ndarray, columns: Sequence[str], place: object) -
     )
 
 
-def _repeats(column: np.ndarray) -> bool:
+def repeats(column: np.ndarray) -> bool:
+    """Tells whether a column repeats its last reading until the next one comes."""
     moves = np.diff(column)
     changes = np.flatnonzero(moves)
     if len(changes) < 5 or np.median(np.diff(changes)) < 2:

@@ -321,7 +321,7 @@ class Filter(Checked, TensorDictSequential):
     def compile(self, *, chunk: int | None = None, **options) -> Filter:
         """From now on runs steps, and sequences in chunks of steps, through ``torch.compile``.
 
-        The first call of each kind (chunk, batch size, with or without gradients) compiles, later ones reuse that;
+        The first call of each kind (batch size, with or without gradients) compiles, later ones reuse that;
         copies and pickles of the filter compile again. Noise is drawn outside: a seed gives what it gives eagerly, up
         to rounding. Some calls stay eager: :meth:`predict`; ``step(without=...)``; in a policy, steps in which rows may
         reset.
@@ -335,10 +335,13 @@ class Filter(Checked, TensorDictSequential):
         that is no tensor, such as an inflation, stays the one of the recording; on a processor it warns, and runs
         eagerly. With further options, such as ``backend="inductor"``, one step is compiled, and the graphs hold that.
 
+        ``mode="in time"`` compiles nothing: a :class:`~torch_denkf.filters.KalmanFilter` then takes all times of a
+        sequence at once, in the order of log2 T calls. From some hundred rows on that is 25 to 50 times faster.
+
         Args:
-            chunk: steps of a sequence in one compiled graph, 4 by default. What is left over after whole chunks runs
-                step by step. A small chunk compiles sooner, a large one runs faster. 0 goes back to eager. With
-                ``mode="graph"`` by default all steps are in one.
+            chunk: steps of a sequence in one compiled graph, 4 by default; one graph serves sequences of any length. A
+                small chunk compiles sooner, a large one runs faster. 0 goes back to eager. With ``mode="graph"`` by
+                default all steps are in one.
             **options: of ``torch.compile``. Without any, inductor on a processor writes what calls its kernels in C++,
                 too, makes fewer calls, and saves fewer tensors for the backward pass, which takes longer to compile and
                 about 40 % less to run; ``backend="inductor"`` alone leaves that out. On a GPU

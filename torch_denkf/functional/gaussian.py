@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from torch_denkf._checks import check_observed, check_one_dtype, check_shape, check_shapes
 from torch_denkf.functional.kernels.small_system import WrittenOut, is_written_out
@@ -69,7 +70,7 @@ def kalman_predict(mean: Tensor, cov: Tensor, transition: Tensor, noise: Tensor)
             ("transition", transition, square if transition.ndim == 2 else cov.shape, "[S, S] or [*B, S, S]"),
             ("noise", noise, square if noise.ndim == 2 else cov.shape, "[S, S] or [*B, S, S]"),
         )
-    return _apply(transition, mean), transition @ cov @ transition.mT + noise
+    return _apply(transition, mean), sandwich(transition, cov) + noise
 
 
 def kalman_update(
@@ -109,23 +110,41 @@ def kalman_update(
         >>> update.mean, update.cov
         (tensor([1.]), tensor([[0.5000]]))
     """
-    _check_update(mean, cov, observation, observation_matrix, noise)
-    batch, state_dim, dim = mean.shape[:-1], mean.shape[-1], observation.shape[-1]
-    if noise.ndim == mean.ndim:
-        noise = as_covariance(noise, mean)
+    check_update(mean, cov, observation, observation_matrix, noise)
+    innovation = observation - _apply(observation_matrix, mean)
+    update = innovation_update(cov, innovation, observation_matrix, noise, observed=observed)
+    return update._replace(mean=mean + update.mean)
+
+
+def innovation_update(
+    cov: Tensor, innovation: Tensor, observation_matrix: Tensor, noise: Tensor, *, observed: Tensor | None = None
+) -> GaussianUpdate:
+    """Does what :func:`kalman_update` does for a prior mean of zero; of what it takes the mask alone is checked.
+
+    In deviations from the mean H m costs no digits where the state is far from zero.
+    """
+    batch, dim = innovation.shape[:-1], innovation.shape[-1]
+    if noise.ndim == innovation.ndim:
+        noise = as_covariance(noise, innovation)
+    noise = noise.to(cov.dtype)
     count: int | Tensor = dim
     if observed is not None:
-        observed, noise, count = hide(observed, noise.to(mean.dtype), (*batch, dim))
-        observation = torch.where(observed, observation, 0)
+        observed, noise, count = hide(observed, noise, (*batch, dim))
+        innovation = torch.where(observed, innovation, 0)
         observation_matrix = torch.where(observed.unsqueeze(-1), observation_matrix, 0)
 
-    cross = observation_matrix @ cov  # HP
-    innovation = observation - _apply(observation_matrix, mean)
-    gain, nis, log_det = solve_for_gain(cross @ observation_matrix.mT + noise, cross, innovation)
-    keep = torch.eye(state_dim, dtype=mean.dtype, device=mean.device) - gain @ observation_matrix
-    cov = keep @ cov @ keep.mT + gain @ noise @ gain.mT
+    p, h, r = cov, observation_matrix.expand(*batch, dim, cov.shape[-1]), innovation.unsqueeze(-1)
+    if len(batch) != 1:  # a product of batches with one dimension costs a third of any other
+        p, h, r, noise = (value.reshape(-1, *value.shape[-2:]) for value in (p, h, r, noise.expand(*batch, dim, dim)))
+    cross = torch.bmm(h, p)
+    gain, nis, log_det = solve_for_gain(torch.bmm(cross, h.mT) + noise, cross, r.squeeze(-1))
+    keep = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device) - torch.bmm(gain, h)
+    new = torch.bmm(torch.bmm(keep, p), keep.mT) + torch.bmm(torch.bmm(gain, noise), gain.mT)
+    mean, new = torch.bmm(gain, r).squeeze(-1), (new + new.mT) / 2
+    if len(batch) != 1:
+        mean, new, nis, log_det = (value.reshape(*batch, *value.shape[1:]) for value in (mean, new, nis, log_det))
     log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
-    return GaussianUpdate(mean + _apply(gain, innovation), (cov + cov.mT) / 2, innovation, nis, log_likelihood)
+    return GaussianUpdate(mean, new, innovation, nis, log_likelihood)
 
 
 def hide(observed: Tensor, noise: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
@@ -146,12 +165,13 @@ def hide(observed: Tensor, noise: Tensor, shape: Sequence[int]) -> tuple[Tensor,
     return observed, noise, observed.sum(-1, keepdim=True, dtype=noise.dtype)
 
 
-def _check_update(mean: Tensor, cov: Tensor, observation: Tensor, matrix: Tensor, noise: Tensor) -> None:
+def check_update(mean: Tensor, cov: Tensor, observation: Tensor, matrix: Tensor, noise: Tensor) -> None:
+    """Raises where what :func:`kalman_update` takes does not fit."""
     batch, size, dim = mean.shape[:-1], mean.shape[-1:], observation.shape[-1:]
     noise_shape = (*batch, *dim) if noise.ndim == mean.ndim else (*batch, *dim, *dim)
     plain = mean.dtype == cov.dtype == observation.dtype == matrix.dtype == noise.dtype
-    fits = observation.shape == (*batch, *dim) and matrix.shape == (*dim, *size) and noise.shape == noise_shape
-    if plain and fits and size and cov.shape == (*batch, *size, *size):
+    fits = observation.shape == (*batch, *dim) and matrix.shape[-2:] == (*dim, *size) and noise.shape == noise_shape
+    if plain and fits and size and cov.shape == (*batch, *size, *size) and matrix.shape[:-2] in ((), batch):
         return
     check_one_dtype(mean=mean, cov=cov, observation=observation, observation_matrix=matrix)
     _check_moments(mean, cov, noise)
@@ -193,7 +213,15 @@ def gaussian_log_prob(value: Tensor, mean: Tensor, cov: Tensor) -> Tensor:
 
 
 def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+    return F.linear(vector, matrix) if matrix.ndim == 2 else (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def sandwich(matrix: Tensor, cov: Tensor) -> Tensor:
+    """Returns M P Mᵀ for M ``[N, S]`` or ``[*B, N, S]`` and P ``[*B, S, S]``."""
+    if cov.ndim != 3:
+        return matrix @ cov @ matrix.mT
+    matrix = matrix.expand(len(cov), *matrix.shape[-2:])
+    return torch.bmm(torch.bmm(matrix, cov), matrix.mT)
 
 
 def solve_for_gain(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -207,6 +235,10 @@ def solve_for_gain(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Ten
     Returns:
         Cᵀ M⁻¹, ``[*B, S, O]``; rᵀ M⁻¹ r and log det M, ``[*B, 1]`` each. NaN where M is not positive definite.
     """
+    if matrix.shape[-1] == 1:
+        total = torch.where(matrix > 0, matrix, torch.nan)
+        of_one = total.squeeze(-1)
+        return cross.mT / total, residual.square() / of_one, of_one.log()
     solver = (WrittenOut if is_written_out(matrix) else Solver)(matrix)
     return solver.solve(cross).mT, solver.square(residual.unsqueeze(-1)), solver.log_det()
 

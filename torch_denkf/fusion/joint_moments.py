@@ -42,7 +42,7 @@ def _ends(mean: torch.Tensor, cov: torch.Tensor, count: int) -> tuple[torch.Tens
 
 def joint_space(space: Space | None, lag: int) -> Space | None:
     """That of the present and the last L states; ``None`` for plain numbers."""
-    return None if space is None else check_space("space", Repeated(space, lag + 1))
+    return space if space is None or not lag else check_space("space", Repeated(space, lag + 1))
 
 
 _MOMENTS = ("mean", "cov", "var")

@@ -22,6 +22,7 @@ def message_rows(
     messages: Iterable[Sequence[Any]],
     *,
     driving: Sequence[str] = (),
+    rows_of: Sequence[str] | None = None,
     delays: Mapping[str, float] | None = None,
     start: float | None = None,
     unit: Unit = "s",
@@ -46,6 +47,8 @@ def message_rows(
             row before, on straight lines between the messages, each of which counts for the moment of its stamp; before
             the first and behind the last it stays as it is there; a warning says where that, or a silence between two
             messages, is longer than twenty of its usual steps. Messages of them that are not finite are left out.
+        rows_of: sensors whose times are rows: all that do not drive, and of those that do the ones whose every message
+            is to be a step; by default all. A fast one that is left out is a mean over each longer step.
         delays: by how many seconds a sensor's stamps are later than what it saw, by name.
         start: time of the first row, in seconds; by default that of the first reading. What was read before is left
             out.
@@ -81,7 +84,8 @@ def message_rows(
     if unit not in SECONDS:
         raise ValueError(f"unit is one of {', '.join(map(repr, SECONDS))}, got {unit!r}")
     streams = _by_sensor(messages, unit)
-    for what, names in (("driving", driving), ("delays", delays or {}), ("origin", origin or {})):
+    given = {"driving": driving, "delays": delays or {}, "origin": origin or {}, "rows_of": rows_of or ()}
+    for what, names in given.items():
         unknown = [name for name in names if name not in streams]
         if unknown:
             raise KeyError(f"{what} names {unknown}, of which there is no message; there is {', '.join(streams)}.")
@@ -103,11 +107,14 @@ def message_rows(
     if start is not None and first > (last := max(stream.times[-1] for stream in streams.values())):
         raise ValueError(f"start={start!r} is behind the last message, {last:.15g} s: pass an earlier one, or unit=.")
     drives = {name: streams.pop(name).once(name) for name in dict.fromkeys(driving)}
+    if rows_of is not None and (silent := [name for name in streams if name not in rows_of]):
+        raise ValueError(f"rows_of={list(rows_of)} leaves out {silent}, which do not drive the motion: name them, too.")
     heard = {name: stream.since(first) for name, stream in streams.items()}
     _look_at_gaps({**heard, **drives}, unit)
     for name, drive in drives.items():
         _look_at_silence(name, drive.times, np.concatenate([[], *(stream.times for stream in heard.values())]))
-    events = [each.events() for each in (*heard.values(), *(drive.since(first) for drive in drives.values()))]
+    stepping = [drive.since(first) for name, drive in drives.items() if rows_of is None or name in rows_of]
+    events = [each.events() for each in (*heard.values(), *stepping)]
     moments, place = np.unique(np.concatenate(events), axis=0, return_inverse=True)
     times = np.concatenate([[first], moments[:, 0]])
     rows = {"stamp": times[:, None], "dt": np.diff(times, prepend=first)[:, None]}

@@ -12,10 +12,10 @@ from torch.nn import functional as F
 
 from torch_denkf._checks import check_mask
 from torch_denkf.functional.linalg import semidefinite_root
-from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.modules import ConstantNoise, LinearTransition, MappedNoise
 from torch_denkf.modules.around import Wrapper, passes_on
-from torch_denkf.running import check_module, marks_of, reads, run_module, writes
+from torch_denkf.running import check_module, linearise, marks_of, reads, run_module, writes
 from torch_denkf.submodel import Call, Entries, Sensor, SubModel, Update
 
 __all__ = ["JoinedObservation", "JoinedReading", "LinearMembers", "OfOwnErrors", "Renamed", "StateObservation"]
@@ -69,10 +69,25 @@ class OfOwnErrors(Wrapper):
 
     def on_entries(self, entries, call):
         """The predicted observations."""
+        key, state = self._seen(entries)
+        return self.run_inside({**entries, key: state}, call)
+
+    def linearised(self, entries, call):
+        """That of the model, and zeros by the errors of others."""
+        key, state = self._seen(entries)
+        found = linearise(self.module, {**entries, key: state}, call)
+        if found is None:
+            return None
+        written, matrix, sides = found
+        begin = state.shape[-1] - len(self.own)
+        whole = F.pad(matrix[..., :begin], (0, self.total))
+        return written, whole.index_add(-1, _places(self.own, begin, whole), matrix[..., begin:]), sides
+
+    def _seen(self, entries: Entries) -> tuple[NestedKey, Tensor]:
+        """The key and the value of what the sensor sees of the state."""
         key = unravel_key(self.in_keys[0])
         system, errors = self.required(entries, key).tensor_split([-self.total], -1)
-        state = torch.cat([system, errors[..., self.own]], -1)
-        return self.run_inside({**entries, key: state}, call)
+        return key, torch.cat([system, errors[..., self.own]], -1)
 
 
 class LinearMembers(SubModel):
@@ -96,6 +111,10 @@ class LinearMembers(SubModel):
         """The forecast."""
         moved = ensemble @ self.module.matrix.mT
         return moved if not action else moved + (action[0].to(moved.dtype) @ self.module.control.mT).unsqueeze(-2)
+
+    def jacobian(self, ensemble, *action):
+        """F."""
+        return self.compute(ensemble, *action), self.module.matrix
 
     def process_noise(self) -> TensorDictModuleBase:
         """Returns the module that writes Q."""
@@ -163,6 +182,7 @@ class StateObservation(Wrapper, Update):
             out_keys, optional_keys = [predicted_key, seen_key], optional_keys + ([late_key] if late_key else [])
         super().__init__(observation, in_keys, out_keys, optional_keys=optional_keys)
         self.delay, self.state_dim = delay, state_dim
+        self._in_key, self._out_key = self_made, unravel_key(observation.out_keys[0])
         keys = (ensemble_key, predicted_key, observed_key, age_key)
         self.ensemble_key, self.predicted_key, self.observed_key, self.age_key = map(unravel_key, keys)
         self.late_key = None if late_key is None else unravel_key(late_key)
@@ -179,8 +199,14 @@ class StateObservation(Wrapper, Update):
                 whole = torch.cat([states.unsqueeze(-2), self.required(entries, self.past_key)], -2)
             states, mask = self._of_its_time(whole, entries)
             written[unravel_key(self.out_keys[1])] = mask
-        key, out_key = unravel_key(self.module.in_keys[0]), unravel_key(self.module.out_keys[0])
-        return {self.predicted_key: self.run_inside({**entries, key: states}, call)[out_key], **written}
+        return {self.predicted_key: self.run_inside({**entries, self._in_key: states}, call)[self._out_key], **written}
+
+    def linearised(self, entries, call):
+        """That of the model, where it sees the present state alone."""
+        if self.state_dim is not None:
+            return None
+        found = linearise(self.module, {**entries, self._in_key: self.required(entries, self.ensemble_key)}, call)
+        return None if found is None else ({self.predicted_key: found[0][self._out_key]}, *found[1:])
 
     def seen(self, entries: Entries, call: Call) -> tuple[Tensor, Tensor | None]:
         """The predicted observations ``[*B, E, O]``, and the mask of what is observed, if there is one."""
@@ -239,13 +265,31 @@ class JoinedObservation(SubModel):
 
     def on_entries(self, entries, call):
         """The predicted observations, and the mask."""
-        predicted, masks = [], []
-        for (name, model), space in zip(self.module.items(), self.spaces, strict=True):
-            values, seen = model.seen(entries, call.part(name))
-            predicted.append(values)
+        pairs = [model.seen(entries, call.part(name)) for name, model in self.module.items()]
+        return self._joined([predicted for predicted, _ in pairs], [mask for _, mask in pairs])
+
+    def linearised(self, entries, call):
+        """Their Jacobians below each other, where all are of plain numbers."""
+        given = [linearise(model, entries, call) for model in self.module.values()]
+        found = [each for each in given if each is not None and is_flat(*each[2] or ())]
+        if len(found) < len(given):
+            return None
+        predicted = [
+            written[model.predicted_key] for (written, *_), model in zip(found, self.module.values(), strict=True)
+        ]
+        rows = [
+            matrix.expand(*values.shape, matrix.shape[-1])
+            for values, (_, matrix, _) in zip(predicted, found, strict=True)
+        ]
+        masks = [entries.get(model.observed_key) for model in self.module.values()]
+        return self._joined(predicted, masks), torch.cat(rows, -2), None
+
+    def _joined(self, predicted: list[Tensor], masks: Sequence[Tensor | None]) -> Entries:
+        seen = []
+        for values, mask, space in zip(predicted, masks, self.spaces, strict=True):
             like = values[..., 0, : None if space is None else space.tangent_dim]
-            masks.append(torch.ones_like(like, dtype=torch.bool) if seen is None else seen.expand(like.shape))
-        return self.by_key((torch.cat(predicted, -1), torch.cat(masks, -1)))
+            seen.append(torch.ones_like(like, dtype=torch.bool) if mask is None else mask.expand(like.shape))
+        return self.by_key((torch.cat(predicted, -1), torch.cat(seen, -1)))
 
 
 class JoinedReading(Sensor):
@@ -299,3 +343,7 @@ class JoinedReading(Sensor):
                 begin += noise.shape[-1]
             return torch.cat(readings, -1), torch.cat(noises, -2)
         return torch.cat(readings, -1), torch.cat(noises, -1)
+
+
+def _places(numbers: Sequence[int], begin: int, like: Tensor) -> Tensor:
+    return torch.tensor([begin + number for number in numbers], device=like.device)

@@ -1,10 +1,12 @@
-"""Imperfect sensors: occlusion, coloured errors, readings that cannot be true."""
+"""Imperfect sensors: occlusion, coloured errors, outliers, readings that cannot be true."""
 
 from torch_denkf.imperfect.bias import FadingBias
+from torch_denkf.imperfect.contaminated import Contaminated
 from torch_denkf.imperfect.rejection import RejectReadings
 from torch_denkf.imperfect.visible import Visibility, Visible
 
 __all__ = [
+    "Contaminated",
     "FadingBias",
     "RejectReadings",
     "Visibility",

@@ -34,7 +34,7 @@ from torch_denkf.functional.manifolds import Space, is_flat
 from torch_denkf.modules.around import AroundInitial, Wrapper
 from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.modules.tensors import as_floating, as_standard_deviations
-from torch_denkf.running import check_module
+from torch_denkf.running import check_module, linearise
 from torch_denkf.submodel import Initial, Transition, role
 
 __all__ = ["BiasedBelief", "BiasedNoise", "BiasedObservation", "BiasedTransition", "FadingBias"]
@@ -253,6 +253,19 @@ class BiasedTransition(Wrapper, Transition):
         written = self.run_inside({**entries, key: state}, call)
         return {**written, out_key: torch.cat([written[out_key], self.bias.decay * slow], -1)}
 
+    def linearised(self, entries, call):
+        """That of the transition, and behind it the decay."""
+        key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
+        state, slow = _split(self.required(entries, key), self.bias, self)
+        found = linearise(self.module, {**entries, key: state}, call.part(self.place))
+        if found is None or not is_flat(*found[2] or ()):
+            return None
+        (written, matrix, _), count = found, len(self.bias)
+        decay = self.bias.decay.diag_embed().expand(*matrix.shape[:-2], count, count)
+        rows = nn.functional.pad(matrix, (0, count)), nn.functional.pad(decay, (matrix.shape[-1], 0))
+        moved = torch.cat([written[out_key], self.bias.decay * slow], -1)
+        return {**written, out_key: moved}, torch.cat(rows, -2), None
+
 
 class BiasedNoise(Wrapper):
     """The process noise of a state and of the biases behind it: variances ``[*B, N + K]`` or a covariance.
@@ -325,17 +338,36 @@ class BiasedObservation(Wrapper):
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, slow = _split(self.required(entries, key), self.bias, self)
         written = self.run_inside({**entries, key: state}, call)
-        read = written[out_key]
+        read, own = written[out_key], self._own(slow, written[out_key])
+        return {**written, out_key: read * (1 + own) if self.bias.factor else read + own}
+
+    def linearised(self, entries, call):
+        """That of the model, and behind it that by the biases."""
+        key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
+        state, slow = _split(self.required(entries, key), self.bias, self)
+        found = linearise(self.module, {**entries, key: state}, call.part(self.place))
+        if found is None or not is_flat(*found[2] or ()):
+            return None
+        (written, matrix, _), count = found, len(self.bias)
+        read, own = written[out_key], self._own(slow, written[out_key])
+        by_bias = self._own(torch.eye(count, dtype=read.dtype, device=read.device), read).mT
+        if self.bias.factor:
+            matrix, by_bias = (1 + own).unsqueeze(-1) * matrix, read.unsqueeze(-1) * by_bias
+        by_bias = by_bias.expand(*matrix.shape[:-1], count)
+        read = read * (1 + own) if self.bias.factor else read + own
+        return {**written, out_key: read}, torch.cat([matrix, by_bias], -1), None
+
+    def _own(self, slow: Tensor, read: Tensor) -> Tensor:
+        """Sums up the biases ``[*, K]`` of each component of the reading, ``[*, O]``."""
+        size = read.shape[-1]
         if self.dims is not None:
-            slow = torch.zeros_like(read).index_add(-1, self.dims, slow)
-            return {**written, out_key: read * (1 + slow) if self.bias.factor else read + slow}
-        if len(self.bias) % read.shape[-1]:
+            return slow.new_zeros(*slow.shape[:-1], size).index_add(-1, self.dims, slow)
+        if len(self.bias) % size:
             raise ValueError(
-                f"{len(self.bias)} biases are not as many for each of the {read.shape[-1]} components of the reading; "
+                f"{len(self.bias)} biases are not as many for each of the {size} components of the reading; "
                 "say in dims which component each belongs to"
             )
-        slow = slow.unflatten(-1, (-1, read.shape[-1])).sum(-2)
-        return {**written, out_key: read * (1 + slow) if self.bias.factor else read + slow}
+        return slow.unflatten(-1, (-1, size)).sum(-2)
 
 
 class BiasedBelief(AroundInitial):

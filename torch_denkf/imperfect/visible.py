@@ -25,11 +25,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.beliefs import Ensemble, complete
-from torch_denkf.functional.manifolds import is_flat
 from torch_denkf.functional.weighted import weighted_innovation
-from torch_denkf.imperfect.mixture import log_mixture, mix_members, mix_moments, responsibility
-from torch_denkf.modules.around import Around
+from torch_denkf.imperfect.mixed import MixedUpdate, kind_of_update
+from torch_denkf.imperfect.mixture import log_mixture, responsibility
+from torch_denkf.modules.spaces import told
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import mean_of_members
 from torch_denkf.submodel import Call, Entries, Sensor, Update
@@ -99,7 +98,7 @@ class Visibility(Sensor):
         return Visible(cast(Update, analysis), visible_key=self.out_keys[0])
 
 
-class Visible(Around):
+class Visible(MixedUpdate):
     r"""Lets a reading count as far as it is about the state.
 
     The analysis runs once. With q, the probability that the reading was about the state now that it is known, the
@@ -108,7 +107,8 @@ class Visible(Around):
     =====================  =============================================================================================
     belief                 what becomes of it
     =====================  =============================================================================================
-    mean and covariance    the mixture's, q (1 - q) d dᵀ of the way d between both means included
+    mean and covariance    the mixture's, q (1 - q) d dᵀ of the way d between both means included; on a space those of
+                           the tangents at the forecast
     ensemble               members with the mixture's mean and sample covariance, see
                            :func:`~torch_denkf.imperfect.mixture.mix_members`; a past that is corrected, too
     particles              the exact mixture: each particle's likelihood is one
@@ -128,7 +128,7 @@ class Visible(Around):
         visible_key: p, ``[*B, 1]``, see :class:`Visibility`.
 
     Raises:
-        TypeError: for another analysis, whose forecast or reading is not known, or for one on a space.
+        TypeError: for another analysis, whose forecast or reading is not known.
         ValueError: if ``broad`` is not above 1.
 
     Example:
@@ -149,21 +149,19 @@ class Visible(Around):
 
     def __init__(self, analysis: Update, *, broad: float = 10.0, visible_key: NestedKey = ("sensor", "visible")):
         check_number("broad", broad, above=1)
-        self_made = _kind(analysis)
-        if analysis.space is not None or not is_flat(analysis.reading_space):
-            raise TypeError(f"Visible is for numbers, and readings of angles; {type(analysis).__name__} is on a space.")
+        kind = kind_of_update(analysis, "Visible")
         super().__init__(
             analysis,
             [*analysis.in_keys, visible_key],
             [*analysis.out_keys, (analysis.info_prefix, "visible")],
         )
-        self.kind, self.broad, self.visible_key = self_made, broad, unravel_key(visible_key)
+        self.kind, self.broad, self.visible_key = kind, broad, unravel_key(visible_key)
 
     def on_entries(self, entries, call):
         """The belief and the diagnostics."""
         if self.observed_key is not None:
             entries = self.with_mask(entries, call)
-        mask = None if self.observed_key is None else entries.get(self.observed_key)
+        mask = None if self.observed_key is None else told(self.reading_space, entries.get(self.observed_key))
         visible = entries.get(self.visible_key)
         if visible is None:  # where a step is taken without the reading, nothing says whether it sees
             like = self.required(entries, self.in_keys[0])
@@ -182,31 +180,13 @@ class Visible(Around):
             count = mask.expand(innovation.shape).sum(-1, keepdim=True, dtype=nis.dtype)
         other = own + 0.5 * nis * (1 - self.broad**-2) - count * math.log(self.broad)
         share = responsibility(visible, own, other)
-        mixed = self._moments(entries, out, share) if self.kind == "moments" else self._members(entries, out, share)
-        if seen is not None:  # where there is no reading, not even rounding moves anything
-            mixed = {key: torch.where(_like(seen, value), value, out[key]) for key, value in mixed.items()}
+        analysis, held = self.module, 2 if self.kind == "moments" else 1
+        forecast = {key: entries[name] for key, name in zip(analysis.out_keys[:held], analysis.in_keys, strict=False)}
+        mixed = self.mixed(entries, visible, share, out, {**entries, **forecast}, seen)
+        if seen is not None:
             share = torch.where(seen, share, 0)
-        told = {"log_likelihood": log_mixture(visible, own, other), "visible": share}
-        return {**out, **mixed, **{(self.info_prefix, name): value for name, value in told.items()}}
-
-    def _moments(self, entries: Entries, out: Entries, share: Tensor) -> Entries:
-        """Mean, covariance and variances."""
-        keys = self.module.out_keys[:3]
-        mean, cov = mix_moments(share, out[keys[0]], out[keys[1]], *(entries[key] for key in self.module.in_keys[:2]))
-        return dict(zip(keys, (mean, cov, cov.diagonal(dim1=-2, dim2=-1)), strict=True))
-
-    def _members(self, entries: Entries, out: Entries, share: Tensor) -> Entries:
-        """Ensemble, mean and variances; a past, and a covariance, where the analysis writes them."""
-        analysis = self.module
-        pairs = [(analysis.in_keys[0], analysis.out_keys[0])]
-        pairs += [(key, key) for key in analysis.in_keys if key in analysis.out_keys]  # the past is corrected in place
-        before = [entries[key].flatten(len(share.shape)) for key, _ in pairs]
-        after = [out[key].flatten(len(share.shape)) for _, key in pairs]
-        both = mix_members(share, torch.cat(after, -1), torch.cat(before, -1))
-        parts = both.split([part.shape[-1] for part in after], -1)
-        mixed = {key: part.reshape(out[key].shape) for (_, key), part in zip(pairs, parts, strict=True)}
-        kind = Ensemble(pairs[0][1][:-1])
-        return complete(mixed, [key for key in analysis.out_keys if key[:-1] == kind.prefix], [kind])
+        scores = {"log_likelihood": log_mixture(visible, own, other), "visible": share}
+        return {**out, **mixed, **{(self.info_prefix, name): value for name, value in scores.items()}}
 
     def _particles(
         self, entries: Entries, call: Call, visible: Tensor, mask: Tensor | None, seen: Tensor | None
@@ -229,30 +209,3 @@ class Visible(Around):
         out = self.module.on_entries({**entries, self.module.in_keys[2]: mixed}, call)
         share = responsibility(visible, torch.logsumexp(prior + likelihood, -1, keepdim=True), other)
         return {**out, (self.info_prefix, "visible"): share if seen is None else torch.where(seen, share, 0)}
-
-
-def _like(seen: Tensor, value: Tensor) -> Tensor:
-    """A mask ``[*B, 1]`` with as many dimensions as a value ``[*B, ...]``."""
-    return seen.reshape(*seen.shape[:-1], *(1,) * (value.ndim - seen.ndim + 1))
-
-
-def _kind(analysis: Update) -> str:
-    """Returns the kind of belief that an analysis updates: ``"members"``, ``"moments"`` or ``"particles"``."""
-    wrapped = isinstance(analysis, Around) and not analysis.updates_ensemble
-    if isinstance(analysis, Update) and not wrapped and analysis.info_prefix is not None:
-        written = [cast("tuple[str, ...]", unravel_key(key)) for key in analysis.out_keys]
-        scores = {(analysis.info_prefix, name) for name in ("nis", "innovation", "log_likelihood")}
-        read = [key[-1] for key in map(unravel_key, analysis.in_keys[:2])]
-        if scores <= set(written):
-            if "log_weight" in (key[-1] for key in written):
-                return "particles"
-            if read == ["mean", "cov"] and [key[-1] for key in written[:3]] == ["mean", "cov", "var"]:
-                return "moments"
-            if analysis.updates_ensemble:
-                return "members"
-    raise TypeError(
-        f"{type(analysis).__name__} does not say where its forecast and its reading are. Visible goes around an "
-        "EnsembleAnalysis, LocalEnsembleAnalysis, KalmanAnalysis, EKFAnalysis or UKFAnalysis, around ParticleAnalysis "
-        "with a GaussianLikelihood, or around one of your own that updates an ensemble and writes innovation, nis and "
-        "log_likelihood under its info_prefix."
-    )

@@ -35,8 +35,8 @@ class EnsembleAnalysis(EnsembleUpdate):
             ``[O, O]``, see :func:`~torch_denkf.functional.analyse`; ``None`` for none. Where one observation can say
             nothing about a component of the state but what E members happen to show, the factor is 0.
         localisation: ``"significance"`` believes a covariance of state and observation as far as E members can tell it
-            from chance, see :func:`~torch_denkf.functional.analysis.significant`. It keeps 32 to 64 members honest
-            where fast sensors make thousands of updates. ``None`` believes all.
+            from chance, see :func:`~torch_denkf.functional.analysis.significant`. It keeps members honest that are too
+            few for exact draws, where fast sensors make thousands of updates. ``None`` believes all.
         threshold: of ``"significance"``, in standard deviations: one number or ``[S]``; a ``Parameter`` is trained. The
             more updates a component sees between two readings about it, the larger. One that is trained beyond
             sqrt(E - 1) believes nothing, and has no gradient that would bring it back.

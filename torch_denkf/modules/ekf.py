@@ -6,13 +6,14 @@ from collections.abc import Callable
 from typing import Unpack
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torch_denkf.functional import kalman_update
+from torch_denkf.functional.gaussian import check_update, innovation_update, sandwich
 from torch_denkf.functional.manifolds import Euclidean, Space, is_flat
 from torch_denkf.modules.gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
-from torch_denkf.running import reads
+from torch_denkf.running import linearise, reads
 from torch_denkf.submodel import Call, Entries, Update, role
 
 __all__ = ["EKFAnalysis", "EKFTransition"]
@@ -21,9 +22,9 @@ __all__ = ["EKFAnalysis", "EKFTransition"]
 class EKFTransition(GaussianTransition):
     r"""Forecast :math:`f(m)` and :math:`F P F^T + Q` with the Jacobian F of the transition at the mean.
 
-    The transition runs on ensembles of one member; its stochastic networks run their deterministic forward. F comes
-    from automatic differentiation of whatever it does, known motion and networks alike, and can be differentiated
-    itself. Rows of a batch must not depend on each other.
+    The transition runs on ensembles of one member; its stochastic networks run their deterministic forward. F is what
+    it says itself (``jacobian``), as known motions and networks of linear layers do; of anything else it comes from
+    automatic differentiation. It can be differentiated. Rows of a batch must not depend on each other.
 
     Args:
         transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.modules.LearnedTransition`.
@@ -60,14 +61,14 @@ class EKFTransition(GaussianTransition):
         def move(rows, states, call):
             return self._move(rows, states, call), None
 
-        entries = _needed(self, entries)
-        if self.space is None or self.space.flat is not None:
-            forecast, jacobian, _ = _linearise(move, entries, call, mean, mean.shape[-1])
-        else:
-            forecast, jacobian, _ = _linearise_on(move, entries, call, mean, self.space, self.space)
+        entries = {**entries, self.ensemble_key: mean.unsqueeze(-2)}
+        sides = None if is_flat(self.space) else (self.space, self.space)
+        forecast, jacobian, _ = _linearise(
+            self, move, entries, call, mean, mean.shape[-1], self.forecast_ensemble_key, sides
+        )
         if self.stop_jacobian_gradient:
             jacobian = jacobian.detach()
-        moved = jacobian @ cov @ jacobian.mT
+        moved = sandwich(jacobian, cov)
         link = (torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device), cov, jacobian) if wanted else None
         return forecast, (moved + moved.mT) / 2, link
 
@@ -96,40 +97,70 @@ class EKFAnalysis(GaussianAnalysis):
     """
 
     def _update(self, entries, mean, cov, observation, noise, call):
-        entries, size = _needed(self, entries), observation.shape[-1]
-        if is_flat(self.space, self.reading_space):
-            predicted, jacobian, observed = _linearise(self._observe, entries, call, mean, size)
-        else:
-            space, reading_space = self.space or Euclidean(mean.shape[-1]), self.reading_space or Euclidean(size)
-            predicted, jacobian, observed = _linearise_on(self._observe, entries, call, mean, space, reading_space)
+        size, sides = observation.shape[-1], None
+        if not is_flat(self.space, self.reading_space):
+            sides = self.space, self.reading_space
+        entries = {**entries, self.ensemble_key: mean.unsqueeze(-2)}
+        predicted, jacobian, observed = _linearise(
+            self, self._observe, entries, call, mean, size, self.predicted_key, sides
+        )
         innovation = self._innovation(observation, predicted, observed)
-        # In deviations from the mean: H m would cost digits where the state is far from zero.
-        update = kalman_update(torch.zeros_like(cov[..., 0]), cov, innovation, jacobian, noise, observed=observed)
+        check_update(mean if is_flat(self.space) else cov[..., 0], cov, innovation, jacobian, noise)
+        update = innovation_update(cov, innovation, jacobian, noise, observed=observed)
         return self._moved(mean, update), observed
 
 
-def _needed(module, entries: Entries) -> Entries:
-    """Lists the keys that the model inside reads, and the mask."""
-    needed, optional = reads(module.module)
-    keys = dict.fromkeys([*needed, *optional, role(module, Update).observed_key])
-    return {key: entries[key] for key in keys if key in entries}
-
-
-def _linearise_on(
+def _linearise(
+    step: GaussianTransition | GaussianAnalysis,
     model: Callable[[Entries, Tensor, Call], tuple[Tensor, Tensor | None]],
     entries: Entries,
     call: Call,
     mean: Tensor,
-    space: Space,
-    image_space: Space,
+    size: int,
+    key: NestedKey,
+    sides: tuple[Space | None, Space | None] | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The image of a point ``[*B, P]``, and the Jacobian ``[*B, N, D]`` between the tangents of both."""
-    image, jacobian, mask = _linearise(model, entries, call, mean, image_space.point_dim)
-    space.check(point=mean)
-    return image, image_space.dual_basis(image) @ jacobian @ space.basis(mean), mask
+    """Value, Jacobian and mask of the model inside a step, which knows its Jacobian or is differentiated.
+
+    Args:
+        step: around the model.
+        model: see :func:`_differentiated`.
+        entries: what the model may read, the mean ``[*B, 1, P]`` among it.
+        call: how it is called.
+        mean: where, ``[*B, P]``.
+        size: numbers of the image, N.
+        key: of the image.
+        sides: of ``mean`` and image, between whose tangents the Jacobian is to lead; ``None`` for plain numbers, of
+            one or both.
+    """
+    found = linearise(step.module, entries, call)
+    if found is None or found[0][key].shape[-1] != size or not _fit(found[2], sides):
+        needed, optional = reads(step.module)
+        keys = dict.fromkeys([*needed, *optional, role(step, Update).observed_key])
+        image, jacobian, mask = _differentiated(
+            model, {name: entries[name] for name in keys if name in entries}, call, mean, size
+        )
+        between = None
+    else:
+        written, jacobian, between = found
+        image, mask = written[key].squeeze(-2), step.mask_of(entries, written)
+        jacobian = jacobian if jacobian.ndim == 2 else jacobian.squeeze(-3)
+    if sides is not None and between is None:
+        space, image_space = sides[0] or Euclidean(mean.shape[-1]), sides[1] or Euclidean(size)
+        space.check(point=mean)
+        jacobian = image_space.dual_basis(image) @ jacobian @ space.basis(mean)
+    return image, jacobian, mask
 
 
-def _linearise(
+def _fit(known: tuple[Space, Space] | None, wanted: tuple[Space | None, Space | None] | None) -> bool:
+    """Tells whether a Jacobian between the tangents of some spaces is one between those of others, or of numbers."""
+    if known is None or known == wanted:
+        return True
+    pairs = zip(known, wanted or (None, None), strict=True)
+    return all(one == other or is_flat(one, other) for one, other in pairs)
+
+
+def _differentiated(
     model: Callable[[Entries, Tensor, Call], tuple[Tensor, Tensor | None]],
     entries: Entries,
     call: Call,

@@ -53,7 +53,7 @@ class EnsembleOptions(EnsembleAnalysisKeys, total=False):
         rotate: random mean-preserving rotation of the anomalies.
         reading_space: of the reading; ``None`` for plain numbers.
         localisation: ``"significance"`` or ``None``.
-        threshold: of ``"significance"``, in standard deviations; 3 by default.
+        threshold: of ``"significance"``, in standard deviations; 1.5 by default.
     """
 
     inflation: float
@@ -119,7 +119,7 @@ class EnsembleUpdate(Rotated):
         reading_space: Space | None = None,
         covariance: bool = False,
         localisation: Literal["significance"] | None = None,
-        threshold: float | Tensor = 3.0,
+        threshold: float | Tensor = 1.5,
         forecast_key: NestedKey = ("forecast", "ensemble"),
         predicted_key: NestedKey = ("forecast", "observation"),
         observation_key: NestedKey = ("sensor", "ensemble"),

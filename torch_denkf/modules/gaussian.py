@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_number
-from torch_denkf.functional.gaussian import GaussianUpdate
+from torch_denkf.functional.gaussian import GaussianUpdate, sandwich
 from torch_denkf.functional.linalg import as_covariance
 from torch_denkf.functional.manifolds import Space, check_space, is_flat
 from torch_denkf.modules.spaces import mean_reading, told
@@ -95,6 +95,9 @@ class GaussianTransition(Transition):
         written = run_module(self.process_noise, work, call.part("process_noise"))
         noise = as_covariance(written[unravel_key(self.process_noise.out_keys[0])], mean)
         return {self.out_keys[0]: mean, self.out_keys[1]: cov + noise}, (*(link or ()), noise)
+
+    def mask_of(self, entries: Entries, written: Entries) -> None:
+        """Returns that a forecast has no mask."""
 
     def _forecast(
         self, entries: Entries, mean, cov, call: Call, wanted: bool
@@ -207,12 +210,11 @@ class GaussianAnalysis(Update):
         """An update of the tangents at ``mean``, as a point and the covariance of the tangents there."""
         if self.space is None:
             return update._replace(mean=mean + update.mean)
-        cov = update.cov
-        if not is_flat(self.space):
-            turn = self.space.right_jacobian(update.mean)
-            cov = turn @ cov @ turn.mT
-            cov = (cov + cov.mT) / 2
-        return update._replace(mean=self.space.plus(mean, update.mean), cov=cov)
+        if is_flat(self.space):
+            return update._replace(mean=self.space.plus(mean, update.mean))
+        move, turn = self.space.exp_and_jacobian(update.mean)
+        cov = sandwich(turn, update.cov)
+        return update._replace(mean=self.space.compose(mean, move), cov=(cov + cov.mT) / 2)
 
     def reading_dims(self, entries, call):
         """O, as the model predicts it."""
@@ -238,9 +240,12 @@ class GaussianAnalysis(Update):
         """Predicted observations ``[*B, E, O]`` of an ensemble, and the mask after the model ran."""
         with deterministic(self.module):
             written = run_module(self.module, {**entries, self.ensemble_key: states}, call)
+        return written[self.predicted_key], self.mask_of(entries, written)
+
+    def mask_of(self, entries: Entries, written: Entries) -> torch.Tensor | None:
+        """Returns the mask of what the observation model was given, and of what it wrote."""
         given, made = entries.get(self.observed_key), written.get(self.observed_key)
-        mask = given if made is None else made if given is None else made & given
-        return written[self.predicted_key], told(self.reading_space, mask)
+        return told(self.reading_space, given if made is None else made if given is None else made & given)
 
 
 def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: float = 1.0) -> tuple[torch.Tensor, ...]:

@@ -8,6 +8,7 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
+from torch_denkf.functional.jacobians import jacobian_of_network
 from torch_denkf.functional.linalg import product_of_known
 from torch_denkf.modules.tensors import check_dims, register_location_and_scale, register_matrix
 from torch_denkf.modules.transition import MemberNetwork
@@ -52,11 +53,17 @@ class LearnedObservation(MemberNetwork):
 
     def compute(self, ensemble, *, noise):
         """The predicted observations."""
-        if self.loc is not None:
-            ensemble = ensemble - self.loc
-        if self.scale is not None:
-            ensemble = ensemble / self.scale
-        return self._run(ensemble, noise)
+        return self._run(self.features(ensemble), noise)
+
+    def features(self, state: torch.Tensor) -> torch.Tensor:
+        """Returns what the network reads, ``[*, S]``."""
+        state = state if self.loc is None else state - self.loc
+        return state if self.scale is None else state / self.scale
+
+    def jacobian(self, state):
+        """The network's, by states in their own units."""
+        found = jacobian_of_network(self.module, self.features(state), state.shape[-1])
+        return found if found is None or self.scale is None else (found[0], found[1] / self.scale)
 
 
 class Select(SubModel):
@@ -94,6 +101,11 @@ class Select(SubModel):
         """The predicted observations of all members."""
         return self.observe(ensemble)
 
+    def jacobian(self, state):
+        """Rows of the identity."""
+        places = torch.arange(state.shape[-1], device=state.device)
+        return self.observe(state), (self.dims.unsqueeze(-1) == places).to(state.dtype)
+
 
 class LinearObservation(SubModel):
     """Known linear observation, ``y = H x``.
@@ -127,3 +139,7 @@ class LinearObservation(SubModel):
     def compute(self, ensemble):
         """The predicted observations."""
         return ensemble @ self.matrix.mT
+
+    def jacobian(self, state):
+        """H."""
+        return self.compute(state), self.matrix

@@ -24,6 +24,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from torch_denkf._checks import check_choice, check_count, check_number
+from torch_denkf.functional.jacobians import jacobian_of_layers
 from torch_denkf.functional.kernels.dropped_relu import dropped_relu
 from torch_denkf.functional.kernels.random_bits import (
     balanced_bytes,
@@ -261,6 +262,15 @@ class StochasticMLP(nn.Module):
                 hidden = self.activation(hidden) * factor
         out = run[-1][0](hidden)
         return (out, hidden) if with_hidden else out
+
+    def jacobian(self, x: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Returns the mean network's output and its Jacobian by the first ``size`` inputs, ``[*, out_features, size]``.
+
+        ``None`` where the activation's derivative is not known, see
+        :func:`~torch_denkf.functional.jacobians.jacobian_of_network`.
+        """
+        layers = [part for layer in self.layers for part in (layer, self.activation)][:-1]
+        return jacobian_of_layers(layers, x, size, (nn.Linear, FlipoutLinear))
 
     def _perturbation_sizes(self) -> list[int]:
         """Numbers of perturbed weights and biases; those of flipout's layers."""

@@ -3,10 +3,12 @@ r"""Transition models: forecast :math:`x^i_{t|t-1} \sim f_\theta(x^i_{t-1|t-1})`
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey
 
+from torch_denkf.functional.jacobians import jacobian_of_network
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.tensors import register_location_and_scale
 from torch_denkf.submodel import SubModel, Transition
@@ -95,21 +97,36 @@ class LearnedTransition(MemberNetwork, Transition):
 
     def compute(self, state, action=None, dt=None, *, noise):
         """The forecast ensemble."""
-        if self.action_key is None:  # then what is read second is the length of the step
-            action, dt = None, action
+        return self._moved(state, self._run(self.features(state, action), noise), action, dt)
+
+    def features(self, state: torch.Tensor, action: Any) -> torch.Tensor:
+        """Returns what the network reads, ``[*B, E, S]`` or ``[*B, E, S + A]``, of states and an action."""
         features = state if self.loc is None else state - self.loc
-        if self.scale is not None:
-            features = features / self.scale
-        if action is not None:
-            action = action if self.action_loc is None else action - self.action_loc
-            action = action if self.action_scale is None else action / self.action_scale
-            action = action.to(state.dtype).unsqueeze(-2)
-            features = torch.cat([features, action.expand(*state.shape[:-1], action.shape[-1])], -1)
-        change = self._run(features, noise)
+        features = features if self.scale is None else features / self.scale
+        if self.action_key is None:
+            return features
+        action = action if self.action_loc is None else action - self.action_loc
+        action = action if self.action_scale is None else action / self.action_scale
+        action = action.to(state.dtype).unsqueeze(-2)
+        return torch.cat([features, action.expand(*state.shape[:-1], action.shape[-1])], -1)
+
+    def jacobian(self, state, action=None, dt=None):
+        """That of the network, in the state's units, times the length of the step; and the identity if residual."""
+        found = jacobian_of_network(self.module, self.features(state, action), state.shape[-1])
+        if found is None:
+            return None
+        matrix = found[1] if self.scale is None else found[1] * (self.scale.unsqueeze(-1) / self.scale)
+        if self.dt_key is not None:
+            matrix = matrix * (action if dt is None else dt).to(matrix.dtype)[..., None, None]
+        if self.residual:
+            matrix = matrix + torch.eye(state.shape[-1], dtype=state.dtype, device=state.device)
+        return self._moved(state, found[0], action, dt), matrix
+
+    def _moved(self, state, change, action, dt):
         if self.scale is not None:
             change = change * self.scale
-        if dt is not None:
-            change = change * dt.to(change.dtype).unsqueeze(-2)
+        if self.dt_key is not None:  # without an action it is read second
+            change = change * (action if dt is None else dt).to(change.dtype).unsqueeze(-2)
         if self.residual:
             return state + change
         return change if self.loc is None else change + self.loc

@@ -7,20 +7,19 @@ from collections.abc import Sequence
 from typing import Literal, TypedDict, TypeGuard
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import TensorDictBase, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.imperfect import Visible
+from torch_denkf.imperfect.mixed import wider_forecast, wider_past, with_draws, with_noise_from
 from torch_denkf.modules.around import Around
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.monitoring._calibration import IDENTITY, check_observation_dim, chi_square_table, empirical_quantile
 from torch_denkf.monitoring.chi_square import chi_square_quantile
-from torch_denkf.monitoring.gating import adapt, disbelief, spread_about_mean
+from torch_denkf.monitoring.gating import adapt, disbelief
 from torch_denkf.monitoring.innovation_tests import interpolate
-from torch_denkf.running import random_parts
-from torch_denkf.smoothers.past import LaggedAnalysis
-from torch_denkf.submodel import Call, Entries, SubModel, Update, flat_noise
+from torch_denkf.submodel import Call, Entries, Update
 
 __all__ = ["GateOptions", "GatedAnalysis"]
 
@@ -180,7 +179,7 @@ class GatedAnalysis(Around):
         check_number("adapt_inflation", adapt_inflation, least=0, below=1)
         claimed = None
         if isinstance(inside, KalmanAnalysis) and inside.noise is not None:
-            claimed, read = inside.noise, _with_noise_from((gate_prefix, "claimed"), inside)
+            claimed, read = inside.noise, with_noise_from((gate_prefix, "claimed"), inside)
             analysis = analysis.around(read) if isinstance(analysis, Visible) else read
         state = [(gate_prefix, name) for name in ("terms", "shut", "log_noise", "log_inflation")]
         further = [(gate_prefix, name) for name in ("factor", "nis", "innovation", "part_nis")]
@@ -255,7 +254,8 @@ class GatedAnalysis(Around):
             if rejects:
                 seen = seen & ~doubted  # an outlier is no measure of the noise
                 wider = torch.where(seen.any(-1, keepdim=True), wider, 1)
-            spread = self._with_past(self._wider(plain, wider), reach)
+            inside = self.module.module if isinstance(self.module, Visible) else self.module
+            spread = wider_past(inside, self._wider(plain, wider), reach)
             out = (
                 self._without(spread, call, doubted) if rejects else self._analyse(self._noisier(spread, factor), call)
             )
@@ -282,11 +282,7 @@ class GatedAnalysis(Around):
         if self.claimed is not None:
             mean = self.required(entries, self.in_keys[0])
             entries[self.noise_variance_key] = self.claimed.expand(*mean.shape[:-1], *self.claimed.shape)
-        for place, part in random_parts(self.module, call.place) if call.sample else ():
-            values = [self.required(entries, key) for key in part.in_keys]
-            noise = SubModel._noise(part, entries, values, call._replace(place=place))  # as drawn: used twice
-            entries.update(flat_noise(noise, place))
-        return entries
+        return with_draws(self.module, entries, call)
 
     def _parts(self, entries: Entries, nis: Tensor, innovation: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised innovations squared ``[*B, K]``, and how many components were observed in each."""
@@ -312,26 +308,7 @@ class GatedAnalysis(Around):
 
     def _wider(self, entries: Entries, factor: Tensor) -> Entries:
         """The entries with the forecast's covariance times a factor ``[*B, 1]``."""
-        if not self.of_ensemble:
-            key = self.module.in_keys[1]
-            return {**entries, key: entries[key] * factor.unsqueeze(-1)}
-        keys = self.module.in_keys[:2]  # states, and what is predicted of them, in plain numbers
-        spaces = (self.module.space, None)
-        wider = {key: spread_about_mean(entries[key], factor.sqrt(), on) for key, on in zip(keys, spaces, strict=True)}
-        return {**entries, **wider}
-
-    def _with_past(self, entries: Entries, factor: Tensor) -> Entries:
-        """The entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
-        inside = self.module.module if isinstance(self.module, Visible) else self.module
-        if not isinstance(inside, LaggedAnalysis):
-            return entries
-        key = inside.in_keys[-1]
-        past, space = entries[key], self.module.space
-        if space is not None:
-            of_times = spread_about_mean(past.movedim(-2, -3), factor.sqrt().unsqueeze(-2), space)
-            return {**entries, key: of_times.movedim(-3, -2)}
-        wider = spread_about_mean(past.flatten(-2), factor.sqrt())
-        return {**entries, key: wider.unflatten(-1, past.shape[-2:])}
+        return wider_forecast(self.module, entries, factor, members=self.of_ensemble)
 
     def _without(self, entries: Entries, call: Call, rejected: Tensor) -> Entries:
         """What the analysis writes without what is rejected ``[*B, K]``."""
@@ -374,24 +351,3 @@ class GatedAnalysis(Around):
             found = float(empirical_quantile(ratio[:, part], torch.tensor([1 - self.rate])))
             self.slack[part] = margin * max(1.0, found)
         return self
-
-
-def _with_noise_from(key: NestedKey, analysis: KalmanAnalysis) -> KalmanAnalysis:
-    """A Kalman analysis that shares the matrix of another, and reads the noise that the other holds."""
-    keys = analysis.in_keys
-    changed = KalmanAnalysis(
-        analysis.matrix.detach(),
-        None,
-        inflation=analysis.inflation,
-        reading_space=analysis.reading_space,
-        observation_key=keys[2],
-        noise_variance_key=key,
-        observed_key=analysis.observed_key,
-        forecast_prefix=keys[0][0],
-        belief_prefix=analysis.out_keys[0][0],
-        info_prefix=analysis.info_prefix,
-    )
-    if isinstance(analysis.matrix, nn.Parameter):
-        del changed.matrix
-    changed.matrix = analysis.matrix
-    return changed

@@ -7,9 +7,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from torch_denkf.functional.manifolds import Space
-
-__all__ = ["Response", "adapt", "disbelief", "spread_about_mean"]
+__all__ = ["Response", "adapt", "disbelief"]
 
 Response = Literal["reject", "student", "huber"]
 
@@ -66,13 +64,3 @@ def adapt(log_factor: Tensor, nis: Tensor, freedom: Tensor, rate: float, *, larg
     """
     ratio = (nis / freedom.clamp_min(1)).clamp_max(largest)
     return torch.where(freedom > 0, log_factor + rate * (ratio - 1), log_factor)
-
-
-def spread_about_mean(members: Tensor, factor: Tensor, space: Space | None = None) -> Tensor:
-    """Members ``[*B, E, N]``, their distances from the mean times ``factor`` ``[*B, 1]``; bit-equal for 1."""
-    factor = factor.unsqueeze(-2)
-    if space is not None:
-        center = space.mean(members).unsqueeze(-2)
-        return torch.where(factor == 1, members, space.plus(center, factor * space.minus(members, center)))
-    mean = members.mean(-2, keepdim=True)
-    return torch.where(factor == 1, members, mean + factor * (members - mean))

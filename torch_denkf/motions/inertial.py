@@ -13,9 +13,17 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf._checks import check_number, check_shape
-from torch_denkf.functional.manifolds import SE23, SO3, Euclidean, Product, rotate
-from torch_denkf.functional.manifolds.rotations import bend, fourth, half_versine, one_minus_sinc, series
-from torch_denkf.motions.motion import Motion, densities, integrated, walked
+from torch_denkf.functional.manifolds import SE3, SE23, SO3, Euclidean, Product, rotate, rotation_matrix, skew
+from torch_denkf.functional.manifolds.rotations import (
+    Function,
+    bend,
+    fifth,
+    fourth,
+    half_versine,
+    one_minus_sinc,
+    series,
+)
+from torch_denkf.motions.motion import Motion, corner, densities, integrated, walked
 
 __all__ = ["AttitudeMotion", "InertialMotion", "move_inertially"]
 
@@ -104,6 +112,13 @@ class InertialMotion(Motion):
         moved = move_inertially(pose, gyro - gyro_bias, accelerometer - accelerometer_bias, dt, self.gravity)
         return torch.cat([moved, gyro_bias, accelerometer_bias], -1)
 
+    def gradient(self, state, *readings, dt):
+        """That of the pose by itself and by the biases, which stay."""
+        gyro, accelerometer = readings if len(readings) == 2 else readings[0].split(3, -1)
+        _, gyro_bias, accelerometer_bias = self.space.points(state)
+        rate, force = torch.broadcast_tensors(gyro - gyro_bias, accelerometer - accelerometer_bias)
+        return corner(_inertial_jacobian(rate, force, dt), torch.eye(6).to(state))
+
     def noise_of_step(self, dt):
         """Of orientation, velocity, position, the gyro's bias and the accelerometer's."""
         force = self.accelerometer_noise
@@ -158,6 +173,15 @@ class AttitudeMotion(Motion):
         orientation, bias = self.space.points(state)
         return torch.cat([SO3().plus(orientation, (gyro - bias) * dt), bias], -1)
 
+    def move_and_gradient(self, state, gyro, *, dt):
+        """By the orientation itself, and by the bias, which stays."""
+        orientation, bias = self.space.points(state)
+        turn, by_rate = SO3().exp_and_jacobian((gyro - bias) * dt)
+        moved = torch.cat([SO3().compose(orientation, turn), bias], -1)
+        by_rate = -by_rate * (dt.unsqueeze(-1) if isinstance(dt, Tensor) else dt)
+        by_turn = rotation_matrix(SO3().inverse(turn))
+        return moved, corner(torch.cat([by_turn, by_rate], -1), torch.eye(3, dtype=state.dtype, device=state.device))
+
     def noise_of_step(self, dt):
         """Of orientation and bias."""
         return walked(self.gyro_noise, dt) + walked(self.gyro_walk, dt)
@@ -210,3 +234,42 @@ def move_inertially(pose: Tensor, rate: Tensor, force: Tensor, dt: float | Tenso
     turned = SO3().compose(orientation, SO3().exp(angles))
     moved = position + (velocity + 0.5 * fall + rotate(orientation, twice)) * dt
     return torch.cat([turned, velocity + fall + rotate(orientation, once), moved], -1)
+
+
+#: Minus the derivative of ``fourth`` by the angle squared.
+_sixth = Function(
+    lambda a: (a**2 + 2 * a.cos() - 2) / a**6 - (a - a.sin()) / (2 * a**5),
+    (1 / 720, -1 / 20160, 1 / 1209600, -1 / 119750400),
+)
+
+
+def _inertial_jacobian(rate: Tensor, force: Tensor, dt: float | Tensor) -> Tensor:
+    """The Jacobian of :func:`move_inertially`, ``[*, 9, 15]``: of the pose's tangent by itself, and by biases.
+
+    Velocity and position are seen from the body's axes, before the step and behind it. What the force adds to the
+    velocity is what a twist of turn and force moves a body by; to the position it adds the integral of that.
+    """
+    pose, angles, impulse = SE3(), rate * dt, force * dt
+    dt = dt.unsqueeze(-1) if isinstance(dt, Tensor) else dt
+    back = SO3().adjoint(SO3().exp(-angles))  # the axes behind the step from those before it
+    by_angles = pose.right_jacobian(torch.cat([angles, impulse], -1))
+    turn, add = by_angles[..., :3, :3], by_angles[..., 3:, :3]
+    square = angles.square().sum(-1, keepdim=True)
+    third, fall = series(square, one_minus_sinc), series(square, fourth)
+    once = bend(angles, impulse, series(square, half_versine), third)
+    twice = bend(angles, 0.5 * impulse, 2 * third, 2 * fall)
+    cross = torch.linalg.cross(angles, impulse)
+    again = torch.linalg.cross(angles, cross)
+    by_square = -(series(square, fifth) * cross + series(square, _sixth) * again)
+    third, fall = third.unsqueeze(-1), fall.unsqueeze(-1)
+    w, f = skew(angles), skew(impulse)
+    unit = torch.eye(3, dtype=rate.dtype, device=rate.device).expand_as(w)
+    of_angles = 2 * by_square.unsqueeze(-1) * angles.unsqueeze(-2) - third * f - fall * (w @ f + skew(cross))
+    of_force = 0.5 * unit + third * w + fall * (w @ w)
+    zero = torch.zeros_like(unit)
+    rows = [
+        [back, zero, zero, -dt * turn, zero],
+        [-back @ skew(once), back, zero, -dt * add, -dt * turn],
+        [-back @ skew(twice) * dt, back * dt, back, -dt * dt * (back @ of_angles), -dt * dt * (back @ of_force)],
+    ]
+    return torch.cat([torch.cat(row, -1) for row in rows], -2)

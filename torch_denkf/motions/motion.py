@@ -10,12 +10,12 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_values
-from torch_denkf.functional.manifolds import Product
+from torch_denkf.functional.manifolds import Product, Space
 from torch_denkf.modules.tensors import as_vector
 from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
 from torch_denkf.submodel import SubModel, Transition
 
-__all__ = ["Motion", "densities", "integrated", "walked"]
+__all__ = ["Motion", "carried", "corner", "densities", "integrated", "walked"]
 
 
 class Motion(Transition):
@@ -44,6 +44,7 @@ class Motion(Transition):
         check_dt(dt)
         super().__init__(nn.Identity(), [in_key, *actions, *keys_of_dt(dt)], [out_key])
         self.space, self.dt, self.actions = space, dt, actions
+        self.tangents_of, self._timed = (space, space), bool(keys_of_dt(dt))
 
     def move(self, *values: Any, **_: Any) -> Tensor:
         """The states ``[*, P]`` one step later.
@@ -53,6 +54,14 @@ class Motion(Transition):
             **_: ``dt``, seconds, a number or ``[*, 1]``.
         """
         raise NotImplementedError
+
+    def gradient(self, *values: Any, **_: Any) -> Tensor:
+        """The Jacobian ``[*, D, D]`` of :meth:`move`, between tangents, from the same values; it may be left out."""
+        raise NotImplementedError
+
+    def move_and_gradient(self, *values: Any, **dt: Any) -> tuple[Tensor, Tensor]:
+        """Both, which may share what they need."""
+        return self.move(*values, **dt), self.gradient(*values, **dt)
 
     def noise_of_step(self, dt: Any) -> list:
         """The standard deviations ``[D]`` that a step of ``dt`` seconds adds, in the space's tangents.
@@ -80,7 +89,19 @@ class Motion(Transition):
 
     def compute(self, ensemble, *others):
         """The forecast ensemble."""
-        *actions, dt = others if keys_of_dt(self.dt) else (*others, self.dt)
+        actions, dt = self._drivers(ensemble, *others)
+        return self.move(ensemble, *actions, dt=dt)
+
+    def jacobian(self, ensemble, *others):
+        """The forecast ensemble, and the Jacobian between tangents."""
+        actions, dt = self._drivers(ensemble, *others)
+        return self.move_and_gradient(ensemble, *actions, dt=dt)
+
+    def _drivers(self, ensemble: Tensor, *others: Tensor) -> tuple[list[Tensor], Any]:
+        """The actions and the length of the step, beside an ensemble."""
+        actions: list[Any]
+        dt: Any
+        *actions, dt = others if self._timed else (*others, self.dt)
         self.space.check(point=ensemble)
         for (key, size), action in zip(self.actions.items(), actions, strict=True):
             if action.shape[-1:] != (size,):
@@ -89,8 +110,7 @@ class Motion(Transition):
             if dt.shape[-1:] != (1,):
                 raise ValueError(f"{self.dt!r} of {type(self).__name__} is [*B, 1]; got {list(dt.shape)}.")
             dt = dt.to(ensemble.dtype)
-        actions = [action.to(ensemble.dtype).unsqueeze(-2) for action in actions]
-        return self.move(ensemble, *actions, dt=for_members(dt))
+        return [action.to(ensemble.dtype).unsqueeze(-2) for action in actions], for_members(dt)
 
 
 class NoiseOfStep(SubModel):
@@ -108,6 +128,25 @@ class NoiseOfStep(SubModel):
         """The variances of the step."""
         dt = dt.to(mean.dtype).squeeze(-1)
         return torch.stack([torch.zeros_like(dt) + each for each in self.module.noise_of_step(dt)], -1).square()
+
+
+def carried(space: Space, twist: Tensor, dt: Any) -> tuple[Tensor, Tensor]:
+    r"""The Jacobians of :math:`x \exp(d)` by x, and by the rate r of which :math:`d = r \Delta t`: ``[*, D, D]`` each.
+
+    Args:
+        space: of x.
+        twist: :math:`d`, ``[*, D]``.
+        dt: seconds, a number or ``[*, 1]``.
+    """
+    rate = space.right_jacobian(twist)
+    rate = rate * (dt.unsqueeze(-1) if isinstance(dt, Tensor) else dt)
+    return space.adjoint(space.exp(-twist)), rate
+
+
+def corner(above: Tensor, below: Tensor) -> Tensor:
+    """Rows ``[*, N, D]``, and below them those of numbers that a motion does not mix, ``[*, D - N, D - N]``."""
+    padded = nn.functional.pad(below, (above.shape[-2], 0))
+    return torch.cat([above, padded.expand(*above.shape[:-2], *padded.shape[-2:])], -2)
 
 
 def densities(name: str, value: float | Sequence[float] | Tensor, size: int) -> list[float]:

@@ -9,7 +9,7 @@ from tensordict import NestedKey
 
 from torch_denkf._checks import check_number
 from torch_denkf.functional.manifolds import SE2, Euclidean, Product
-from torch_denkf.motions.motion import Motion, integrated, walked
+from torch_denkf.motions.motion import Motion, carried, corner, integrated, walked
 
 __all__ = ["PlanarMotion"]
 
@@ -69,9 +69,21 @@ class PlanarMotion(Motion):
         pose, rest = self.space.points(state)
         speed, turn, errors = rest.split([1, 1, 2], -1)
         arc = torch.cat([turn * dt, speed * dt, torch.zeros_like(turn)], -1)
-        kept = torch.exp(-self.damping * dt) if isinstance(dt, torch.Tensor) else math.exp(-self.damping * dt)
+        kept = self._kept(dt)
         speed = self.usual_speed + kept * (speed - self.usual_speed)
         return torch.cat([SE2().plus(pose, arc), speed, kept * turn, errors], -1)
+
+    def gradient(self, state, *, dt):
+        """That of the pose by itself, by the speed ahead and by the turn rate; and the damping of these."""
+        speed, turn = state[..., 3:4], state[..., 4:5]
+        arc = torch.cat([turn * dt, speed * dt, torch.zeros_like(turn)], -1)
+        by_pose, by_rate = carried(SE2(), arc, dt)
+        by_rate = torch.cat([by_rate[..., :2].flip(-1), torch.zeros_like(by_pose[..., :2])], -1)
+        kept, one = self._kept(dt) * torch.ones_like(speed), torch.ones_like(speed)
+        return corner(torch.cat([by_pose, by_rate], -1), torch.cat([kept, kept, one, one], -1).diag_embed())
+
+    def _kept(self, dt):
+        return torch.exp(-self.damping * dt) if isinstance(dt, torch.Tensor) else math.exp(-self.damping * dt)
 
     def noise_of_step(self, dt):
         """Of turn, ahead and sideways; of speed, turn rate, bias and scale."""

@@ -9,7 +9,7 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number, check_values
-from torch_denkf.functional.manifolds import SE2, SE3, SE23, SO3, Circle, Euclidean, Product, Space, rotate
+from torch_denkf.functional.manifolds import SE2, SE3, SE23, SO3, Circle, Euclidean, Product, Space, rotate, skew
 from torch_denkf.modules.tensors import register_constant
 from torch_denkf.submodel import SubModel
 
@@ -36,17 +36,32 @@ class _Reading(SubModel):
             names = " or ".join(f"{kind.__name__}()" for kind in self.kinds)
             raise TypeError(f"{type(self).__name__} reads a part that is {names}; part {part} of {space} is none.")
         self.space, self.read_space = space, parts[part]
-        self.reading_space = self.read_space if reading_space is None else reading_space
+        self._of_readings(self.read_space if reading_space is None else reading_space)
         self.begin = sum(each.point_dim for each in parts[:part])
+        before = sum(each.tangent_dim for each in parts[:part])
+        self._beside = before, space.tangent_dim - before - self.read_space.tangent_dim
+
+    def _of_readings(self, space: Space) -> None:
+        self.reading_space, self.tangents_of = space, (self.space, space)
 
     def observe(self, point: Tensor) -> Tensor:
         """What is read of the part's points ``[*, P]``, ``[*, Q]``."""
         raise NotImplementedError
 
-    def compute(self, ensemble):
+    def gradient(self, point: Tensor, reading: Tensor) -> Tensor:
+        """The Jacobian of :meth:`observe` from the part's tangents to those of the reading; it may be left out."""
+        raise NotImplementedError
+
+    def compute(self, ensemble, *given):
         """The predicted readings."""
         self.space.check(point=ensemble)
         return self.observe(ensemble.narrow(-1, self.begin, self.read_space.point_dim))
+
+    def jacobian(self, ensemble, *given):
+        """Zero but for the part that is read."""
+        reading = self.compute(ensemble, *given)
+        matrix = self.gradient(ensemble.narrow(-1, self.begin, self.read_space.point_dim), reading)
+        return reading, nn.functional.pad(matrix, self._beside) if any(self._beside) else matrix
 
 
 class PoseOf(_Reading):
@@ -81,6 +96,10 @@ class PoseOf(_Reading):
     def observe(self, point):
         """The same point."""
         return point
+
+    def gradient(self, point, reading):
+        """The identity."""
+        return torch.eye(self.read_space.tangent_dim, dtype=point.dtype, device=point.device)
 
 
 class Magnetic(_Reading):
@@ -123,6 +142,11 @@ class Magnetic(_Reading):
         """The direction in the body's axes."""
         return rotate(_inverse(point), self.field)
 
+    def gradient(self, point, reading):
+        """A turn of the body turns the direction back."""
+        others = self.read_space.tangent_dim - 3
+        return nn.functional.pad(skew(reading), (0, others)) if others else skew(reading)
+
 
 class Gravity(Magnetic):
     """What an accelerometer reads while the velocity is constant: specific force, upwards, in the body's axes.
@@ -164,13 +188,16 @@ class PositionInBody(_Reading):
     Args:
         space: of the states.
         landmark: where it lies in the world, ``[3]``, in the plane ``[2]``; of several ``[L, 3]`` or ``[L, 2]``.
+        landmark_key: in its place, an entry of the data that says it in each row, ``[*B, 3 L]`` or ``[*B, 2 L]``, as
+            for a landmark that is recognised; what a row lacks is hidden by a mask ``[*B, O]`` of the readings.
+        count: L, of the entry.
         part: the place of the pose, ``SE2()``, ``SE3()`` or ``SE23()``, in a ``Product``.
         in_key: states to observe ``[*B, E, P]``.
         out_key: predicted readings ``[*B, E, 3 L]``, in the plane ``[*B, E, 2 L]``.
 
     Raises:
         TypeError: if the part is no pose.
-        ValueError: if landmarks have another shape.
+        ValueError: if landmarks have another shape, or are given twice or not at all.
 
     Example:
         >>> from tensordict import TensorDict
@@ -186,74 +213,118 @@ class PositionInBody(_Reading):
     def __init__(
         self,
         space: Space,
-        landmark: Sequence[float] | Sequence[Sequence[float]] | Tensor,
+        landmark: Sequence[float] | Sequence[Sequence[float]] | Tensor | None = None,
         *,
+        landmark_key: NestedKey | None = None,
+        count: int = 1,
         part: int = 0,
         in_key: NestedKey = ("forecast", "ensemble"),
         out_key: NestedKey = ("forecast", "observation"),
     ):
         super().__init__(space, part, None, in_key, out_key)
+        if (landmark is None) == (landmark_key is None):
+            raise ValueError(f"{type(self).__name__} takes landmark=, or landmark_key= of an entry that says it.")
         size = 2 if isinstance(self.read_space, SE2) else 3
-        _register_vectors(self, "landmark", landmark, [size], [len(landmark), size])
-        self.reading_space = Euclidean(self.landmark.numel())
+        if landmark is None:
+            check_count("count", count)
+            self.in_keys = [in_key, landmark_key]
+        else:
+            _register_vectors(self, "landmark", landmark, [size], [len(landmark), size])
+            count = self.landmark.numel() // size
+        self.size, self.count = size, count
+        self._of_readings(self.space_of_reading(count))
+
+    def space_of_reading(self, count: int) -> Space:
+        """The space of readings of so many landmarks."""
+        return Euclidean(self.size * count)
+
+    def compute(self, ensemble, *given):
+        """The predicted readings."""
+        self.space.check(point=ensemble)
+        point, size = ensemble.narrow(-1, self.begin, self.read_space.point_dim), self.size * self.count
+        if not given:
+            return self.observe(point)
+        if given[0].shape[-1] != size:
+            what = f"{self.count} landmarks of {self.size} numbers"
+            raise ValueError(f"{self.in_keys[1]!r} is [*B, {size}], {what}; got {list(given[0].shape)}.")
+        return self.seen(point, given[0].to(ensemble.dtype).unsqueeze(-2).unflatten(-1, (-1, self.size))).flatten(-2)
 
     def observe(self, point):
-        """The landmarks in the body's axes."""
-        size = self.landmark.shape[-1]
-        away = self.landmark.reshape(-1, size) - point[..., -size:].unsqueeze(-2)
-        if size == 3:
-            return rotate(_inverse(point).unsqueeze(-2), away).flatten(-2)
+        """The landmarks that are known beforehand, one after the other."""
+        return self.seen(point, self.landmark.reshape(-1, self.size)).flatten(-2)
+
+    def gradient(self, point, reading):
+        """A turn of the body turns landmarks back; they come nearer as it moves towards them."""
+        return self._by_pose(reading)
+
+    def _by_pose(self, seen: Tensor) -> Tensor:
+        """The Jacobian ``[*, N L, D]`` of landmarks that lie at ``seen`` ``[*, N L]``."""
+        seen = seen.unflatten(-1, (-1, self.size))
+        turn = skew(seen) if self.size == 3 else torch.stack([seen[..., 1], -seen[..., 0]], -1).unsqueeze(-1)
+        nearer = -torch.eye(self.size, dtype=seen.dtype, device=seen.device).expand(*seen.shape, self.size)
+        between = seen.new_zeros(*seen.shape, self.read_space.tangent_dim - turn.shape[-1] - self.size)
+        return torch.cat([turn, between, nearer], -1).flatten(-3, -2)
+
+    def seen(self, point: Tensor, landmark: Tensor) -> Tensor:
+        """The landmarks ``[*, L, N]`` in the body's axes."""
+        away = landmark - point[..., -self.size :].unsqueeze(-2)
+        if self.size == 3:
+            return rotate(_inverse(point).unsqueeze(-2), away)
         cos, sin = point[..., :1].cos(), point[..., :1].sin()
         x, y = away.unbind(-1)
-        return torch.stack([cos * x + sin * y, cos * y - sin * x], -1).flatten(-2)
+        return torch.stack([cos * x + sin * y, cos * y - sin * x], -1)
 
 
 class RangeBearing(PositionInBody):
-    """How far a landmark in the plane is, and by how much to the left of straight ahead.
+    """Range and bearing of landmarks in the plane: how far, and by how much to the left of straight ahead.
 
-    The second number is an angle: the reading is a point of ``Product(Euclidean(1), Circle())``, ``reading_space``.
+    Of each the second number is an angle: the reading is a point of ``Product(Euclidean(1), Circle(), ...)``,
+    ``reading_space``.
 
     Args:
         space: of the states.
-        landmark: where it lies in the world, ``[2]``.
+        landmark: where it lies in the world, ``[2]``; of several ``[L, 2]``.
+        landmark_key: in its place, an entry of the data that says it in each row, ``[*B, 2 L]``, as for a landmark that
+            is recognised by a barcode.
+        count: L, of the entry.
         part: the place of the pose, ``SE2()``, in a ``Product``.
         in_key: states to observe ``[*B, E, P]``.
-        out_key: predicted readings ``[*B, E, 2]``: the unit of length, and rad.
+        out_key: predicted readings ``[*B, E, 2 L]``: of each the unit of length, and rad.
 
     Raises:
         TypeError: if the part is no pose in the plane.
-        ValueError: if the landmark has another shape.
+        ValueError: if landmarks have another shape, or are given twice or not at all.
 
     Example:
         >>> from tensordict import TensorDict
         >>> pose = torch.tensor([[0.0, 1.0, 0.0]])
-        >>> RangeBearing(SE2(), [1.0, 5.0])(TensorDict({("forecast", "ensemble"): pose}))["forecast", "observation"]
+        >>> td = TensorDict({("forecast", "ensemble"): pose, "post": torch.tensor([1.0, 5.0])})
+        >>> RangeBearing(SE2(), landmark_key="post")(td)["forecast", "observation"]
         tensor([[5.0000, 1.5708]])
     """
 
     kinds = (SE2,)
 
-    def __init__(
-        self,
-        space: Space,
-        landmark: Sequence[float] | Tensor,
-        *,
-        part: int = 0,
-        in_key: NestedKey = ("forecast", "ensemble"),
-        out_key: NestedKey = ("forecast", "observation"),
-    ):
-        super().__init__(space, landmark, part=part, in_key=in_key, out_key=out_key)
-        if self.landmark.ndim != 1:
-            raise ValueError(f"landmark is one, [2]; got {list(self.landmark.shape)}.")
-        self.reading_space = Product(Euclidean(1), Circle())
+    def space_of_reading(self, count):
+        """A length and an angle for each."""
+        return Product(*[Euclidean(1), Circle()] * count)
 
-    def observe(self, point):
-        """Range and bearing; at the landmark itself zero, and so is their gradient."""
-        away = super().observe(point)
+    def seen(self, point, landmark):
+        """Ranges and bearings; at a landmark itself zero, and so is their gradient."""
+        away = super().seen(point, landmark)
         there = (away == 0).all(-1, keepdim=True)
         away = torch.where(there, torch.ones_like(away), away)
         polar = torch.stack([torch.linalg.vector_norm(away, dim=-1), torch.atan2(away[..., 1], away[..., 0])], -1)
         return torch.where(there, torch.zeros_like(polar), polar)
+
+    def gradient(self, point, reading):
+        """That of range and bearing by where each landmark lies, times that of this."""
+        distance, angle = reading.unflatten(-1, (-1, 2)).unbind(-1)
+        ahead = torch.stack([angle.cos(), angle.sin()], -1)
+        across = torch.stack([-ahead[..., 1], ahead[..., 0]], -1) / torch.where(distance == 0, 1, distance)[..., None]
+        rows = torch.stack([ahead, across], -2) * (distance != 0)[..., None, None]
+        turned = self._by_pose((distance[..., None] * ahead).flatten(-2)).unflatten(-2, (-1, 2))
+        return (rows @ turned).flatten(-3, -2)
 
 
 def _inverse(pose: Tensor) -> Tensor:

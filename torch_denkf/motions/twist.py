@@ -9,7 +9,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf.functional.manifolds import SE2, SE3, Euclidean, Product
-from torch_denkf.motions.motion import Motion, densities, integrated, walked
+from torch_denkf.motions.motion import Motion, carried, corner, densities, integrated, walked
 
 __all__ = ["ConstantTwist"]
 
@@ -59,6 +59,12 @@ class ConstantTwist(Motion):
         """The pose moved by its twist."""
         pose, twist = self.space.points(state)
         return torch.cat([self.pose_space.plus(pose, twist * dt), twist], -1)
+
+    def gradient(self, state, *, dt):
+        """That of the pose by itself and by its twist; the twist stays."""
+        twist = self.space.points(state)[1]
+        by_pose, by_rate = carried(self.pose_space, twist * dt, dt)
+        return corner(torch.cat([by_pose, by_rate], -1), torch.eye(self.pose_space.tangent_dim).to(state))
 
     def noise_of_step(self, dt):
         """Of the pose, then of the twist."""

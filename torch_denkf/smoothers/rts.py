@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torch_denkf._registered import compiler
 from torch_denkf.filters import Filter
 from torch_denkf.functional.smoothing.rts import rts_smooth
 from torch_denkf.smoothers.base import Smoother
@@ -56,5 +57,9 @@ class RTSSmoother(Smoother):
 
     def _smooth(self, entries, follows, out):
         space = self.filter.structure.space
-        mean, cov = rts_smooth(*(entries[key] for key in self._needed), follows=follows, lag=self.lag, space=space)
+        values = [entries[key] for key in self._needed]
+        if space is None and self.lag is None:  # all times at once
+            mean, cov = compiler().rts_in_time(*values, follows=follows)
+        else:
+            mean, cov = rts_smooth(*values, follows=follows, lag=self.lag, space=space)
         return mean, cov, cov.diagonal(dim1=-2, dim2=-1)

@@ -22,7 +22,7 @@ def fails(error, match, *, clock=None, name=None, **streams):
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("t,x\n0,1\n1,2\n", r"run.csv lacks the columns \['time'\]; it has \['t', 'x'\]: pass time="),
+        ("tick,x\n0,1\n1,2\n", r"run.csv lacks the columns \['time'\]; it has \['tick', 'x'\]: pass time="),
         ("time,x\n0,1\n1,nan\n", r"run.csv:3: 'x' is 'nan', which is no finite number"),
         ("time,x\n0,1\n\n1,one\n", r"run.csv:4: 'x' is 'one', which is no finite number"),
         ("time,x\n0,1\n1\n", r"run.csv:3: 'x' is ''"),

@@ -214,7 +214,7 @@ def bursts(count=1000):
 def test_times_that_no_log_has(tmp_path, time, seen):
     file = write_csv(tmp_path / "run.csv", time=time, x=np.arange(len(time)))
     with pytest.warns(UserWarning, match=rf"run.csv: 'time' {seen}.*pass unit='ms', 'us' or 'ns'"):
-        Table(file).read()
+        Table(file, unit="s").read()
 
 
 def test_times_that_logs_have(tmp_path):

@@ -19,7 +19,7 @@ from tensordict import TensorDict
 from torch_denkf._checks import check_number
 from torch_denkf.data.cache import cache_folder, cached, stamp
 from torch_denkf.data.pictures import CURE, decode_picture, picture_files, scaled, text_of_size, unnamed_file
-from torch_denkf.data.recordings.tables import check_stream, check_times, read_numbers
+from torch_denkf.data.recordings.tables import check_stream, check_times, given_times
 from torch_denkf.data.text import read_number
 from torch_denkf.data.video import NOT_DECODED, decoded_frames, say_if_cut
 from torch_denkf.deployment.files import clear_errors
@@ -105,22 +105,11 @@ class Frames:
     def _times(self, source: Path, stored: TensorDict) -> np.ndarray:
         if self.times is None:
             return self._own_times(source, stored) + self.start
-        given = self.times
-        if isinstance(given, (str, Path)):
-            _, numbers, where = read_numbers(Path(given).expanduser(), self.time, [])
-            times = numbers[:, 0]
-            check_times(times * SECONDS[self.unit], where, self.time)
-        else:
-            if np.ma.is_masked(given):
-                raise ValueError(f"times of {source} has masked elements; pass a time for each picture")
-            times = np.asarray(given, dtype=np.float64).reshape(-1)
-            check_times(times * SECONDS[self.unit], "times[{}]".format, self.time)
         # Damaged pictures are not stored: the place of each tells which time is its own.
-        place, there = stored["place"].numpy(), int(stored["count"][0])
-        if len(times) != there:
-            name = given if isinstance(given, (str, Path)) else "times"
-            raise ValueError(f"{name} has {len(times)} times, but {source} has {there} pictures; it needs one for each")
-        return times[place] * SECONDS[self.unit] + self.start
+        kept, there = stored["place"].numpy(), int(stored["count"][0])
+        times, place = given_times(self.times, self.time, str(source), there, "pictures")
+        check_times(times * SECONDS[self.unit], place, self.time)
+        return times[kept] * SECONDS[self.unit] + self.start
 
     def _decode(
         self, source: Path, files: list[Path], size: tuple[int, int], folder: Path | None, progress: bool

@@ -185,6 +185,12 @@ class Product(_Made):
         object.__setattr__(self, "point_dim", sum(part.point_dim for part in parts))
         object.__setattr__(self, "tangent_dim", sum(part.tangent_dim for part in parts))
 
+    def exp_and_jacobian(self, tangent):
+        """Returns those of the parts, side by side and as blocks."""
+        pairs = [part.exp_and_jacobian(own) for part, own in zip(self.parts, self._apart("exp", tangent), strict=True)]
+        points, jacobians = zip(*pairs, strict=True)
+        return torch.cat(points, -1), blocks(jacobians)
+
     def neutral(self, like=None):
         """Returns those of the parts."""
         return torch.cat([part.neutral(like) for part in self.parts])

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_denkf.functional.kernels.small_system import made_once
+
 __all__ = ["quaternion_of", "quaternion_product", "rotate", "rotation_matrix", "skew"]
 
 
@@ -13,21 +15,26 @@ def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
     a, b = first[..., :1], first[..., 1:]
     c, d = second[..., :1], second[..., 1:]
     w = a * c - (b * d).sum(-1, keepdim=True)
-    return torch.cat([w, a * d + c * b + torch.linalg.cross(*torch.broadcast_tensors(b, d))], -1)
+    return torch.cat([w, torch.addcmul(torch.addcmul(_cross(b, d), c, b), a, d)], -1)
 
 
 def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
     """A vector ``[*, 3]`` in the body's axes, turned into the world's by a quaternion ``[*, 4]``."""
     w, axis = quaternion[..., :1], quaternion[..., 1:]
-    axis, vector = torch.broadcast_tensors(axis, vector)
-    twice = 2 * torch.linalg.cross(axis, vector)
-    return vector + w * twice + torch.linalg.cross(axis, twice)
+    twice = 2 * _cross(axis, vector)
+    return torch.addcmul(vector, w, twice) + _cross(axis, twice)
+
+
+def _cross(first: Tensor, second: Tensor) -> Tensor:
+    if first.ndim != second.ndim:  # torch pads no dimensions
+        first, second = torch.broadcast_tensors(first, second)
+    return torch.linalg.cross(first, second)
 
 
 def rotation_matrix(quaternion: Tensor) -> Tensor:
     """The matrix ``[*, 3, 3]`` of a quaternion ``[*, 4]``: its columns are the body's axes in the world's."""
     axes = torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)
-    return torch.stack([rotate(quaternion, axis) for axis in axes], -1)
+    return rotate(quaternion.unsqueeze(-2), axes).mT
 
 
 def quaternion_of(matrix: Tensor) -> Tensor:
@@ -47,10 +54,8 @@ def quaternion_of(matrix: Tensor) -> Tensor:
 
 def skew(vector: Tensor) -> Tensor:
     """The matrix ``[*, 3, 3]`` whose product with another vector is the cross product with it."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    axes = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return _cross(vector.unsqueeze(-2), axes).mT
 
 
 def products(point: Tensor) -> Tensor:
@@ -61,7 +66,11 @@ def products(point: Tensor) -> Tensor:
 
 
 def conjugate(quaternion: Tensor) -> Tensor:
-    return torch.cat([quaternion[..., :1], -quaternion[..., 1:]], -1)
+    return quaternion * made_once(("conjugate", quaternion.dtype, quaternion.device), lambda: _signs(quaternion))
+
+
+def _signs(like: Tensor) -> Tensor:
+    return torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=like.dtype, device=like.device)
 
 
 def unit(quaternion: Tensor) -> Tensor:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torch_denkf.functional.angles import wrap_angles
+from torch_denkf.functional.kernels.small_system import made_once
 from torch_denkf.functional.manifolds.quaternions import (
     conjugate,
     products,
@@ -162,8 +163,9 @@ class _RotationAndVectors(Space):
         """Maps a tangent, a constant rate of all, to the point that it leads to."""
         angles = tangent[..., :3]
         square = angles.square().sum(-1, keepdim=True)
-        quaternion = torch.cat([series(square, cos_half), 0.5 * series(square, sinc_half) * angles], -1)
-        return self._bent(quaternion, angles, tangent, series(square, half_versine), series(square, one_minus_sinc))
+        w, share, *bends = several(square, *_EXP[: 4 if self.vectors else 2])
+        quaternion = torch.cat([w, 0.5 * share * angles], -1)
+        return self._bent(quaternion, angles, tangent, *bends) if self.vectors else quaternion
 
     def log(self, point):
         """The shorter rotation, and what leads to the vectors meanwhile."""
@@ -193,8 +195,8 @@ class _RotationAndVectors(Space):
         square = back[..., :3].square().sum(-1)[..., None, None]
         turn = skew(back[..., :3])
         turn2 = turn @ turn
-        third = series(square, one_minus_sinc)
-        block = eye(back[..., :3], 3) + series(square, half_versine) * turn + third * turn2
+        half, third = several(square, half_versine, one_minus_sinc)
+        block = torch.addcmul(torch.addcmul(eye(back[..., :3], 3), half, turn), third, turn2)
         if not self.vectors:
             return block
         move = skew(self._vectors(back, 3))
@@ -205,6 +207,15 @@ class _RotationAndVectors(Space):
         low = low + series(square, fourth) * (turn @ both + move @ turn2 - 3 * around)
         low = low + series(square, fifth) * (around @ turn + turn @ around)
         return self._matrix(block, low)
+
+    def exp_and_jacobian(self, tangent):
+        """For a rotation alone from three functions of its angle."""
+        if self.vectors or torch.compiler.is_compiling():
+            return super().exp_and_jacobian(tangent)
+        w, share, third = several(tangent.square().sum(-1, keepdim=True), cos_half, sinc_half, one_minus_sinc)
+        share, turn = 0.5 * share, skew(tangent)
+        half = torch.addcmul(eye(tangent, 3), (share * share).unsqueeze(-1), turn, value=-2)  # 1 - cos = 2 sin^2
+        return torch.cat([w, share * tangent], -1), torch.addcmul(half, third.unsqueeze(-1), turn @ turn)
 
     def adjoint(self, point):
         """Solà et al., eq. 175."""
@@ -321,8 +332,24 @@ def series(square: Tensor, function: Function) -> Tensor:
     return torch.where(small, near, function.formula(safe))
 
 
+def several(square: Tensor, *functions: Function) -> Sequence[Tensor]:
+    """Returns the :func:`series` of several functions of squares ``[*, 1]``, in fewer calls."""
+    if torch.compiler.is_compiling():
+        return [series(square, function) for function in functions]
+    dtype, device = square.dtype, square.device
+    key = ("series", *map(id, functions), dtype, device)
+    first, *others = made_once(
+        key, lambda: torch.tensor([each.terms[::-1] for each in functions], dtype=dtype, device=device).mT.contiguous()
+    ).unbind()
+    small = square < _SMALL[dtype]
+    safe, near = torch.where(small, 1.0, square).sqrt(), first
+    for terms in others:
+        near = torch.addcmul(terms, near, square)
+    return torch.where(small, near, torch.cat([each.formula(safe) for each in functions], -1)).split(1, -1)
+
+
 cos_half = Function(lambda a: (a / 2).cos(), (1.0, -1 / 8, 1 / 384, -1 / 46080))
-sinc_half = Function(lambda a: (a / 2).sin() / (a / 2), (1.0, -1 / 24, 1 / 1920, -1 / 322560))
+sinc_half = Function(lambda a: (a / 2).sin() * 2 / a, (1.0, -1 / 24, 1 / 1920, -1 / 322560))
 sinc = Function(lambda a: a.sin() / a, (1.0, -1 / 6, 1 / 120, -1 / 5040))
 half_versine = Function(lambda a: (1 - a.cos()) / a**2, (1 / 2, -1 / 24, 1 / 720, -1 / 40320))
 one_minus_sinc = Function(lambda a: (a - a.sin()) / a**3, (1 / 6, -1 / 120, 1 / 5040, -1 / 362880))
@@ -335,6 +362,9 @@ inverse_third = Function(
     lambda a: (1 - a / 2 * (a / 2).cos() / (a / 2).sin()) / a**2,
     (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600),
 )
+
+#: What the exponential of a rotation needs, and behind it that of the vectors which it turns.
+_EXP = (cos_half, sinc_half, half_versine, one_minus_sinc)
 
 
 def bend(turn: Tensor, vector: Tensor, half: Tensor, third: Tensor) -> Tensor:

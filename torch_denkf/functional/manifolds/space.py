@@ -67,6 +67,10 @@ class Space:
         r"""J with :math:`\exp(d + \delta) \approx \exp(d) \exp(J \delta)`: ``[*, D, D]`` of ``[*, D]``."""
         raise NotImplementedError
 
+    def exp_and_jacobian(self, tangent: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns :meth:`exp` and :meth:`right_jacobian`, which may share what they need."""
+        return self.exp(tangent), self.right_jacobian(tangent)
+
     def adjoint(self, point: Tensor) -> Tensor:
         r"""A with :math:`x \exp(d) x^{-1} = \exp(A d)`: ``[*, D, D]`` of ``[*, P]``."""
         raise NotImplementedError

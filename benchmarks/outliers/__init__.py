@@ -1,0 +1,1 @@
+"""Readings of which a share is wrong: a cart."""

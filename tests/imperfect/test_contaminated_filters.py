@@ -1,0 +1,277 @@
+"""Filters of readings of which a share is wrong: every way to run one is the same, and so are late readings."""
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torch.testing import assert_close
+from torchrl.envs import TransformedEnv
+
+from tests.filters import test_spaces as spaces
+from tests.filters.composed import ReplayedFrames
+from tests.filters.factories import FixedEnsemble, linear_denkf, linear_kalman, linear_system
+from tests.imperfect.test_visible_filters import CERTAIN, KINDS, MAKERS, certain, frames
+from torch_denkf import DEnKFTransform
+from torch_denkf.deployment import export_step, load_step
+from torch_denkf.functional.manifolds import SO3
+from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
+from torch_denkf.imperfect import Contaminated
+from torch_denkf.imperfect.mixture import log_mixture, mix_moments
+from torch_denkf.modules import (
+    AroundState,
+    GaussianAround,
+    LearnedTransition,
+    LinearObservation,
+    LinearTransition,
+    MomentPrior,
+)
+from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss
+from torch_denkf.smoothers import EnRTS, FixedLag, RTSSmoother
+
+
+def contaminated(filter, share="visible", **options):
+    """The filter, whose readings are wrong in the share that an entry says."""
+    return filter.with_modules(analysis=Contaminated(filter["analysis"], share, **options))
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_steps_are_the_sequence_and_the_compiled_sequence(float64, name):
+    divergence = 0.0 if name == "particles" else 0.1
+    filter, td = contaminated(MAKERS[name](), width=4.0, divergence=divergence), frames(2, 6)
+    filter.draw_noise(td)
+    whole, belief = filter.sequence(td.copy()), None
+    share = whole["info", "outlier"]
+    assert ((share > 0) & (share < 1)).any()
+    for t in range(6):
+        row = td[:, t].copy()
+        out = filter.initialise(row) if belief is None else filter.step(row.update(belief))
+        belief = out.select(*filter.belief_keys)
+        for key in filter.belief_keys:
+            assert_close(belief[key], whole[key][:, t], rtol=0, atol=1e-12)
+    compiled = filter.compile(chunk=2, backend="eager").sequence(td.copy())
+    for key in filter.out_keys:
+        assert_close(compiled[key], whole[key], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["etkf", "Kalman", "EKF"])
+def test_a_start_in_the_middle_is_a_start(float64, name):
+    filter, td = contaminated(MAKERS[name]()), frames(2, 8)
+    td["is_init"][:, 5] = True
+    whole, late = filter.sequence(td.copy()), filter.sequence(td[:, 5:].copy())
+    for key in filter.belief_keys:
+        assert_close(whole[key][:, 5:], late[key], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["etkf", "Kalman"])
+def test_it_goes_through_an_environment(float64, name):
+    filter, td = contaminated(MAKERS[name]()), frames(2, 6)
+    td["action"] = torch.zeros(2, 6, 1)
+    env = TransformedEnv(ReplayedFrames(td), DEnKFTransform(contaminated(MAKERS[name]())))
+    out = env.rollout(5, auto_reset=True)["next"]
+    whole = filter.sequence(td.copy())
+    for key in (("belief", "mean"), ("belief", "var")):
+        assert_close(out[key], whole[key][:, 1:], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["etkf", "Kalman"])
+def test_a_packaged_step_is_the_step(name, tmp_path):
+    filter, td = contaminated(MAKERS[name](), 0.3, width=4.0), frames(4).exclude("is_init", "visible")
+    row = filter.initialise(td[0])
+    step = load_step(export_step(filter, row, tmp_path / "step.pt2", compiled=False))
+    row = filter.draw_noise(row.select(*filter.carry_keys).update(td[1]))
+    with torch.no_grad():
+        found = step({key: row[tuple(key.split("."))] for key in step.inputs})
+        out = filter.step(row)
+    for key, value in found.items():
+        assert_close(value, out[tuple(key.split("."))], rtol=1e-5, atol=1e-5, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", CERTAIN)
+@pytest.mark.parametrize("lag", [0, 3])
+def test_certain_outliers_are_missing(float64, name, lag):
+    """A share of 0 is the reading, a share of 1 a missing observation, also for the past of a lag."""
+    told, masked = certain(frames(2, 9))
+    told["visible"] = 1 - told["visible"]
+    outs = []
+    for filter, td in ((contaminated(MAKERS[name](), width=1e6), told), (MAKERS[name](), masked)):
+        filter = FixedLag(filter, lag) if lag else filter
+        torch.manual_seed(3)
+        outs.append(filter.sequence(td.copy()))
+    for key in [*filter.belief_keys, *([("smoothed", "mean"), ("smoothed", "var")] if lag else [])]:
+        assert_close(outs[0][key], outs[1][key], rtol=0, atol=1e-5)
+
+
+def late(kind, r=1.0, *, analysis=None, delay=2):
+    F, Q, H, R = linear_system()
+    sensors = {
+        "late": FusedSensor(LinearObservation(H), r * R.sqrt(), delay=delay, analysis=analysis),
+        "own": FusedSensor(LinearObservation(H), R.sqrt()),
+    }
+    if kind == "ensemble":
+        moves = torch.nn.Linear(2, 2, bias=False)
+        moves.weight.data = F
+        members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+        return FusedFilter(LearnedTransition(moves, residual=False), sensors, initial=FixedEnsemble(members))
+    return FusedFilter(LinearTransition(F, Q), sensors, initial=MomentPrior(torch.zeros(2), torch.eye(2)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("delay", [0, 2])
+def test_late_readings_have_the_moments_of_both_histories(float64, kind, delay):
+    """One late reading at the end: the mixture of the filters of narrow and of wide noise; others stay as they are."""
+
+    def analysis(*args, **keys):
+        return Contaminated(KINDS[kind](*args, **keys), 0.3, width=5.0)
+
+    td = frames(2, 7).rename_key_("observation", "late").exclude("visible", "observed")
+    td["own"] = torch.randn(2, 7, 2)
+    td["late_observed"] = torch.zeros(2, 7, 1, dtype=torch.bool)
+    td["late_observed"][:, -1] = True
+    td["late"] = torch.full((2, 7, 2), torch.nan)
+    td["late"][:, -1] = torch.tensor([[1.5, -1.0], [0.3, 0.2]])
+    td["own_observed"] = ~td["late_observed"]  # the last reading alone is the late one
+    mixed, sound, wide = (
+        late(kind, r, analysis=a, delay=delay).sequence(td.copy())[:, -1]
+        for r, a in ((1.0, analysis), (1.0, None), (5.0, None))
+    )
+    scores = [out["info", "late", "log_likelihood"] for out in (sound, wide)]
+    odds = 0.3 / 0.7 * (scores[1] - scores[0]).exp()
+    q = mixed["info", "late", "outlier"]
+    assert_close(q, odds / (1 + odds), rtol=1e-6, atol=0)
+    assert_close(mixed["info", "log_likelihood"], log_mixture(torch.tensor(0.7), *scores), rtol=1e-6, atol=0)
+    beliefs = [("belief", "mean"), ("belief", "cov")]
+    covs = [
+        out["belief", "cov"] if kind != "ensemble" else torch.stack([one.T.cov() for one in out["belief", "ensemble"]])
+        for out in (mixed, sound, wide)
+    ]
+    means = [out[beliefs[0]] for out in (mixed, sound, wide)]
+    mean, cov = mix_moments(1 - q, means[1], covs[1], means[2], covs[2])
+    assert_close(means[0], mean, rtol=0, atol=1e-7)
+    assert_close(covs[0], cov, rtol=0, atol=1e-7)
+    if delay and kind != "ensemble":
+        ends = [out["smoothed", "mean"] for out in (mixed, sound, wide)]
+        assert_close(ends[0], ends[2] + (1 - q) * (ends[1] - ends[2]), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["etkf", "Kalman", "particles"])
+def test_late_readings_are_filtered_again(float64, name):
+    """Refiltering, which makes the steps again: the reading where it belongs."""
+    filter, td = contaminated(MAKERS[name](), 0.3, width=4.0), frames(6).exclude("visible", "is_init")
+    td["observed"] = torch.ones(6, 1, dtype=torch.bool)
+    td["observation"] = td["observation"].nan_to_num()
+    td["observed"][3] = False
+    filter.draw_noise(td)
+    delayed = td.copy()
+    delayed["late"] = torch.zeros(6, 1, dtype=torch.int64)
+    delayed["late"][-1] = 2
+    delayed["observation"][-1] = torch.tensor([2.0, -1.0])
+    order = td.copy()
+    order["observation"][3], order["observed"][3], order["observed"][-1] = torch.tensor([2.0, -1.0]), True, False
+    late = Refiltering(filter, {"late": ("observation", "observed")}, lag=2).sequence(delayed)
+    assert_close(late["belief", "mean"][-1], filter.sequence(order)["belief", "mean"][-1], rtol=0, atol=1e-12)
+
+
+def test_one_sensor_of_several_fails(float64):
+    """Each sensor has its own share; the belief stays near the truth where the other's readings are sound."""
+    td = frames(200, 12).rename_key_("observation", "late").exclude("visible", "observed")
+    td["late"], td["own"] = 0.3 * torch.randn(200, 12, 2), 0.3 * torch.randn(200, 12, 2)
+    wrong = torch.rand(200, 12, 1) < 0.3
+    td["late"] = torch.where(wrong, td["late"] + 5 * torch.randn(200, 12, 2), td["late"])
+    whole = late("EKF", delay=0, analysis=lambda *a, **k: Contaminated(KINDS["EKF"](*a, **k), 0.3, noise=[5.0, 5.0]))
+    plain = late("EKF", delay=0)
+    mixed, alone = (filter.sequence(td.copy()) for filter in (whole, plain))
+    assert ("info", "own", "outlier") not in mixed.keys(True, True)
+    found = mixed["info", "late", "outlier"][:, 1:] > 0.5
+    assert (found == wrong[:, 1:]).double().mean() > 0.9
+    errors = [out["belief", "mean"][:, 1:].square().mean() for out in (mixed, alone)]
+    assert errors[0] < 0.2 * errors[1]
+
+
+def test_smoothers_run_behind_it(float64):
+    td = frames(2, 8)
+    for make, smoother in ((linear_denkf, EnRTS), (linear_kalman, RTSSmoother)):
+        out = smoother(contaminated(make()))(td.copy())
+        assert_close(out["smoothed", "mean"][:, -1], out["belief", "mean"][:, -1])
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_step_without_the_reading_is_the_forecast(float64, name):
+    filter = contaminated(MAKERS[name](), width="width")
+    td = filter.initialise(frames(2, 3)[:, 0])
+    td["width"] = torch.full((2, 1), 3.0)
+    torch.manual_seed(1)
+    hidden = filter.step(td.copy().set("observed", torch.zeros(2, 1, dtype=torch.bool)))
+    torch.manual_seed(1)
+    left = ["observation", "visible", "width"]
+    td = td.exclude(*left, "observed")
+    out = filter.step(td, without=left) if name == "Kalman" else filter.predict(td)
+    for key in filter.belief_keys:
+        assert_close(out[key], hidden[key])
+
+
+LOSSES = {"etkf": DEnKFLoss, "Kalman": GaussianLoss, "UKF": GaussianLoss}
+LOSSES["particles"] = partial(MixtureLoss, score="crps")
+
+
+@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("term", ["state", "nll"])
+def test_losses_train_share_width_and_head(float64, name, term):
+    head = torch.nn.Linear(1, 1)
+    share = TensorDictModule(torch.nn.Sequential(head, torch.nn.Sigmoid()), [("info", "nis")], ["share"])
+    td = frames(3, 5).set("state", torch.randn(3, 5, 2)).exclude("visible")
+    for options in ({"share": 0.2, "trainable": True}, {"share": share, "trainable": True}):
+        filter = contaminated(MAKERS[name](), **options)
+        loss = LOSSES[name](filter, **{**dict.fromkeys(("state", "transition", "sensor"), 0.0), term: 1.0})
+        parameters = list(filter["analysis"].quantities.parameters())
+        assert len(parameters) == (3 if options["share"] is share else 2)
+        for gradient in torch.autograd.grad(loss(td)[f"loss_{term}"], parameters):
+            assert gradient.isfinite().all()
+            assert gradient.abs().max() > 0
+
+
+def late_on_space(kind):
+    """Orientations whose readings come two steps late."""
+
+    def analysis(*args, **keys):
+        return Contaminated(
+            KINDS["ensemble" if kind == "etkf" else kind](*args, **keys), 0.3, width=5.0, divergence=0.1
+        )
+
+    space = {"state_key": "start", "space": spaces.SPACE}
+    start = (
+        AroundState(spaces.STD, ensemble_size=24, **space) if kind == "etkf" else GaussianAround(spaces.STD, **space)
+    )
+    options = {"reading_space": SO3(), "observed_key": "observed", "delay": 2, "analysis": analysis}
+    sensor = FusedSensor(spaces.Orientation(), spaces.R, **options)
+    return FusedFilter(spaces.Turning(), {"pose": sensor}, initial=start, process_noise=spaces.Q)
+
+
+@pytest.mark.parametrize("kind", ["EKF", "UKF", "etkf", "particles", "late EKF", "late etkf"])
+def test_orientations_turn_with_the_world_and_steps_are_the_sequence(float64, kind):
+    """Readings of which a share is wrong: a world that is turned changes nothing else, a past included."""
+    divergence = 0.0 if kind == "particles" else 0.1
+    filter = (
+        late_on_space(kind.split()[-1])
+        if "late" in kind
+        else contaminated(spaces.make(kind), 0.3, width=5.0, divergence=divergence)
+    )
+    data = spaces.log()
+    wrong = torch.rand(*data.shape, 1) < 0.3
+    data["pose"] = torch.where(wrong, SO3().plus(data["pose"], 0.5 * torch.randn(*data.shape, 3)), data["pose"])
+    data = spaces.with_noise(filter, data)
+    turn = SO3().exp(torch.randn(3))
+    here, there = spaces.turned_beliefs(filter, turn, data)
+    outlier = here["info", "outlier"]
+    assert ((outlier > 0.1) & (outlier < 0.9)).sum() > 3
+    tolerance = 1e-6 if kind == "particles" else 1e-7
+    moved = spaces.turned(turn, here["belief", "mean"])
+    assert spaces.SPACE.minus(there["belief", "mean"], moved).abs().max() < tolerance
+    assert_close(there["belief", "var"], here["belief", "var"], rtol=0, atol=tolerance)
+    assert_close(there["info", "log_likelihood"], here["info", "log_likelihood"], rtol=0, atol=1e-5)
+    belief = None
+    for t in range(5):
+        row = data[:, t].copy().set("action", data["action"][:, max(t - 1, 0)])  # that led here
+        out = filter.initialise(row) if belief is None else filter.step(row.update(belief))
+        belief = out.select(*filter.belief_keys)
+        assert_close(out["belief", "mean"], here["belief", "mean"][:, t], rtol=0, atol=1e-10)

@@ -1,0 +1,249 @@
+"""Oracle: automatic differentiation, by which the same filter steps when no sub-model knows its Jacobian."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torch.testing import assert_close
+
+from tests.motions.steps_for_tests import MOTIONS, frame, random_points
+from tests.motions.test_readings import DEEP, READINGS
+from torch_denkf.functional.jacobians import jacobian_of_network
+from torch_denkf.functional.manifolds import SO3, Euclidean, Opposite
+from torch_denkf.fusion.parts import JoinedObservation, LinearMembers, OfOwnErrors, StateObservation
+from torch_denkf.imperfect import FadingBias
+from torch_denkf.imperfect.bias import BiasedObservation, BiasedTransition
+from torch_denkf.modules import (
+    ConstantNoise,
+    EKFAnalysis,
+    EKFTransition,
+    LearnedObservation,
+    LearnedTransition,
+    LinearObservation,
+    LinearTransition,
+    Select,
+    StochasticMLP,
+)
+from torch_denkf.motions import AttitudeMotion, Gravity
+from torch_denkf.submodel import SubModel
+
+ACTIVATIONS = {
+    "relu": nn.ReLU,
+    "leaky": lambda: nn.LeakyReLU(0.2),
+    "elu": lambda: nn.ELU(0.7),
+    "tanh": nn.Tanh,
+    "sigmoid": nn.Sigmoid,
+    "silu": nn.SiLU,
+    "silu in place": lambda: nn.SiLU(inplace=True),
+    "softplus": lambda: nn.Softplus(2.0, threshold=1.0),
+}
+
+
+def mlp(n_in, n_out, activation=nn.Tanh, layer="none"):
+    return StochasticMLP(n_in, n_out, (7, 6), layer=layer, activation=activation)
+
+
+def chain(n_in, n_out):
+    return nn.Sequential(nn.Sequential(nn.Linear(n_in, 5), nn.ELU()), nn.Identity(), nn.Linear(5, n_out, bias=False))
+
+
+def scaled(network, **options):
+    where = {"loc": [1.0, 2.0, -1.0], "scale": [2.0, 0.5, 3.0]}
+    return lambda: LearnedTransition(network(), **where, **options)
+
+
+def linear(**options):
+    return LinearTransition(torch.randn(3, 3), torch.eye(3), trainable=True, **options)
+
+
+def of_own_errors():
+    bias = FadingBias([1.0, 1.0], time=3.0)
+    return OfOwnErrors(BiasedObservation(LearnedObservation(mlp(3, 2)), bias), [2, 0], 3)
+
+
+def of_a_sensor(observation, name):
+    keys = {"reading_keys": ["reading", "noise"], "observed_key": "observed"}
+    return StateObservation(observation, ("forecast", "ensemble"), name, **keys)
+
+
+def side_by_side():
+    models = {"a": of_a_sensor(Select([1]), "a"), "b": of_a_sensor(LearnedObservation(mlp(3, 1)), "b")}
+    keys = {"predicted_key": ("forecast", "observation"), "observed_key": ("forecast", "observed")}
+    return JoinedObservation(models, [None, None], **keys)
+
+
+TRANSITIONS = {
+    **{kind: lambda layer=kind: LearnedTransition(mlp(3, 3, layer=layer)) for kind in ("none", "dropout", "flipout")},
+    "linear": lambda: LearnedTransition(nn.Linear(3, 3), residual=False),
+    "chain": lambda: LearnedTransition(chain(3, 3)),
+    "identity": lambda: LearnedTransition(nn.Identity()),
+    "activation alone": lambda: LearnedTransition(nn.Tanh()),
+    "action and dt": scaled(lambda: mlp(5, 3), action_key="action", action_loc=[1.0, 0.0], dt_key="dt"),
+    "dt": scaled(lambda: chain(3, 3), dt_key="dt"),
+    "not residual": scaled(lambda: chain(3, 3), residual=False),
+    "matrices": lambda: LinearMembers(linear(control=torch.randn(3, 2))),
+    "biased": lambda: BiasedTransition(LearnedTransition(mlp(2, 2)), FadingBias([1.0], time=3.0)),
+}
+OBSERVATIONS = {
+    "mlp": lambda: LearnedObservation(mlp(3, 2, nn.ReLU), loc=[1.0, 0.0, 2.0], scale=[2.0, 1.0, 0.5]),
+    "select": lambda: Select([2, 0, 2]),
+    "linear": lambda: LinearObservation(torch.randn(2, 3)),
+    "of a fused sensor": lambda: of_a_sensor(LearnedObservation(mlp(3, 2)), ("forecast", "observation")),
+    "biased": lambda: BiasedObservation(LearnedObservation(mlp(2, 1)), FadingBias([1.0], time=3.0)),
+    "biased factor": lambda: BiasedObservation(Select([0, 1]), FadingBias([1.0], time=3.0, factor=True), dims=[1]),
+    "errors of others": of_own_errors,
+    "side by side": side_by_side,
+}
+
+
+def entries(size, *batch, space=None, **others):
+    tangents = size if space is None else space.tangent_dim
+    root = torch.randn(*batch, tangents, tangents)
+    mean = torch.randn(*batch, size) if space is None else random_points(space, *batch)
+    moments = {"mean": mean, "cov": root @ root.mT + torch.eye(tangents)}
+    return TensorDict({"belief": dict(moments), "forecast": dict(moments), **others}, batch)
+
+
+def known_and_differentiated(monkeypatch, module, td, *, parameters=()):
+    """What a step writes and its gradients, by the Jacobian that the sub-model knows, and without it."""
+    results = []
+    for forget in (False, True):
+        if forget:
+            monkeypatch.setattr("torch_denkf.modules.ekf.linearise", lambda *_: None)
+        else:
+            monkeypatch.setattr("torch_denkf.modules.ekf._differentiated", None)  # it is not called
+        out = module(td.copy())
+        monkeypatch.undo()
+        values = [out.get(key) for key in module.out_keys]
+        total = sum((value * torch.arange(1.0, value.numel() + 1).reshape(value.shape).sin()).sum() for value in values)
+        grads = torch.autograd.grad(total, parameters, materialize_grads=True) if total.requires_grad else ()
+        results.append([*values, *grads])
+    return results
+
+
+def moving(transition, size, **options):
+    noise = ConstantNoise([0.3] * size, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    return EKFTransition(transition, noise, **options)
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+@pytest.mark.parametrize("name", TRANSITIONS)
+def test_a_transition_knows_its_jacobian_and_its_gradient(float64, monkeypatch, name, batch):
+    transition = TRANSITIONS[name]()
+    td = entries(3, *batch, action=torch.randn(*batch, 2), dt=torch.rand(*batch, 1))
+    both = known_and_differentiated(monkeypatch, moving(transition, 3), td, parameters=list(transition.parameters()))
+    assert_close(*both, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("batch", [(), (4,)])
+@pytest.mark.parametrize("name", OBSERVATIONS)
+def test_an_observation_knows_its_jacobian_and_its_gradient(float64, monkeypatch, name, batch):
+    observation = OBSERVATIONS[name]()
+    size = {"errors of others": 6}.get(name, 3)
+    outputs = {"select": 3, "biased": 1, "biased factor": 2}.get(name, 2)
+    mask = torch.rand(*batch, 1 if name == "side by side" else outputs) > 0.3
+    td = entries(size, *batch, reading=torch.randn(*batch, outputs), noise=torch.rand(*batch, outputs), observed=mask)
+    masks = {"observed_key": ("forecast", "observed")} if name == "side by side" else {}
+    update = EKFAnalysis(observation, observation_key="reading", noise_variance_key="noise", **masks)
+    both = known_and_differentiated(monkeypatch, update, td, parameters=list(observation.parameters()))
+    assert_close(*both, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_chains_of_layers(float64, name):
+    network = nn.Sequential(nn.Linear(4, 5), ACTIVATIONS[name](), nn.Linear(5, 5), ACTIVATIONS[name](), nn.Linear(5, 3))
+    x = 2 * torch.randn(6, 4)
+    x[0], x[1] = 0.0, 30.0
+    parameters = list(network.parameters())
+    value, jacobian = jacobian_of_network(network, x, 2)
+    expected = torch.func.vmap(torch.func.jacrev(network))(x)[..., :2]
+    assert_close(value, network(x), rtol=1e-12, atol=1e-12)
+    assert_close(jacobian, expected, rtol=1e-10, atol=1e-10)
+    ours, theirs = (
+        torch.autograd.grad(each.sin().sum(), parameters[:-1], materialize_grads=True) for each in (jacobian, expected)
+    )
+    assert_close(ours, theirs, rtol=1e-10, atol=1e-10)
+
+
+def test_what_a_chain_does_not_know_is_differentiated():
+    x = torch.zeros(1, 3)
+    others = [nn.LayerNorm(3), nn.Sequential(nn.Linear(3, 3), nn.GELU("tanh")), lambda x: x, nn.ReLU6()]
+    weighted = nn.utils.parametrizations.weight_norm(nn.Linear(3, 3))
+    hooked, outer = nn.Linear(3, 3), nn.Sequential(nn.Linear(3, 3))
+    for layer in (hooked, outer):
+        layer.register_forward_hook(lambda module, read, out: 2 * out)
+    for network in (*others, weighted, hooked, outer, nn.Sequential(hooked)):
+        assert jacobian_of_network(network, x, 3) is None
+
+
+@pytest.mark.parametrize("kind", ["compute", "hook", "wrapper"])
+def test_who_changes_what_a_sub_model_computes_changes_its_jacobian(float64, kind):
+    """Oracle: the factor."""
+
+    class Doubled(Select):
+        def observe(self, state):
+            return 2 * super().observe(state)
+
+    observation = Doubled([0]) if kind == "compute" else Select([0])
+    if kind == "hook":
+        observation.register_forward_hook(
+            lambda module, read, out: out.set(("forecast", "observation"), 2 * out["forecast", "observation"])
+        )
+    if kind == "wrapper":
+
+        class Twice(StateObservation):
+            def on_entries(self, entries, call):
+                return {key: 2 * value for key, value in super().on_entries(entries, call).items()}
+
+        keys = {"reading_keys": ["reading", "noise"], "observed_key": "observed"}
+        observation = Twice(observation, ("forecast", "ensemble"), ("forecast", "observation"), **keys)
+    td = entries(2, reading=torch.zeros(1), noise=torch.zeros(1))
+    out = EKFAnalysis(observation, observation_key="reading", noise_variance_key="noise")(td)
+    assert_close(out["belief", "mean"][0], torch.tensor(0.0), atol=1e-12, rtol=0)
+    assert_close(out["info", "innovation"], -2 * td["forecast", "mean"][:1])
+
+
+@pytest.mark.parametrize("still", [False, True])
+@pytest.mark.parametrize("dt", [0.3, "dt"])
+@pytest.mark.parametrize("name", MOTIONS)
+def test_known_motions(float64, monkeypatch, name, dt, still):
+    motion = MOTIONS[name](dt)
+    space, batch = motion.space, (2, 3)
+    td = entries(space.point_dim, *batch, space=space, dt=torch.rand(*batch, 1), **frame(motion, *batch, still=still))
+    if still:
+        td["belief", "mean"] = space.neutral().expand(*batch, -1)
+    both = known_and_differentiated(monkeypatch, moving(motion, space.tangent_dim, space=space), td)
+    assert_close(*both, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", READINGS)
+def test_known_readings(float64, monkeypatch, name):
+    reading = READINGS[name]()
+    space, own, batch = reading.space, reading.reading_space, (2, 3)
+    noise = torch.rand(*batch, own.tangent_dim)
+    td = entries(space.point_dim, *batch, space=space, reading=random_points(own, *batch), noise=noise)
+    keys = {"observation_key": "reading", "noise_variance_key": "noise"}
+    update = EKFAnalysis(reading, space=space, reading_space=own, **keys)
+    assert_close(*known_and_differentiated(monkeypatch, update, td), rtol=1e-10, atol=1e-10)
+
+
+def test_at_a_landmark_range_and_bearing_have_no_gradient():
+    reading = READINGS["range and bearing"]()
+    state = torch.zeros(1, 6)
+    state[0, 3:5] = torch.tensor([3.0, 4.0])
+    value, jacobian = reading.jacobian(state)
+    assert value.tolist() == [[0.0, 0.0]]
+    assert jacobian.tolist() == torch.zeros(1, 2, 6).tolist()
+
+
+def test_tangents_of_another_space_are_differentiated(float64):
+    """Oracle: the same filter without the motion's own Jacobian; a right-invariant filter has other tangents."""
+    motion = AttitudeMotion(0.1)
+    space = Opposite(SO3()) * Euclidean(3)
+    td = entries(7, 2, space=space, gyro=torch.randn(2, 3))
+    ours = moving(motion, 6, space=space)(td.copy())["forecast", "cov"]
+    motion.jacobian = lambda *_: None
+    assert_close(ours, moving(motion, 6, space=space)(td.copy())["forecast", "cov"], rtol=1e-12, atol=1e-12)
+    gravity = Gravity(DEEP, part=1)
+    assert gravity.tangents_of == (DEEP, Euclidean(3))
+    assert SubModel.tangents_of is None

@@ -1,0 +1,6 @@
+"""The fifteen states of robot_localization: its motion, its YAML, and what its users do with a log."""
+
+import lazy_loader
+
+# __init__.pyi names what is here, and where; a module is imported when one of its names is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,5 @@
+from .model import robot_model
+
+__all__ = [
+    "robot_model",
+]

@@ -1,0 +1,298 @@
+"""Delays between the streams of a log, found by what two of them know both."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from torch_denkf.data.earth import to_local
+from torch_denkf.data.recordings.quantities import find, in_radians, quantity
+from torch_denkf.data.recordings.replay import Recording
+from torch_denkf.data.recordings.tables import Readings, Table
+from torch_denkf.diagnosis.logs import repeats
+
+__all__ = ["ClockOffset", "Delay", "changes_of", "clock_offsets", "delays_between", "solved"]
+
+_SPANS = (1.0, 2.0)  # s: over which changes of heading, and ways, are compared: the longer, the less noise counts
+_STEP = 0.02  # s: of the search
+_LEAST = 30  # comparisons
+_AGREE = 0.6  # correlation: streams that agree less have nothing in common
+_BLOCK = 4.0  # spans, after which errors are forgotten
+_BETTER = 0.7  # of its standard deviation: the longer span is taken where it is so much better, not by chance
+_STEADY = 0.02  # the variation of a signal that says nothing
+
+
+class ClockOffset(NamedTuple):
+    """The correction of a stream's clock.
+
+    Attributes:
+        seconds: the ``offset`` to give to its table; zero for the stream that the others are compared with.
+        std: its standard deviation, s.
+    """
+
+    seconds: float
+    std: float
+
+
+class Delay(NamedTuple):
+    """The delay of one stream behind another, from one thing that both know.
+
+    Attributes:
+        late: the stream that is later, if ``seconds`` is positive.
+        early: the other one.
+        what: both know, ``"heading"`` or ``"way"``.
+        seconds: the delay.
+        std: its standard deviation, s.
+        scale: the numbers of ``late`` over those of ``early``.
+        correlation: of both, at that delay.
+    """
+
+    late: str
+    early: str
+    what: str
+    seconds: float
+    std: float
+    scale: float
+    correlation: float
+
+
+class _Signal(NamedTuple):
+    """A thing that a stream knows: times ``[n]``, a heading or way ``[n]`` or fixes ``[n, 2]``, and weights ``[n]``."""
+
+    times: np.ndarray
+    level: np.ndarray
+    weight: np.ndarray
+
+
+def clock_offsets(recording: Recording, *, most: float = 5.0) -> dict[str, ClockOffset]:
+    """Finds by how much the stamps of a recording's streams are off, by what two of them know both.
+
+    Turn rates, headings and the directions between fixes are compared, and so are speeds and the ways between fixes.
+    Columns are known by usual names, such as ``yawrate``, ``course``, ``speed``, ``x``, ``latitude`` and
+    ``twist.twist.linear.x``; units do not matter. The robot must turn, or change its speed, some times.
+
+    Args:
+        recording: its tables.
+        most: s, the largest delay between two streams.
+
+    Returns:
+        By the names of the streams that have something in common: what to add to their times, beside the fastest one
+        that knows turns.
+
+    Raises:
+        ValueError: if no two streams know the same.
+
+    Examples:
+        >>> from tempfile import mkdtemp
+        >>> from pathlib import Path
+        >>> t, folder = np.arange(0, 60, 0.05), Path(mkdtemp())
+        >>> rate = np.sin(t) + np.sin(0.37 * t)
+        >>> np.savetxt(folder / "gyro.txt", np.c_[t, rate], header="time yaw_rate")
+        >>> np.savetxt(folder / "gps.txt", np.c_[t + 0.4, -np.cos(t) - np.cos(0.37 * t) / 0.37], header="time course")
+        >>> run = Recording(gyro=Table(folder / "gyro.txt"), gps=Table(folder / "gps.txt"))
+        >>> round(clock_offsets(run)["gps"].seconds, 2)
+        -0.4
+    """
+    streams = {name: stream for name, stream in recording.streams.items() if isinstance(stream, Table)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of float32, which no number becomes here
+        tables = {name: replace(stream, origin=None).read() for name, stream in streams.items()}
+    delays = delays_between(tables, most)
+    if not delays:
+        raise ValueError(
+            f"recording {recording.name!r}: no two of {list(tables)} know the same turns or ways; give columns usual "
+            "names by a header, or pass the offset= that you know"
+        )
+    return solved(delays, tables)
+
+
+def solved(delays: Sequence[Delay], tables: Mapping[str, Readings]) -> dict[str, ClockOffset]:
+    """Solves delays of pairs for offsets, by least squares, beside the fastest stream that knows turns."""
+    linked = {name: tables[name] for delay in delays for name in (delay.late, delay.early)}
+    turning = [name for name, table in linked.items() if find(table.columns, "turn rate")] or list(linked)
+    first = min(turning, key=lambda name: float(np.median(np.diff(linked[name].times))))
+    names = [first]
+    for _ in delays:
+        names += [
+            other
+            for delay in delays
+            for one, other in ((delay.late, delay.early), (delay.early, delay.late))
+            if one in names and other not in names
+        ][:1]
+    place = {name: number for number, name in enumerate(names)}
+    used = [delay for delay in delays if delay.late in place]
+    design = np.zeros((len(used), len(names)))
+    for row, delay in enumerate(used):
+        design[row, place[delay.late]], design[row, place[delay.early]] = -1.0, 1.0
+    weights = np.array([delay.std for delay in used])[:, None] ** -2
+    cov = np.linalg.inv(design[:, 1:].T @ (weights * design[:, 1:]))
+    found = cov @ design[:, 1:].T @ (weights[:, 0] * np.array([delay.seconds for delay in used]))
+    offsets = [ClockOffset(0.0, 0.0), *map(ClockOffset, found.tolist(), np.sqrt(np.diag(cov)).tolist())]
+    return dict(zip(names, offsets, strict=True))
+
+
+def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[Delay]:
+    """Compares all pairs of streams.
+
+    Args:
+        tables: readings by the names of streams.
+        most: s, the largest delay.
+
+    Returns:
+        The delays of pairs that have something in common.
+    """
+    known = {name: _signals(table) for name, table in tables.items()}
+    out = []
+    for one, other in combinations(known, 2):
+        for what in known[one].keys() & known[other].keys():
+            early, late = sorted((one, other), key=lambda name: (known[name][what].level.ndim, len(tables[name].times)))
+            if known[early][what].level.ndim == 1 and known[late][what].level.ndim == 1:
+                early, late = late, early  # the slow one is compared at its own times
+            if known[early][what].level.ndim == 1:
+                # Shifts leave out the ends of a log, where a robot begins to move: the fewer, the more it says.
+                pair = known[early][what], known[late][what]
+                tried = [_delay(*pair, what, limit, _SPANS[0]) for limit in (most, most / 3, most / 9)]
+                sizes = [0.0 if one is None else abs(one[3]) for one in tried]
+                best = int(np.argmax(sizes))
+                limit = most / 3**best
+                found = tried[best]
+                if what == "heading" or pair[1].level.ndim == 1:  # a chord of some seconds is shorter than a way
+                    longer = _delay(*pair, what, limit, _SPANS[1])
+                    if found is None or (longer is not None and longer[1] < _BETTER * found[1]):
+                        found = longer
+                if found is not None and abs(found[3]) >= _AGREE:
+                    out.append(Delay(late, early, what, *found))
+    return out
+
+
+def changes_of(tables: Mapping[str, Readings], offsets: Mapping[str, float]) -> tuple[dict, dict]:
+    """Times of the streams, and the changes of heading and way that several know, all after correction.
+
+    Args:
+        tables: readings by stream.
+        offsets: to add to their times.
+
+    Returns:
+        Times by stream; and by title, times and values of each stream, of size 1.
+    """
+    begin = min(table.times[0] for table in tables.values())
+    steps, changes = {name: table.times - begin for name, table in tables.items()}, {}
+    known = {name: _signals(table) for name, table in tables.items()}
+    for what, title in (("heading", "turn rate, scaled"), ("way", "speed, scaled")):
+        drawn: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        for name in known:
+            if what in known[name]:
+                times, level, _ = known[name][what]
+                at = np.arange(times[0], times[-1] - 1.0, 0.1)
+                if level.ndim > 1:
+                    x, y = (np.interp([at, at + 1.0], times, column) for column in level.T)
+                    dx, dy = x[1] - x[0], y[1] - y[0]
+                    value = np.hypot(dx, dy) if what == "way" else np.gradient(np.unwrap(np.arctan2(dy, dx)), at)
+                else:
+                    value = np.interp(at + 1.0, times, level) - np.interp(at, times, level)
+                scale = np.quantile(np.abs(value), 0.95) if len(value) else 0.0
+                at, value = at + 0.5 - begin + offsets.get(name, 0.0), value / (scale or 1.0)
+                other = np.interp(at, *next(iter(drawn.values()))) if drawn else value
+                drawn[name] = at, value * (1.0 if (value * other).sum() >= 0 else -1.0)  # clockwise, in some logs
+        if len(drawn) > 1:
+            changes[title] = drawn
+    return steps, changes
+
+
+def _signals(table: Readings) -> dict[str, _Signal]:
+    """Lists the headings and ways that a stream knows."""
+    columns, times, values = table.columns, table.times, table.values
+    known = [place for place, name in enumerate(columns) if quantity(name)]
+    if any(repeats(values[:, place]) for place in known):
+        new = np.append(True, (np.diff(values[:, known], axis=0) != 0).any(1))
+        times, values = times[new], values[new]
+    ones, out = np.ones(len(times)), {}
+    speed = find(columns, "speed")
+    places = find(columns, "latitude", "longitude")
+    if places:
+        fixes = values[:, places]
+        fixes = to_local(fixes, np.median(fixes, 0))
+    elif places := find(columns, "east", "north"):
+        fixes = values[:, places]
+    if places:
+        out["heading"] = out["way"] = _Signal(times, fixes, ones)
+    if speed:
+        out["way"] = _Signal(times, _integral(times, values[:, speed[0]]), ones)
+    if heading := find(columns, "heading"):
+        weight = ones if speed is None else np.square(values[:, speed[0]])
+        out["heading"] = _Signal(times, np.unwrap(in_radians(values[:, heading[0]])), weight)
+    if turn := find(columns, "turn rate"):
+        out["heading"] = _Signal(times, _integral(times, values[:, turn[0]]), ones)
+    return out
+
+
+def _integral(times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.append(0.0, np.cumsum(np.diff(times) * (values[1:] + values[:-1]) / 2))
+
+
+def _delay(
+    early: _Signal, late: _Signal, what: str, most: float, span: float
+) -> tuple[float, float, float, float] | None:
+    """Delay, its standard deviation, scale and correlation; ``None`` where both have too little in common.
+
+    The changes of the late stream over a span are compared with those of the early one over the same span, shifted.
+    """
+    most = min(most, (early.times[-1] - early.times[0]) / 4)
+    end = np.searchsorted(late.times, late.times + span - 1e-6)
+    fixes = late.level.ndim == 2
+    corners = fixes and what == "heading"
+    last = np.append(end, len(end))[end] if corners else end  # a span later than the end
+    until = np.append(late.times, np.inf)[last]
+    begin = np.flatnonzero((late.times > early.times[0] + most) & (until < early.times[-1] - most))
+    end, last = end[begin], last[begin]
+    if len(begin) < _LEAST:
+        return None
+    way = late.level[end] - late.level[begin]
+    if corners:
+        then, level = late.level[last] - late.level[end], _integral(early.times, early.level)
+        change = np.arctan2(way[:, 0] * then[:, 1] - way[:, 1] * then[:, 0], (way * then).sum(1))
+        weight = np.minimum(np.square(way).sum(1), np.square(then).sum(1))
+    else:
+        change, level = np.linalg.norm(way, axis=-1) if fixes else way, early.level
+        weight = np.minimum(late.weight[begin], late.weight[end])
+
+    def model(shift: float) -> np.ndarray:
+        at = [np.interp(late.times[which] - shift, early.times, level) for which in (begin, end, last)]
+        first, second = at[1] - at[0], at[2] - at[1]
+        if not corners:
+            return first
+        return second / (late.times[last] - late.times[end]) - first / (late.times[end] - late.times[begin])
+
+    def centred(values: np.ndarray) -> np.ndarray:
+        return values - np.average(values, weights=weight)
+
+    def fit(shift: float) -> tuple[np.ndarray, float, float]:
+        x, y = centred(model(shift)), centred(change)
+        xx, xy, yy = ((weight * product).sum() for product in (x * x, x * y, y * y))
+        return x, float(xy / xx) if xx > 0 else 0.0, float(xy / np.sqrt(xx * yy)) if xx * yy > 0 else 0.0
+
+    if not (weight > 0).any() or np.std(model(0.0)) < _STEADY * np.abs(model(0.0)).max():
+        return None
+    shifts = np.arange(-most, most + _STEP, _STEP)
+    fits = [fit(shift)[2] for shift in shifts]
+    found = int(np.abs(fits).argmax())
+    if not 0 < found < len(shifts) - 1:
+        return None
+    left, best, right = np.square(fits[found - 1 : found + 2])
+    shift = float(shifts[found] + _STEP * 0.5 * (left - right) / (left - 2 * best + right))
+    x, scale, correlation = fit(shift)
+    slope = centred(-scale * (model(shift + _STEP) - model(shift - _STEP)) / (2 * _STEP))
+    slope -= x * (weight * x * slope).sum() / (weight * x * x).sum()
+    score = weight * slope * (centred(change) - scale * x)
+    # Errors last: blocks of some spans are taken to be independent, and each is left out once.
+    block = ((late.times[begin] - late.times[begin[0]]) // max(_BLOCK * span, 8.0)).astype(int)
+    sums, known = np.bincount(block, score), np.bincount(block, weight * slope * slope)
+    blocks = max(2.0, float(known.sum() ** 2 / np.square(known).sum()))  # that say as much as others
+    variance = np.square(sums / (known.sum() - known).clip(min=1e-300)).sum()
+    variance = variance * (1 + 1.2 / (blocks - 1)) ** 2 + np.median(np.diff(early.times)) ** 2 / 12
+    return shift, float(np.sqrt(variance)), scale, correlation

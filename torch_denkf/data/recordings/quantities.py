@@ -1,0 +1,46 @@
+"""The meaning of a log's columns, by their names: places, speeds, headings, turn rates."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+__all__ = ["find", "in_radians", "quantity"]
+
+_AXIS = r"(?:^|(?:.*[._ /])?(?:pose|pos|position|utm|map|gps|fix|translation)[._ /])(?:p|t|pos)?_?"
+#: Patterns of the names of columns, in lower case and without units, by what they mean.
+_NAMES = {
+    "latitude": r".*latitude|.*\blat",
+    "longitude": r".*longitude|.*\b(lon|lng|long)",
+    "east": rf"east(ing)?|{_AXIS}x|.*p_rs_r_x",
+    "north": rf"north(ing)?|{_AXIS}y|.*p_rs_r_y",
+    "turn rate": r".*(yaw_?rate|yaw_?vel|turn(_?rate)?|gyro(_?z)?|omega(_?z)?|\bwz|angular(_velocity)?[._]z|w_rs_s_z)",
+    "heading": r".*(heading|yaw|theta|course|\bcog|track|psi)",
+    "speed": r".*(speed|velocity|\bsog|\bvx|\bv|(twist[._])?linear[._]x|v_forward)",
+    "acceleration": r".*(\bax|acc(el(eration)?)?_?x|linear_acceleration[._]x|a_rs_s_x)",
+}
+_DEGREES = 7.0  # rad: beyond are no headings in rad
+
+
+def quantity(name: str) -> str | None:
+    """The quantity that a column holds, by its name.
+
+    Examples:
+        >>> quantity("twist.twist.angular.z"), quantity("yawrate"), quantity("Latitude (deg)"), quantity("hdop")
+        ('turn rate', 'turn rate', 'latitude', None)
+    """
+    plain = re.sub(r"\s*[\[(].*", "", name).strip().lower()
+    return next((what for what, pattern in _NAMES.items() if re.fullmatch(pattern, plain)), None)
+
+
+def find(columns: Sequence[str], *wanted: str) -> list[int] | None:
+    """The places of the first columns that hold some quantities; ``None`` where one is not there."""
+    found = [quantity(name) for name in columns]
+    return [found.index(what) for what in wanted] if set(wanted) <= set(found) else None
+
+
+def in_radians(angles: np.ndarray) -> np.ndarray:
+    """Headings in rad: those beyond a turn are in degrees."""
+    return np.radians(angles) if np.abs(angles).max(initial=0.0) > _DEGREES else angles

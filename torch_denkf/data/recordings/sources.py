@@ -1,0 +1,225 @@
+"""Columns of a table as numbers, whatever file they stand in, and its times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torch_denkf.data.parquet import parquet_names, read_parquet
+from torch_denkf.data.recordings.bags import is_bag, read_topic
+from torch_denkf.data.recordings.stamps import nanoseconds_beside, seconds_of, time_columns
+from torch_denkf.data.recordings.texts import LARGEST, as_number, numbered, read_cells
+
+__all__ = ["Numbers", "Source", "open_source", "read_numbers"]
+
+
+class Source:
+    """A table whose columns are read one by one.
+
+    Attributes:
+        names: of the columns.
+        headless: whether the file has none, so that they are others' names.
+        asides: names of columns that are read only where they are asked for.
+    """
+
+    names: Sequence[str]
+    headless = False
+    asides: tuple[str, ...] = ()
+
+    def column(self, name: str) -> np.ndarray:
+        """The numbers of a column ``[n]``; NaN for what is none."""
+        raise NotImplementedError
+
+    def stamps(self, name: str) -> np.ndarray:
+        """A column of times ``[n]``, in which dates are numbers, too, with its nanoseconds where another has them."""
+        rest = nanoseconds_beside(name, self.names)
+        return self.column(name) if rest is None else self.column(name) + 1e-9 * self.column(rest)
+
+    def empty(self, name: str) -> np.ndarray:
+        """Cells that are there and hold nothing, bool ``[n]``."""
+        return np.zeros(len(self.column(name)), bool)
+
+    def cell(self, name: str, row: int) -> Any:
+        """The content of a cell, for messages."""
+        return self.column(name)[row]
+
+    def place(self, row: int) -> str:
+        """Says where a row is; -1 for the table."""
+        raise NotImplementedError
+
+
+class _Text(Source):
+    def __init__(self, file: Path, columns: Sequence[str] | None):
+        self.file, self.table = file, read_cells(file, columns)
+        self.names, self.headless = self.table.names, self.table.headless
+        self._places = {name: place for place, name in enumerate(self.names)}
+
+    def _cells(self, name: str) -> list[str]:
+        at = self._places[name]
+        return [row[at] if at < len(row) else "" for row in self.table.rows]
+
+    def column(self, name):
+        return np.array([as_number(cell) for cell in self._cells(name)])
+
+    def stamps(self, name):
+        times, cells = super().stamps(name), self._cells(name)
+        days = self._cells("date") if "date" in self.names and name != "date" else [""] * len(cells)
+        for row in np.flatnonzero(np.isnan(times)):
+            found = seconds_of(f"{days[row]} {cells[row]}" if days[row] else cells[row])
+            times[row] = np.nan if found is None else found
+        return times
+
+    def empty(self, name):
+        at = self._places[name]
+        return np.array([at < len(row) and not row[at].strip() for row in self.table.rows], bool)
+
+    def cell(self, name, row):
+        return self._cells(name)[row]
+
+    def place(self, row):
+        return f"{self.file}:{self.table.lines[row]}" if self.table.lines else str(self.file)
+
+
+class _Parquet(Source):
+    def __init__(self, file: Path):
+        self.file, self.names = file, parquet_names(file)
+        if len(set(self.names)) < len(self.names):
+            raise ValueError(f"{file} has two columns of one name in {self.names}; give one another name")
+
+    def column(self, name):
+        column = read_parquet(self.file, [name])[name]
+        values = column.to_numpy()
+        if values.dtype.kind == "M":  # it would become a count of days, or of milliseconds
+            raise ValueError(f"{self.file}: {name!r} holds {column.type}, not a number a row; pass columns= without it")
+        try:
+            numbers = values.astype(np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"{self.file}: {name!r} holds {column.type}, not a number a row; pass columns= without it"
+            ) from error
+        return np.where(np.abs(numbers) <= LARGEST, numbers, np.nan)
+
+    def stamps(self, name):
+        values = read_parquet(self.file, [name])[name].to_numpy()
+        if values.dtype.kind != "M":
+            return super().stamps(name)
+        return np.where(np.isnat(values), np.nan, values.astype("datetime64[ns]").astype(np.int64) * 1e-9)
+
+    def cell(self, name, row):
+        return read_parquet(self.file, [name])[name][row].as_py()
+
+    def place(self, row):
+        return str(self.file) if row < 0 else f"{self.file}, row {row} (from 0)"
+
+
+class _Topic(Source):
+    asides = ("recorded", "header.seq")
+
+    def __init__(self, file: Path, topic: str | None):
+        self.file, (self.topic, self.columns) = file, read_topic(file, topic)
+        self.names = numbered(list(self.columns))
+
+    def column(self, name):
+        return self.columns[name]
+
+    def place(self, row):
+        return f"{self.file}, {self.topic}" if row < 0 else f"{self.file}, {self.topic}, message {row} (from 0)"
+
+
+def open_source(file: Path, columns: Sequence[str] | None = None, topic: str | None = None) -> Source:
+    """Opens a table.
+
+    Args:
+        file: of a :class:`~torch_denkf.data.Table`.
+        columns: names of all columns, for a text that has none.
+        topic: of a bag.
+
+    Raises:
+        FileNotFoundError: without the file.
+        ImportError: for Parquet without pyarrow, for bags without rosbags.
+        ValueError: if it cannot be read.
+    """
+    if is_bag(file):
+        return _Topic(file, topic)
+    if topic is not None:
+        raise ValueError(f"{file} is no ROS bag, and has no topic {topic!r}; pass columns=")
+    return _Parquet(file) if file.suffix.lower() in (".parquet", ".pq") else _Text(file, columns)
+
+
+class Numbers(NamedTuple):
+    """Columns of a table.
+
+    Attributes:
+        times: in the unit of the file, ``[n]``.
+        time: name of their column.
+        values: ``[n, C]``.
+        names: of the columns ``[C]``.
+        place: where a row is in the file.
+    """
+
+    times: np.ndarray
+    time: str
+    values: np.ndarray
+    names: tuple[str, ...]
+    place: Callable[[int], str]
+
+
+def read_numbers(
+    file: Path, time: str | None, columns: Sequence[str] | None, timeless: bool = False, topic: str | None = None
+) -> Numbers:
+    """Reads columns of a table.
+
+    Args:
+        file: of a :class:`~torch_denkf.data.Table`.
+        time: name of the column of times; ``None`` for the first ascending one with a usual name.
+        columns: to read; ``None`` for all others that hold numbers.
+        timeless: whether times stand elsewhere.
+        topic: of a bag.
+
+    Raises:
+        FileNotFoundError: without the file.
+        ImportError: for Parquet without pyarrow, for bags without rosbags.
+        ValueError: for columns that are not there, and values that are no finite numbers.
+    """
+    source = open_source(file, columns, topic)
+    there = source.names
+    found = [] if timeless else [time] if time is not None else time_columns(there) or ["time"]
+    missing = [name for name in [*found, *(columns or ())] if name not in there]
+    if missing:
+        cure = (
+            "pass time= for the column of times, or times= where it has none"
+            if set(missing) & set(found)
+            else "pass columns= of those"
+        )
+        raise ValueError(f"{file} lacks the columns {missing}; it has {list(there)}: {cure}")
+    stamps = {name: source.stamps(name) for name in found}
+    chosen = next((name for name in found if len(found) > 1 and (np.diff(stamps[name]) > 0).all()), (found or [""])[0])
+    own = [chosen, nanoseconds_beside(chosen, there), *source.asides, *(found if time is None else ())]
+    if columns is None or source.headless:
+        columns = [name for name in (columns or there) if name not in own]
+        read = {name: source.column(name) for name in columns}
+        if not source.headless:  # a column of text is none to read
+            read = {name: column for name, column in read.items() if not len(column) or np.isfinite(column).any()}
+    else:
+        read = {name: source.column(name) for name in columns}
+    names = tuple(read)
+    count = len(next(iter(read.values()))) if read else len(stamps[chosen]) if found else len(source.column(there[0]))
+    values = np.array(list(read.values())).reshape(len(names), count).T
+    kept = np.arange(count)
+    if names and np.isnan(values).all(1).any():
+        kept = np.flatnonzero(~np.all([source.empty(name) for name in names], 0))
+    times, values = (stamps[chosen] if found else np.arange(float(count)))[kept], values[kept]
+    bad = np.flatnonzero(np.isnan(times) | np.isnan(values).any(1))
+    if len(bad):
+        row = int(bad[0])
+        name = chosen if np.isnan(times[row]) else names[int(np.isnan(values[row]).argmax())]
+        raise ValueError(
+            f"{source.place(int(kept[row]))}: {name!r} is {source.cell(name, int(kept[row]))!r}, which is no finite "
+            "number; correct it, or leave the row out: what is missing then counts as not observed"
+        )
+    return Numbers(
+        times, chosen or "times", values, names, lambda row: source.place(int(kept[row]) if len(kept) else -1)
+    )

@@ -1,0 +1,131 @@
+"""The streams of a log: topics of a bag, or columns of a file that change together; and what is odd in each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from torch_denkf.data.recordings.bags import bag_topics, is_bag
+from torch_denkf.data.recordings.quantities import quantity
+from torch_denkf.data.recordings.tables import Readings, Table
+from torch_denkf.diagnosis.logs import repeats
+
+__all__ = ["Stream", "streams_of"]
+
+_TOGETHER = 0.8  # of the changes of one column another has, too, that is written by the same sensor
+_GAP = 10  # usual steps
+_BURST = 0.1  # usual steps
+_NAMES = {"latitude": "gps", "east": "position", "turn rate": "imu", "acceleration": "imu", "speed": "speed"}
+_TURNS, _GRAVITY = 7.0, (5.0, 20.0)  # rad/s that no robot has; m/s^2 between which the size of an acceleration lies
+
+
+class Stream(NamedTuple):
+    """A stream of a log.
+
+    Attributes:
+        table: reads it.
+        readings: what was read.
+        repeated: the share of rows that repeat a reading.
+    """
+
+    table: Table
+    readings: Readings
+    repeated: float
+
+    @property
+    def rate(self) -> float:
+        """Readings a second."""
+        return 1 / float(np.median(np.diff(self.readings.times))) if len(self.readings.times) > 1 else 0.0
+
+    def oddities(self) -> list[str]:
+        """Says what is odd: repeats, gaps, bursts, and units that look wrong."""
+        times, out = self.readings.times, []
+        steps = np.diff(times)
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        if self.repeated:
+            out.append(f"repeated in {self.repeated:.0%} of the rows")
+        if (gaps := np.flatnonzero(steps > max(_GAP * usual, 0.5))).size:
+            longest = gaps[steps[gaps].argmax()]
+            out.append(f"{len(gaps)} gaps, the longest {steps[longest]:.3g} s at {times[longest] - times[0]:.4g} s")
+        if (share := float((steps < _BURST * usual).mean()) if len(steps) else 0.0) > 0.01:
+            out.append(f"bursts: {share:.0%} of the steps are below {_BURST * usual:.2g} s")
+        for name, column in zip(self.readings.columns, self.readings.values.T, strict=True):
+            size, what = float(np.quantile(np.abs(column), 0.99)), quantity(name)
+            if what in ("turn rate", "heading") and size > _TURNS:
+                out.append(f"{name} looks like degrees")
+        axes = [name for name in self.readings.columns if quantity(name) == "acceleration"]
+        if axes:
+            at = self.readings.columns.index(axes[0])
+            size = float(np.median(np.linalg.norm(self.readings.values[:, at : at + 3], axis=1)))
+            if self.readings.values.shape[1] >= at + 3 and not _GRAVITY[0] < size < _GRAVITY[1]:
+                out.append(f"accelerations of {size:.3g} look like another unit than m/s^2")
+        return out
+
+
+def streams_of(file: str | Path, **options) -> dict[str, Stream]:
+    """Finds the streams of a log.
+
+    Args:
+        file: of a :class:`~torch_denkf.data.Table`.
+        **options: of the tables, such as ``time`` and ``unit``.
+
+    Returns:
+        The streams by name: topics, or names of sensors by what their columns mean.
+
+    Raises:
+        FileNotFoundError: without the file.
+        ImportError: for bags without rosbags.
+        ValueError: if the file cannot be read.
+    """
+    path = Path(file).expanduser()
+    found: dict[str, Stream] = {}
+    if is_bag(path):
+        for topic in sorted(bag_topics(path)):
+            table = Table(path, topic=topic, **options)
+            try:
+                found[topic] = Stream(table, table.read(), 0.0)
+            except ValueError:  # a topic of pictures or text
+                continue
+        return found
+    whole = Table(path, **options).read()
+    for columns in _together(whole):
+        slow = any(repeats(whole.values[:, whole.columns.index(name)]) for name in columns)
+        table = Table(path, columns, repeats="drop" if slow else "keep", **options)
+        read = table.read()
+        known = [what for what in map(quantity, columns) if what]
+        name = next((named for what, named in _NAMES.items() if what in known), (known or columns)[0])
+        while name in found:
+            name += "_"
+        found[name] = Stream(table, read, 1 - len(read.times) / len(whole.times))
+    return found
+
+
+def _together(table: Readings) -> list[list[str]]:
+    """Groups columns that change in the same rows; columns that never change are left out."""
+    groups: list[tuple[np.ndarray, list[str]]] = []
+    fast: list[str] = []
+    for name, column in zip(table.columns, table.values.T, strict=True):
+        changed = np.diff(column) != 0
+        if not changed.any():
+            continue
+        if not repeats(column) and changed.mean() > 0.5:
+            fast.append(name)
+            continue
+        for other, names in groups:
+            if (changed & other).sum() > _TOGETHER * min(changed.sum(), other.sum()):
+                names.append(name)
+                other |= changed
+                break
+        else:
+            groups.append((changed, [name]))
+    known = [names for _, names in groups if any(map(quantity, names))]
+    return [names for names in _by_sensor(fast) if names] + known
+
+
+def _by_sensor(names: list[str]) -> list[list[str]]:
+    """Columns of each row by what they are: inertial and unknown ones, speeds, and poses."""
+    speeds = [name for name in names if quantity(name) == "speed"]
+    poses = [name for name in names if quantity(name) in ("heading", "east", "north", "latitude", "longitude")]
+    return [[name for name in names if name not in (*speeds, *poses)], speeds, poses]

@@ -1,0 +1,91 @@
+"""Values and Jacobians of networks of linear layers and activations: products of matrices, in one forward pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+__all__ = ["jacobian_of_layers", "jacobian_of_network"]
+
+
+def _of_silu(layer: nn.Module, x: Tensor, y: Tensor) -> Tensor:
+    share = x.sigmoid()
+    return share + y * (1 - share)
+
+
+#: Derivatives of activations, from the layer, what it read and what it wrote.
+_SLOPES: dict[type, Callable[..., Tensor]] = {
+    nn.ReLU: lambda layer, x, y: x > 0,
+    nn.LeakyReLU: lambda layer, x, y: torch.where(x > 0, 1.0, layer.negative_slope),
+    nn.ELU: lambda layer, x, y: torch.where(x > 0, 1.0, y + layer.alpha),
+    nn.Tanh: lambda layer, x, y: 1 - y * y,
+    nn.Sigmoid: lambda layer, x, y: y * (1 - y),
+    nn.SiLU: _of_silu,
+    nn.Softplus: lambda layer, x, y: torch.where(x * layer.beta > layer.threshold, 1.0, (x * layer.beta).sigmoid()),
+}
+
+
+def jacobian_of_network(network: nn.Module, x: Tensor, size: int) -> tuple[Tensor, Tensor] | None:
+    """Returns what a network makes of ``x``, and the Jacobian by its first numbers, where that is a product.
+
+    Both can be differentiated. A network that has a method of its own, ``jacobian(x, size)``, is asked.
+
+    Args:
+        network: linear layers and activations, one after the other in ``nn.Sequential``.
+        x: ``[*, N]``.
+        size: S, how many of the N numbers the Jacobian is by.
+
+    Returns:
+        ``[*, M]`` and ``[*, M, S]``, or ``[M, S]`` if it is constant; ``None`` where another layer is among them, or a
+        layer has hooks.
+
+    Example:
+        >>> net = nn.Sequential(nn.Linear(2, 3), nn.Tanh(), nn.Linear(3, 1))
+        >>> value, jacobian = jacobian_of_network(net, torch.zeros(5, 2), 2)
+        >>> value.shape, jacobian.shape
+        (torch.Size([5, 1]), torch.Size([5, 1, 2]))
+    """
+    own = getattr(network, "jacobian", None)
+    if own is not None:
+        return None if _hooked(network) else own(x, size)
+    return jacobian_of_layers(list(_flat(network)), x, size)
+
+
+def jacobian_of_layers(
+    layers: Sequence[nn.Module], x: Tensor, size: int, linear: tuple[type, ...] = (nn.Linear,)
+) -> tuple[Tensor, Tensor] | None:
+    """Does what :func:`jacobian_of_network` does for layers in their order; those of types ``linear`` are W x + b."""
+    if any(not (type(layer) in linear or type(layer) in _SLOPES) or _hooked(layer) for layer in layers):
+        return None
+    layer: Any
+    rows: Tensor | None = None  # the Jacobian's transpose, [*, S, H]
+    for layer in layers:
+        if type(layer) in linear:
+            rows = layer.weight[:, :size].mT if rows is None else rows @ layer.weight.mT
+            x = F.linear(x, layer.weight, layer.bias)
+            continue
+        read, rows = x, _identity(x)[:size] if rows is None else rows
+        x = layer(read.clone() if getattr(layer, "inplace", False) else read)
+        rows = rows * _SLOPES[type(layer)](layer, read, x).unsqueeze(-2)
+    return x, (_identity(x)[:size] if rows is None else rows).mT
+
+
+def _identity(x: Tensor) -> Tensor:
+    return torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+
+
+def _flat(network: nn.Module) -> Iterator[nn.Module]:
+    """The layers of sequences, and of those in them, but for the identity."""
+    if type(network) is nn.Sequential and not _hooked(network):
+        for layer in network:
+            yield from _flat(layer)
+    elif type(network) is not nn.Identity:
+        yield network
+
+
+def _hooked(layer: nn.Module) -> bool:
+    return bool(layer._forward_hooks or layer._forward_pre_hooks)
