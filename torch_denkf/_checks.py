@@ -335,8 +335,8 @@ def flag_value(flag: Tensor) -> bool | None:
         >>> flag_value(torch.tensor(True)), flag_value(torch.tensor(True, device="meta"))
         (True, None)
     """
-    recorded = flag.is_cuda and torch.cuda.is_current_stream_capturing()  # in a graph, where a read is an error
-    if torch.compiler.is_compiling() or flag.is_meta or recorded:
+    # In a graph that is being captured a read is an error.
+    if torch.compiler.is_compiling() or flag.is_meta or (flag.is_cuda and torch.cuda.is_current_stream_capturing()):
         return None
     try:
         return bool(flag)

@@ -73,10 +73,9 @@ def check_belief(structure: Structure, entries: Entries, written: Entries) -> No
     nothing = None  # NaN where a number is not finite: fewer calls than isfinite() takes
     for key, kind in structure.carried:
         for value in (written[key], entries.get(key)):  # a particle that is not finite may have been resampled away
-            if value is None or not value.is_floating_point():
-                continue
-            zero = (value - value).sum() if kind is None else kind.finite(key[-1], value).logical_not()
-            nothing = zero if nothing is None else nothing + zero
+            if value is not None and value.is_floating_point():
+                zero = (value - value).sum() if kind is None else kind.finite(key[-1], value).logical_not()
+                nothing = zero if nothing is None else nothing + zero
     if nothing is None or flag_value(nothing == 0) is not False:
         return
     raise ValueError(diagnosis().why_not_finite(structure, entries, written))
