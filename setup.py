@@ -24,10 +24,11 @@ setup(
         "Operating System :: POSIX :: Linux",
         "Programming Language :: Python :: 3",
         "Programming Language :: Python :: 3.11",
+        "Programming Language :: Python :: 3.12",
         "Topic :: Scientific/Engineering :: Artificial Intelligence",
         "Typing :: Typed",
     ],
-    python_requires=">=3.11",
+    python_requires=">=3.11",  # labmaze, which dm-control needs, has no wheel for 3.13
     packages=find_packages(include=["torch_denkf", "torch_denkf.*"]),
     package_data={
         "torch_denkf": ["py.typed", "**/*.pyi"],
