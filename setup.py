@@ -33,6 +33,7 @@ setup(
         "torch_denkf": ["py.typed", "**/*.pyi"],
         "torch_denkf.applications.ur5": ["simulation/assets/*.xml", "weights/*/*"],
         "torch_denkf.applications.car": ["weights/*/*"],
+        "torch_denkf.applications.imu": ["weights/*/*"],
         "torch_denkf.applications.legged": ["weights/*/*"],
         "torch_denkf.applications.reacher": ["weights/*/*"],
     },
@@ -66,6 +67,7 @@ setup(
         # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
         "bench": [
             "matplotlib",
+            "vqf==2.1.2",  # the peer of benchmarks/broad
             "filterpy==2.0.0",
             "dapper==1.7.1",
             "cuthbert==0.1.1",

@@ -64,7 +64,7 @@ def check_trained_filters(wheel, folder):
     weights = [each for each in wheel.infolist() if "/weights/" in each.filename]
     assert sum(each.file_size for each in weights) <= 1.5e6
     names = torch_denkf.available()
-    assert names == ["car-odometry", "quadruped", "reacher", "ur5-table"]
+    assert names == ["car-odometry", "imu", "quadruped", "reacher", "ur5-table"]
     files = {f"{name}/{file}" for name in names for file in ("card.md", "config.json", "weights.safetensors")}
     assert {each.filename.split("/weights/")[1] for each in weights} == files
     wheel.extractall(folder)
@@ -90,7 +90,7 @@ def test_modules_is_a_relative_link():
 CORE = ("functional", "metrics", "modules", "filters", "smoothers", "transforms", "objectives")
 ROBOTS = {
     name
-    for robot in ("car", "legged", "reacher", "ur5")
+    for robot in ("car", "imu", "legged", "reacher", "ur5")
     for name in import_module(f"torch_denkf.applications.{robot}").__all__
     if name[0].isupper()
 }
@@ -190,6 +190,7 @@ def test_every_public_name_is_there():
         "diagnosis",
         "baselines",
         "applications.car",
+        "applications.imu",
         "applications.ur5",
         "applications.reacher",
     ):

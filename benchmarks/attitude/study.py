@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import NormalDist
 
@@ -42,6 +43,13 @@ COLUMNS = Columns(
 )
 IMU, PLACE = "gyro, accelerometer", "and that it stays about a place"
 COMPASS, FEET = "and a magnetometer", "and the standing foot"
+READS = [IMU, PLACE, COMPASS, f"{PLACE}, {COMPASS}", FEET]
+#: Name, kind and members of the filters of several sensors.
+FUSED = (
+    ("FusedFilter, EKF", "EKF", 64),
+    ("FusedFilter, DEnKF, 32 members", "etkf", 32),
+    ("FusedFilter, DEnKF, 64 members", "etkf", 64),
+)
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,7 @@ class Study:
     seconds: float = 20.0  # of a simulated run
     updates: int = 25  # of the learned noise
     seed: int = 0
+    only: str = ""  # run filters alone whose name has this, with the settings of attitude.csv; other rows stay
     smoke: bool = False  # one short run: does it run?
 
 
@@ -124,9 +133,16 @@ def run(model: nn.Module, data: TensorDict, prefix: str = "belief") -> tuple[Ten
 
 
 def library_rows(
-    name: str, data: TensorDict, rows: slice, up_noise: float, rest_noise: float, learned: SubModel, smoke: bool = False
+    name: str,
+    data: TensorDict,
+    rows: slice,
+    up_noise: float,
+    rest_noise: float,
+    learned: SubModel,
+    smoke: bool = False,
+    only: str = "",
 ) -> Iterator[dict]:
-    """Of the library's filters and smoothers.
+    """Of the library's filters and smoothers; an empty row for each whose name has not ``only``.
 
     Args:
         name: of the data.
@@ -136,10 +152,13 @@ def library_rows(
         rest_noise: of the velocity that is read to be zero, in m/s.
         learned: the noise of the accelerometer's direction that :func:`learned_noise` trained.
         smoke: a few of them.
+        only: a part of the names of those that run.
     """
     gyro = GYRO_NOISES[name]
 
     def scored(reads: str, label: str, model: nn.Module, prefix: str = "belief", **setting) -> dict:
+        if only not in label:
+            return {}
         orientation, cov, ms = run(model, data, prefix)
         return {
             "data": name,
@@ -155,37 +174,30 @@ def library_rows(
         yield scored(IMU, kind, attitude_filter(kind, gyro, up_noise), **up)
     learns = attitude_filter("EKF", gyro, learned)
     yield scored(IMU, "EKF, learned noise", learns)
-    significance = {"localisation": "significance", "threshold": 3.0}
     for members in (32,) if smoke else (32, 64):
-        for label, options in (("", {}), (", significance", significance)):
-            model = attitude_filter("etkf", gyro, up_noise, members=members, **options)
-            yield scored(IMU, f"DEnKF, {members} members{label}", model, **up)
-    model = attitude_filter("etkf", gyro, learned, **significance)
-    yield scored(IMU, "DEnKF, 64 members, significance, learned noise", model)
+        yield scored(IMU, f"DEnKF, {members} members", attitude_filter("etkf", gyro, up_noise, members=members), **up)
     yield scored(IMU, "RTS smoother", RTSSmoother(attitude_filter("EKF", gyro, up_noise)), "smoothed", **up)
     yield scored(IMU, "RTS smoother, learned noise", RTSSmoother(learns), "smoothed")
     if smoke:
         return
-    model = EnRTS(attitude_filter("etkf", gyro, up_noise, **significance))
-    yield scored(IMU, "EnRTS, 64 members, significance", model, "smoothed", **up)
+    yield scored(IMU, "EnRTS, 64 members", EnRTS(attitude_filter("etkf", gyro, up_noise)), "smoothed", **up)
     rest = {"setting": rest_noise}
-    models = {kind: inertial_filter(kind, gyro, rest_noise) for kind in ("EKF",)}
-    models["DEnKF, 64 members, significance"] = inertial_filter("etkf", gyro, rest_noise, **significance)
-    for kind, model in models.items():
-        yield scored(PLACE, f"FusedFilter, {kind}", model, **rest)
-    yield scored(PLACE, "RTS smoother", RTSSmoother(models["EKF"]), "smoothed", **rest)
+    for label, kind, members in FUSED:
+        yield scored(PLACE, label, inertial_filter(kind, gyro, rest_noise, members=members), **rest)
+    model = RTSSmoother(inertial_filter("EKF", gyro, rest_noise))
+    yield scored(PLACE, "RTS smoother", model, "smoothed", **rest)
     if "magnetometer" in data:
-        for kind, label, options in (("EKF", "EKF", {}), ("etkf", "DEnKF, 64 members, significance", significance)):
-            model = attitude_filter(kind, gyro, up_noise, magnetometer=True, **options)
-            yield scored(COMPASS, f"FusedFilter, {label}", model, **up)
-        model = inertial_filter("EKF", gyro, rest_noise, magnetometer=True)
-        yield scored(f"{PLACE}, {COMPASS}", "FusedFilter, EKF", model, **rest)
+        for label, kind, members in FUSED:
+            model = attitude_filter(kind, gyro, up_noise, members=members, magnetometer=True)
+            yield scored(COMPASS, label, model, **up)
+        for label, kind, members in FUSED:
+            model = inertial_filter(kind, gyro, rest_noise, members=members, magnetometer=True)
+            yield scored(f"{PLACE}, {COMPASS}", label, model, **rest)
     if "leg" in data:
-        model = inertial_filter("EKF", gyro, rest_noise, feet=True)
-        yield scored(FEET, "FusedFilter, EKF", model)
-        yield scored(FEET, "RTS smoother", RTSSmoother(model), "smoothed")
-        model = inertial_filter("etkf", gyro, rest_noise, feet=True, **significance)
-        yield scored(FEET, "FusedFilter, DEnKF, 64 members, significance", model)
+        for label, kind, members in FUSED:
+            yield scored(FEET, label, inertial_filter(kind, gyro, rest_noise, members=members, feet=True))
+        model = RTSSmoother(inertial_filter("EKF", gyro, rest_noise, feet=True))
+        yield scored(FEET, "RTS smoother", model, "smoothed")
 
 
 def chosen(make: Callable, noises: Sequence[float], data: TensorDict, rows: slice) -> float:
@@ -277,6 +289,16 @@ def page(rows: list[dict], study: Study) -> str:
     return "\n".join(lines) + "\n"
 
 
+def found_settings(study: Study, settled: slice) -> tuple[float, float, DiagonalNoise]:
+    """Both settings by other runs, and the learned noise."""
+    others = study.runs // 3 + 1
+    validation = prepared(simulated(others, study.seconds, study.seed + 1))
+    up_noise = chosen(attitude_filter, UP_NOISES[-2:] if study.smoke else UP_NOISES, validation, settled)
+    rest_noise = REST_NOISES[0] if study.smoke else chosen(inertial_filter, REST_NOISES, validation, settled)
+    training = prepared(simulated(3 * others, min(study.seconds, 10.0), study.seed + 2))
+    return up_noise, rest_noise, learned_noise(training, up_noise, study.updates, min(250, training.shape[1]))
+
+
 def main() -> None:
     """Runs the study."""
     study = parse(Study)
@@ -285,27 +307,36 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(study.seed)
     settled = slice(min(round(SETTLED / DT), round(study.seconds / DT) // 2), None)
-    others = study.runs // 3 + 1
-    validation = prepared(simulated(others, study.seconds, study.seed + 1))
-    up_noise = chosen(attitude_filter, UP_NOISES[-2:] if study.smoke else UP_NOISES, validation, settled)
-    rest_noise = REST_NOISES[0] if study.smoke else chosen(inertial_filter, REST_NOISES, validation, settled)
-    training = prepared(simulated(3 * others, min(study.seconds, 10.0), study.seed + 2))
-    learned = learned_noise(training, up_noise, study.updates, min(250, training.shape[1]))
-    logs = {"simulated": (simulated(study.runs, study.seconds, study.seed), settled)}
+    logs = {"simulated": (partial(simulated, study.runs, study.seconds, study.seed), settled)}
     if (study.icub / "walking.npz").exists() and not study.smoke:
-        logs["iCub"] = walking(study.icub), STEADY
+        logs["iCub"] = partial(walking, study.icub), STEADY
     rows: list[dict] = []
-    for name, (data, scored) in logs.items():
-        rows += baseline_rows(name, data, scored)
-        for row in library_rows(name, prepared(data), scored, up_noise, rest_noise, learned, study.smoke):
-            rows.append(row)
+    if study.only:
+        rows = COLUMNS.read(study.out / "attitude.csv")
+        settings = {
+            row["reads"]: row["setting"]
+            for row in rows
+            if row["filter"] in ("EKF", "FusedFilter, EKF") and "setting" in row
+        }
+        options = settings[IMU], settings[PLACE], GivenNoise()
+    else:
+        options = found_settings(study, settled)
+    for name, (make, scored) in logs.items():
+        data = make()
+        if not study.only:
+            rows += baseline_rows(name, data, scored)
+        for row in library_rows(name, prepared(data), scored, *options, study.smoke, study.only):
+            if not row:
+                continue
+            rows = [other for other in rows if any(other[key] != row[key] for key in COLUMNS.text)] + [row]
             numbers = {key: f"{row[key]:.3g}" for key in SCORES}
             print(name, row["reads"], row["filter"], numbers, flush=True)
+    rows.sort(key=lambda row: (row["data"] == "iCub", READS.index(row["reads"])))
     if study.out is not None:
         study.out.mkdir(parents=True, exist_ok=True)
         COLUMNS.write(rows, study.out / "attitude.csv")
         if "iCub" in logs:
             mahonys = [row for row in rows if row["data"] == "simulated" and row["filter"].startswith("Mahony")]
             pull = min(mahonys, key=lambda row: row["tilt"])["setting"]
-            picture(logs["iCub"][0], pull, study.out / "attitude.png")
+            picture(logs["iCub"][0](), pull, study.out / "attitude.png")
     write_page(page(rows, study), None if study.out is None else study.out / "attitude.md")

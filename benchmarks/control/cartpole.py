@@ -15,6 +15,7 @@ from torchrl.data import Bounded
 from torch_denkf import modules as m
 from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.filters import DEnKF
+from torch_denkf.functional.draws import exact_draws
 
 REPEAT, STEPS = 4, 250  # physics steps of 0.01 s that an action is held for; actions in an episode
 DT = 0.01 * REPEAT  # s
@@ -147,7 +148,8 @@ class Physics(m.Transition):
 
     def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
         """States ``[*B, E, 5]`` one step on, with actions ``[*B, 1]``."""
-        motor = action.unsqueeze(-2) + ACTION_NOISE * torch.randn(*ensemble.shape[:-1], REPEAT)
+        normal = exact_draws(torch.randn(*ensemble.shape[:-1], REPEAT), ensemble)
+        motor = action.unsqueeze(-2) + ACTION_NOISE * normal
         state, _ = self.world.moved(ensemble.flatten(0, -2), motor.clamp(-1, 1).flatten(0, -2))
         return state.view_as(ensemble)
 

@@ -20,7 +20,7 @@ from benchmarks.legged.task import FIRM, GROUNDS, LEVEL, SIMULATED, Robot, icub,
 from benchmarks.legged.training import CELLS, VELOCITY, learned_contacts, trained_lstm
 from torch_denkf.applications.legged import LearnedContacts, LeggedNoises, legged_filter
 from torch_denkf.applications.legged.quadruped import quadruped
-from torch_denkf.pretrained import save_pretrained
+from torch_denkf.pretrained import from_pretrained, save_pretrained
 
 #: Of the feet, by the joints' angles in m and by their rates in m/s: one pair is chosen in validation.
 KINEMATICS, RATES = (0.01, 0.03, 0.1), (0.3, 1.0)
@@ -47,6 +47,7 @@ VALIDATED = Columns(
 )
 SHOWN = list(DATA["quadruped"])[1]  # in the picture
 VALIDATION_RUNS = 8
+RESULTS = Path(__file__).parent / "results"
 KINDS = {
     "EKF": {"kind": "EKF"},
     "UKF": {"kind": "UKF"},
@@ -66,6 +67,7 @@ class Study:
         "humanoid",
         "icub",
     )  # rows of the others are read from legged.csv
+    kinds: tuple[str, ...] = ()  # run these filters alone, with the quadruped's contacts that the library has
     runs: int = 20  # of the test, on each ground
     seconds: float = 20.0  # of such a run
     training_runs: int = 120  # of 6 s each
@@ -133,7 +135,7 @@ def feet_grid(smoke: bool) -> list[dict[str, float]]:
 
 
 def filter_rows(
-    robots: dict[str, Robot], variants: dict[str, dict], kinds: dict[str, dict]
+    robots: dict[str, Robot], variants: dict[str, dict], kinds: dict[str, dict], integrated: bool = True
 ) -> tuple[list[dict], dict[str, TensorDict]]:
     """Rows of the library's filters; and their beliefs, by filter, of all runs.
 
@@ -142,6 +144,7 @@ def filter_rows(
         variants: of every filter, by what is behind its name: its noises, and its contacts. The first one's noises are
             also those of the integrated sensor.
         kinds: options of the filters, by name.
+        integrated: whether the inertial sensor alone has a row.
     """
     every = replace(next(iter(robots.values())), log=torch.cat([robot.log for robot in robots.values()]))
     runs = {
@@ -151,7 +154,8 @@ def filter_rows(
     }
     noises = next(iter(variants.values()))["noises"]
     used = {key: getattr(noises, key) for key in NOISES}
-    runs["integrated inertial sensor"] = run(in_the_air(every), noises=noises, kind="EKF")
+    if integrated:
+        runs["integrated inertial sensor"] = run(in_the_air(every), noises=noises, kind="EKF")
     rows = []
     for name, (belief, ms) in runs.items():
         parts = belief.chunk(len(robots))
@@ -213,6 +217,32 @@ def _with_noises(rows: list[dict]) -> dict[str, dict]:
     return {row["data"].split(",")[0]: row for row in rows if row["filter"].startswith("EKF")}
 
 
+def again(study: Study, kind: str) -> list[dict]:
+    """Rows of some filters: of all four grounds, with the noises that were chosen before."""
+    if kind == "icub":
+        robots = {ICUB: icub(study.icub)}
+        names = "humanoid, firm ground, uneven stamps"
+    else:
+        robots = grounds(study, kind)
+        names = f"{kind}, all grounds"
+    file = (study.out or RESULTS) / "validation.csv"
+    best = min((row for row in VALIDATED.read(file) if row["data"] == names), key=lambda row: row["nll"])
+    noises = LeggedNoises(**{key: best[key] for key in NOISES})
+    variants = {"" if kind == "icub" else ", threshold": {"noises": noises}}
+    if kind == "quadruped":
+        trained = next(m for m in from_pretrained(kind).modules() if isinstance(m, LearnedContacts))
+        variants[", learned"] = {"noises": noises, "contacts": trained}
+    return filter_rows(robots, variants, {name: KINDS[name] for name in study.kinds}, integrated=False)[0]
+
+
+def grounds(study: Study, kind: str) -> dict[str, Robot]:
+    """A simulated robot's test logs."""
+    return {
+        name: simulated(kind, study.runs, study.seconds, study.seed + 3 + number, ground)
+        for number, (name, ground) in enumerate(DATA[kind].items())
+    }
+
+
 def walked(study: Study, kind: str) -> list[dict]:
     """The rows of a simulated robot; of the quadruped the picture and the trained filter are left in the folder."""
     length = 0.3 if study.smoke else 6.0
@@ -224,10 +254,7 @@ def walked(study: Study, kind: str) -> list[dict]:
     lstm = trained_lstm(training, validation, contacts, study.lstm_updates)
     if study.out is not None and kind == "quadruped":
         _save(contacts, noises, study)
-    robots = {
-        name: simulated(kind, study.runs, study.seconds, study.seed + 3 + number, ground)
-        for number, (name, ground) in enumerate(DATA[kind].items())
-    }
+    robots = grounds(study, kind)
     kinds = {"EKF": KINDS["EKF"]} if study.smoke else KINDS
     variants = {", threshold": {"noises": noises}, ", learned": {"noises": noises, "contacts": contacts}}
     rows, beliefs = filter_rows(robots, variants, kinds)
@@ -284,7 +311,11 @@ def main() -> None:
             continue
         began = time.monotonic()
         data = DATA.get(part, [ICUB])
-        rows = [row for row in rows if row["data"] not in data] + parts[part](study)
+        made = again(study, part) if study.kinds else parts[part](study)
+        replaced = {(row["data"], row["filter"]) for row in made}
+        if not study.kinds:
+            rows = [row for row in rows if row["data"] not in data]
+        rows = [row for row in rows if (row["data"], row["filter"]) not in replaced] + made
         print(f"{part}: {(time.monotonic() - began) / 60:.0f} min", flush=True)
         if file is not None:
             COLUMNS.write(rows, file)

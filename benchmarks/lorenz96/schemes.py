@@ -11,8 +11,9 @@ burn-in.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 from tensordict import TensorDict
@@ -22,6 +23,7 @@ from benchmarks.common.arguments import command, processor
 from benchmarks.common.lorenz96 import lorenz96_step
 from benchmarks.common.tables import head, line, write_page
 from torch_denkf.functional import analyse
+from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.inflation import inflate, random_rotation
 from torch_denkf.modules import LocalEnsembleAnalysis
 
@@ -59,8 +61,9 @@ RADIUS = 4.0  # of the localisation, in variables
 class Random:
     """One generator a seed, so a seed's draws do not depend on which others run."""
 
-    def __init__(self, seeds: int, stream: int) -> None:
-        self.generators = [torch.Generator().manual_seed(1000 * stream + seed) for seed in range(seeds)]
+    def __init__(self, seeds: int, stream: int, first: int = 0) -> None:
+        numbers = range(first, first + seeds)
+        self.generators = [torch.Generator().manual_seed(1000 * stream + seed) for seed in numbers]
 
     def randn(self, *shape: int) -> Tensor:
         """Standard normal, ``[seeds, *shape]``."""
@@ -71,9 +74,9 @@ class Random:
         return torch.stack([random_rotation(size, generator=g, dtype=torch.float64) for g in self.generators])
 
 
-def simulate(seeds: int, cycles: int) -> tuple[Tensor, Tensor]:
+def simulate(seeds: int, cycles: int, first: int = 0) -> tuple[Tensor, Tensor]:
     """Truth and observations, ``[cycles + 1, seeds, VARIABLES]``; the first is the start."""
-    random = Random(seeds, stream=0)
+    random = Random(seeds, 0, first)
     state = 8 + random.randn(VARIABLES)
     for _ in range(SPIN_UP):
         state = lorenz96_step(state)
@@ -83,12 +86,27 @@ def simulate(seeds: int, cycles: int) -> tuple[Tensor, Tensor]:
     return torch.stack(truth), torch.stack([state + random.randn(VARIABLES) for state in truth])
 
 
-def assimilate(case: Case, truth: Tensor, observations: Tensor) -> tuple[Tensor, Tensor]:
-    """Root mean square error and spread of every analysis, both ``[cycles, seeds]``."""
+def assimilate(
+    case: Case, truth: Tensor, observations: Tensor, first: int = 0, exact: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Root mean square error and spread of every analysis, both ``[cycles, seeds]``.
+
+    Args:
+        case: of the table.
+        truth: of :func:`simulate`.
+        observations: of it.
+        first: seed of them.
+        exact: whether the start and perturbations are exact draws.
+    """
     seeds = truth.shape[1]
-    random = Random(seeds, stream=1)
+    random = Random(seeds, 1, first)
+
+    def draw(*uncorrelated: Tensor) -> Tensor:
+        normal = random.randn(case.ensemble_size, VARIABLES)
+        return exact_draws(normal, *uncorrelated) if exact else normal
+
     noise = torch.ones(seeds, VARIABLES, dtype=torch.float64)
-    ensemble = truth[0].unsqueeze(1) + random.randn(case.ensemble_size, VARIABLES)
+    ensemble = truth[0].unsqueeze(1) + draw()
     places = torch.arange(VARIABLES, dtype=torch.float64).unsqueeze(-1)
     local = LocalEnsembleAnalysis.around(places, places, RADIUS, period=[float(VARIABLES)], rotate=case.rotate)
     errors, spreads = [], []
@@ -112,7 +130,7 @@ def assimilate(case: Case, truth: Tensor, observations: Tensor) -> tuple[Tensor,
                 observation,
                 noise,
                 scheme=case.scheme,
-                perturbation=random.randn(case.ensemble_size, VARIABLES) if case.scheme == "perturbed" else None,
+                perturbation=draw(ensemble) if case.scheme == "perturbed" else None,
                 rotation=random.rotation(case.ensemble_size) if case.rotate else None,
             ).ensemble
         ensemble = inflate(ensemble, case.inflation)
@@ -121,10 +139,11 @@ def assimilate(case: Case, truth: Tensor, observations: Tensor) -> tuple[Tensor,
     return torch.stack(errors), torch.stack(spreads)
 
 
-def report(seeds: int, cycles: int, burn_in: int) -> str:
+def report(study: Schemes) -> str:
     """Run every case; the Markdown table with what is needed to repeat it."""
+    seeds, cycles, burn_in = study.seeds, study.cycles, study.burn_in
     start = time.perf_counter()
-    truth, observations = simulate(seeds, burn_in + cycles)
+    truth, observations = simulate(seeds, burn_in + cycles, study.first)
     lines = [
         "# Lorenz-96: analysis error of the ensemble schemes",
         "",
@@ -132,12 +151,16 @@ def report(seeds: int, cycles: int, burn_in: int) -> str:
         f"over {cycles:,} cycles after {burn_in:,} of burn-in of the root mean square error of the analysis mean;",
         f"mean over {seeds} seeds, then each seed. Spread: the same of the ensemble's standard deviation.",
         "Published: DAPPER's table, which reproduces the papers. Met: the mean does not exceed the target.",
+        f"The start and perturbations are {study.draws} draws.",
         "",
         *head(*TITLES),
     ]
     for case in CASES:
+        if case.scheme not in study.schemes:
+            continue
+        case = case if study.inflation is None else replace(case, inflation=study.inflation)
         began = time.perf_counter()
-        errors, spreads = assimilate(case, truth, observations)
+        errors, spreads = assimilate(case, truth, observations, study.first, study.draws == "exact")
         elapsed = 1e3 * (time.perf_counter() - began) / len(errors)
         scores = errors[burn_in:].mean(0)
         cells = [
@@ -157,7 +180,7 @@ def report(seeds: int, cycles: int, burn_in: int) -> str:
     lines += [
         "",
         f"* Command: `{command('lorenz96')}`",
-        f"* Seeds: 0 to {seeds - 1}, all run as one batch, none left out; double precision.",
+        f"* Seeds: {study.first} to {study.first + seeds - 1}, all run as one batch, none left out; double precision.",
         f"* Hardware: {processor()}, {torch.get_num_threads()} thread(s); torch {torch.__version__}; "
         f"{time.perf_counter() - start:.0f} s in all. A cycle: {seeds} filters' forecast, analysis, score.",
     ]
@@ -171,10 +194,15 @@ class Schemes:
     seeds: int = 4  # independent runs, one batch
     cycles: int = 10_000  # cycles averaged
     burn_in: int = 400  # cycles before those
+    first: int = 0  # seed
+    schemes: tuple[str, ...] = ("perturbed", "sakov", "etkf", "letkf")
+    inflation: float | None = None  # in the place of the published ones
+    draws: Literal["exact", "random"] = "exact"  # of the start and of perturbations
     out: Path | None = None  # also write the table to this Markdown file
     smoke: bool = False  # a few cycles: does it run?
 
     def __call__(self) -> None:
         """Prints the table."""
-        cycles, burn_in = (20, 20) if self.smoke else (self.cycles, self.burn_in)
-        write_page(report(self.seeds, cycles, burn_in), self.out)
+        if self.smoke:
+            self.cycles, self.burn_in = 20, 20
+        write_page(report(self), self.out)

@@ -27,7 +27,20 @@ from torch_denkf.functional.inflation import inflate
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
 
-__all__ = ["Score", "Task", "cartpole", "lorenz96", "manipulator", "reacher", "ur5", "walks", "wheels"]
+__all__ = [
+    "Score",
+    "Task",
+    "cartpole",
+    "episodes_of_reacher",
+    "filtered",
+    "lorenz96",
+    "manipulator",
+    "reacher",
+    "resized",
+    "ur5",
+    "walks",
+    "wheels",
+]
 
 LEVEL = 0.9  # of the intervals
 WALKS, WALK_STD, READING_STD = 10, 0.1, 0.5  # walks, each step of one, each reading of one
@@ -73,9 +86,9 @@ def scored(mean: Tensor, var: Tensor, truth: Tensor, dims: slice = slice(None)) 
 
 
 @torch.no_grad()
-def filtered(filter: Filter, data: TensorDict, skip: int, dims: slice = slice(None)) -> Score:
+def filtered(filter: Filter, data: TensorDict, skip: int, dims: slice = slice(None), seed: int = 0) -> Score:
     """The score on sequences ``[B, T]`` behind their first steps."""
-    torch.manual_seed(0)
+    torch.manual_seed(seed)
     out = filter.sequence(data.clone(), keep=[("belief", "mean"), ("belief", "var")])["belief"][:, skip:]
     return scored(out["mean"], out["var"], data["state"][:, skip:], dims)
 
@@ -212,7 +225,8 @@ def resized(filter: Any, members: int, threshold: float | None) -> Any:
     return new
 
 
-def _episodes(episodes: int, steps: int, seed: int) -> TensorDict:
+def episodes_of_reacher(episodes: int, steps: int, seed: int) -> TensorDict:
+    """Episodes ``[episodes, steps]`` of random actions."""
     torch.manual_seed(seed)
     env = reacher_env(seed)
     return TensorDict.stack([env.rollout(steps).select("state", "encoder", "action") for _ in range(episodes)])
@@ -221,8 +235,8 @@ def _episodes(episodes: int, steps: int, seed: int) -> TensorDict:
 def reacher(episodes: int = 10, steps: int = 400) -> Task:
     """Joint velocities of the reacher by the filter that comes with the library."""
     test, other, shipped = (
-        _episodes(episodes, steps, 1000),
-        _episodes(episodes, steps, 2000),
+        episodes_of_reacher(episodes, steps, 1000),
+        episodes_of_reacher(episodes, steps, 2000),
         from_pretrained("reacher"),
     )
 

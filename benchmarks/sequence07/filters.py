@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from benchmarks.sequence07.chosen import FILTER, HALVES, LENS, SLIP_KEPT
 from torch_denkf import Filter, FusedFilter, FusedSensor
+from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.manifolds import SE3, Euclidean, Product
 from torch_denkf.modules import (
     AroundState,
@@ -33,6 +34,7 @@ DT = 0.1037  # s, of a typical row; the length of each is read
 #: Pose of the row before; twist in rad/s and m/s; how turn and speed have changed since the row before; the gyro's bias
 #: in rad/s; the slip in rad/m and m/m.
 SPACE = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3), Euclidean(6))
+WITHOUT_SLIP = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3))
 POSE, TWIST, BIAS = slice(0, 7), slice(7, 13), slice(17, 20)
 SLIP = [math.hypot(*both) for both in zip(HALVES, LENS, strict=True)]
 SWAYS = [0, 1, 2, 5]  # of the twist
@@ -51,19 +53,24 @@ class CarMotion(Motion):
     the filter thinks it is.
 
     The pose trails so that the row's own readings correct the twist before it moves the pose.
+
+    Args:
+        slip: whether the state has it.
     """
 
-    def __init__(self):
+    def __init__(self, slip: bool = True):
         keys = {"kept": 6, "swing": 4, "slip_kept": 1}
-        super().__init__(SPACE, "dt_before", keys, ("belief", "ensemble"), ("forecast", "ensemble"))
+        super().__init__(
+            SPACE if slip else WITHOUT_SLIP, "dt_before", keys, ("belief", "ensemble"), ("forecast", "ensemble")
+        )
 
     def move(self, state, kept, swing, slip_kept, *, dt):
         """The pose moved by twist and slip; the twist that is kept."""
-        pose, twist, change, bias, slip = self.space.points(state)
+        pose, twist, change, bias, *slips = self.space.points(state)
         change = swing * change
         after = kept * twist + torch.cat([change[..., :3], torch.zeros_like(twist[..., 3:5]), change[..., 3:]], -1)
-        moved = SE3().plus(pose, (twist + slip * twist[..., 5:]) * dt)
-        return torch.cat([moved, after, (after - twist)[..., SWAYS], bias, slip_kept * slip], -1)
+        moved = SE3().plus(pose, (twist + sum(slip * twist[..., 5:] for slip in slips)) * dt)
+        return torch.cat([moved, after, (after - twist)[..., SWAYS], bias, *(slip_kept * slip for slip in slips)], -1)
 
 
 class LastMotion(SubModel):
@@ -106,7 +113,7 @@ class TurnRate(SubModel):
 
 
 class Given(Sensor):
-    """Hands an entry on, under another key."""
+    """Hands the first components of an entry on, under another key."""
 
     def __init__(self, in_key, out_key, size: int):
         super().__init__(nn.Identity(), [in_key], [out_key])
@@ -114,7 +121,7 @@ class Given(Sensor):
 
     def compute(self, value):
         """The same."""
-        return value
+        return value[..., : self.observation_dim]
 
 
 def pose_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
@@ -135,12 +142,32 @@ def pose_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
     return out[prefix, "mean"][..., 1:, POSE], var[..., 1:, :6]
 
 
-def process_noise() -> MappedNoise:
-    """What a row adds: noise of the twist, of the bias, of the slip."""
-    through = torch.zeros(25, 15, dtype=torch.float64)
+def noise_paths(slip: bool = True) -> Tensor:
+    """How what a row adds enters the tangent ``[D, q]``: noise of the twist, of the bias, of the slip."""
+    size = 15 if slip else 9
+    through = torch.zeros(size + 10, size, dtype=torch.float64)
     through[6:12, :6], through[12:16, :6] = torch.eye(6), torch.eye(6)[SWAYS]
-    through[16:, 6:] = torch.eye(9)
-    return MappedNoise(Given("process", ("forecast", "noise"), 15), through)
+    through[16:, 6:] = torch.eye(size - 6)
+    return through
+
+
+class FewNoises(NoisyTransition):
+    """Process noise of fewer numbers than the tangent has: exact draws of these need fewer members.
+
+    Args:
+        motion: the motion.
+        through: how the noises ``[D, q]`` enter the tangent. Their variances stand under ``"process"``.
+    """
+
+    def __init__(self, motion: CarMotion, through: Tensor):
+        super().__init__(motion, Given("process", ("forecast", "noise"), len(through)), space=motion.space)
+        self.register_buffer("through", through)
+
+    def _add(self, ensemble, entries, call):
+        normal = self._noise(entries, [ensemble], call)[..., : self.through.shape[1]]
+        away = self.space.minus(ensemble, self.space.near(ensemble).unsqueeze(-2))
+        std = entries["process"][..., : self.through.shape[1]].sqrt().unsqueeze(-2)
+        return self.space.plus(ensemble, (exact_draws(normal, away) * std) @ self.through.mT)
 
 
 def speed_before(data: TensorDict) -> Tensor:
@@ -186,10 +213,13 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     data["gyro_noise"] = several("gyro", "gyro", "gyro").square()
     origin = SPACE.neutral(data["motion"]) if start is None else start.unsqueeze(-2)
     data["start"] = origin.expand(*data.shape, 26).contiguous()
+    data["start_without_slip"] = data["start"][..., : WITHOUT_SLIP.point_dim]
     return data
 
 
-def car_filter(kind: Kind, members: int = 64, *, gate: dict | None = None, again: bool = False, **analysis) -> Filter:
+def car_filter(
+    kind: Kind, members: int = 64, *, gate: dict | None = None, again: bool = False, slip: bool = True, **analysis
+) -> Filter:
     """A filter of all three parts of the state.
 
     Args:
@@ -197,6 +227,7 @@ def car_filter(kind: Kind, members: int = 64, *, gate: dict | None = None, again
         members: of the ensemble.
         gate: options of :class:`~torch_denkf.monitoring.Gated` around the corners' update; ``None`` for none.
         again: whether the start is a belief of a filter that has run before.
+        slip: whether the state of an ensemble has it.
         **analysis: options of the ensemble's analyses.
     """
     seen = {"observed_key": "motion_observed"}
@@ -204,13 +235,15 @@ def car_filter(kind: Kind, members: int = 64, *, gate: dict | None = None, again
         "gyro": FusedSensor(TurnRate(), Given("gyro_noise", ("sensor", "noise"), 3)),
         "motion": FusedSensor(LastMotion(), Given("motion_noise", ("sensor", "noise"), 6), reading_space=SE3(), **seen),
     }
-    std = [*(RESTART if again else START), *SLIP]
-    motion, noise = CarMotion(), process_noise()
+    std = [*(RESTART if again else START), *(SLIP if slip else [])]
+    motion, through = CarMotion(slip), noise_paths(slip)
+    noise = MappedNoise(Given("process", ("forecast", "noise"), through.shape[1]), through)
     if kind == "DEnKF":
-        initial = AroundState(std, ensemble_size=members, state_key="start", space=SPACE)
+        key = "start" if slip else "start_without_slip"
+        initial = AroundState(std, ensemble_size=members, state_key=key, space=motion.space)
         sensors["motion"] = FusedSensor(WhitenedMotion(), [1.0] * 6, observation_key="whitened", **seen)
         made = partial(EnsembleAnalysis, "etkf", **analysis)
-        filter = FusedFilter(NoisyTransition(motion, noise, space=SPACE), sensors, initial=initial, analysis=made)
+        filter = FusedFilter(FewNoises(motion, through), sensors, initial=initial, analysis=made)
     else:
         initial = GaussianAround(std, state_key="start", space=SPACE)
         if kind == "UKF":

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import Columns, head, line, write_page
-from benchmarks.sequence07.filters import POSE, SPACE, car_filter, pose_of, prepared
+from benchmarks.sequence07.filters import BIAS, POSE, SPACE, car_filter, pose_of, prepared
 from benchmarks.sequence07.pictures import draw
 from benchmarks.sequence07.task import CONDITIONS, ROWS, chained, naive, readings, truth
 from torch_denkf import Filter
@@ -27,7 +27,9 @@ LEVEL = 0.9  # of the intervals
 STEPS = (1, 10, 100)  # rows over which a relative motion is claimed
 EVERY = 40  # rows from one start of a relative motion to the next
 HELD = tuple(f"held_{step}" for step in STEPS)
-SCORES = ("translation", "rotation", *HELD, "ms")
+DRAWS = 5  # of an ensemble
+SPREADS = ("translation_spread", "rotation_spread")  # standard deviation over draws
+SCORES = ("translation", "rotation", *HELD, "ms", *SPREADS)
 COLUMNS = Columns(
     names=("condition", "filter", *SCORES),
     text=("condition", "filter"),
@@ -44,6 +46,7 @@ class Study:
     out: Path | None = None  # folder for sequence07.csv, sequence07.md and sequence07.png
     seed: int = 0
     ukf: bool = False  # also the unscented filter, whose figures are the extended one's
+    only: str = ""  # run filters alone whose name has this; other rows are read from sequence07.csv, nothing is drawn
     smoke: bool = False  # a few rows and filters: does it run?
 
 
@@ -85,8 +88,8 @@ def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict
     length = STEPS[-1] + 2
     first = torch.arange(EVERY, data.shape[1] - length + 1, EVERY)
     rows = first.unsqueeze(-1) + torch.arange(length)
-    origin = SPACE.neutral(states[:, first]).expand_as(states[:, first]).clone()
-    origin[..., POSE.stop : -6] = states[:, first, POSE.stop : -6]
+    origin = SPACE.neutral(states).expand(len(states), len(first), -1).clone()
+    origin[..., POSE.stop : BIAS.stop] = states[:, first, POSE.stop : BIAS.stop]
     part = prepared(data[:, rows], start=origin)
     for key in ("motion_observed", "gyro_observed"):  # the start's own reading is in its belief
         part[key] = part[key].clone()
@@ -121,8 +124,12 @@ def and_one_more(data: TensorDict) -> TensorDict:
 def filter_rows(
     label: str, kind: str, data: TensorDict, poses: Tensor, smoother: str = "", **options
 ) -> Iterator[tuple[dict, Tensor, Claim]]:
-    """Of one filter, and of its smoother if it has a name: a row for each condition, its path ``[T, 7]``, its claim."""
+    """Of one filter, and of its smoother if it has a name: a row for each condition, its path ``[T, 7]``, its claim.
+
+    An ensemble's row is the mean over ``DRAWS``; the path is that of the first.
+    """
     around = EnRTS if kind == "DEnKF" else RTSSmoother
+    draws = DRAWS if kind == "DEnKF" else 1
     models = [car_filter(kind, again=again, **options) for again in (False, True)]
     some = prepared(data[:1, :50])
     began = time.process_time()
@@ -131,15 +138,24 @@ def filter_rows(
     if smoother:
         models = [around(model) for model in models]
     named = {"belief": label, "smoothed": smoother} if smoother else {"belief": label}
+    data = torch.cat([data] * draws)
     out = run(models[0], prepared(and_one_more(data)))
     part, true = windows(data, out["belief", "mean"], poses)
     found = run(models[1], part.flatten(0, 1)).unflatten(0, part.shape[:2])
     for number, condition in enumerate(CONDITIONS):
         for prefix, name in named.items():
-            path, claim = pose_of(out[number], prefix)[0], claimed(found[number], true, prefix)
-            row = {"condition": condition, "filter": name, **drift(path, poses)}
+            each = slice(number, None, len(CONDITIONS))
+            paths, claim = (
+                pose_of(out[each], prefix)[0],
+                claimed(found[each].flatten(0, 1), true.repeat(draws, 1, 1), prefix),
+            )
+            drifts = torch.tensor([list(drift(path, poses).values()) for path in paths])
+            row = {"condition": condition, "filter": name}
+            row |= dict(zip(("translation", "rotation"), drifts.mean(0).tolist(), strict=True))
+            if draws > 1:
+                row |= dict(zip(SPREADS, drifts.std(0).tolist(), strict=True))
             row |= dict(zip(HELD, claim.held().tolist(), strict=True))
-            yield row if prefix == "smoothed" else {**row, "ms": ms}, path, claim
+            yield row if prefix == "smoothed" else {**row, "ms": ms}, paths[0], claim
 
 
 def drift(path: Tensor, poses: Tensor) -> dict[str, float]:
@@ -161,14 +177,15 @@ def alone(study: Study, data: TensorDict, poses: Tensor, count: int) -> Iterator
             yield {"condition": condition, "filter": label, **drift(path, poses)}, path
 
 
-def page(rows: Sequence[dict], seconds: float, count: int) -> str:
+def page(rows: Sequence[dict], count: int) -> str:
     """The table."""
     lines = [
         "# Sequence 07 of KITTI",
         "",
         f"Odometry sequence 07, {count} rows: stereo corners and turn rates. Errors are KITTI's own, in six "
         f"dimensions, over 100 to 800 m. *Held*: the share of errors within the {LEVEL:.0%} intervals, of the six "
-        f"numbers of the motion over 1, 10 and 100 rows; a start every {EVERY} rows.",
+        f"numbers of the motion over 1, 10 and 100 rows; a start every {EVERY} rows. Rows of ensembles are means over "
+        f"{DRAWS} draws, with their standard deviation.",
     ]
     titles = ("filter", "translation, %", "rotation, deg/100 m", *(f"held, {step}" for step in STEPS), "ms a row")
     for condition in CONDITIONS:
@@ -177,6 +194,8 @@ def page(rows: Sequence[dict], seconds: float, count: int) -> str:
             if row["condition"] == condition:
                 digits = {"translation": 2, "rotation": 2, **dict.fromkeys(HELD, 2), "ms": 1}
                 numbers = [f"{row[key]:.{places}f}" if key in row else "" for key, places in digits.items()]
+                for at, spread in enumerate(SPREADS):
+                    numbers[at] += f" ± {row[spread]:.2f}" if spread in row else ""
                 lines.append(line(row["filter"], *numbers))
     lines += [
         "",
@@ -184,7 +203,7 @@ def page(rows: Sequence[dict], seconds: float, count: int) -> str:
         "the later row, in both images by different amounts.",
         "",
         "Milliseconds are those of the processor for one row of one drive, not compiled, one thread; without those of "
-        f"the corners' motion. The whole command took {seconds:.0f} s.",
+        "the corners' motion.",
         "",
         *made_by("sequence07"),
     ]
@@ -194,7 +213,6 @@ def page(rows: Sequence[dict], seconds: float, count: int) -> str:
 def main() -> None:
     """Runs the study."""
     study = parse(Study)
-    began = time.perf_counter()
     torch.set_default_dtype(torch.float64)
     torch.manual_seed(study.seed)
     count = 250 if study.smoke else ROWS
@@ -204,21 +222,25 @@ def main() -> None:
     models = [("EKF", "EKF", "RTS smoother", {})]
     if study.ukf:
         models.append(("UKF", "UKF", "", {}))
-    for members, smoother in ((32, ""), (64, "EnRTS, 64 members")):
-        options = {"members": members, "localisation": "significance", "threshold": 3.0}
-        models.append((f"DEnKF, {members} members", "DEnKF", smoother, options))
-    for row, path in alone(study, data, poses, count):
-        rows.append(row)
-        paths[row["condition"], row["filter"]] = path
+    models.append(("DEnKF, 32 members, no slip", "DEnKF", "", {"members": 32, "slip": False}))
+    models.append(("DEnKF, 64 members", "DEnKF", "EnRTS, 64 members", {"members": 64}))
+    if study.only:
+        rows = COLUMNS.read(study.out / "sequence07.csv")
+        models = [model for model in models if study.only in model[0]]
+    else:
+        for row, path in alone(study, data, poses, count):
+            rows.append(row)
+            paths[row["condition"], row["filter"]] = path
     for label, kind, smoother, options in models[:1] if study.smoke else models:
         for row, path, claim in filter_rows(label, kind, data, poses, smoother, **options):
-            rows.append(row)
+            rows = [other for other in rows if any(other[key] != row[key] for key in COLUMNS.text)] + [row]
             paths[row["condition"], row["filter"]], claims[row["condition"], row["filter"]] = path, claim
     for row in rows:
         print({key: f"{value:.3g}" if isinstance(value, float) else value for key, value in row.items()}, flush=True)
     if study.out is not None:
         study.out.mkdir(parents=True, exist_ok=True)
         COLUMNS.write(rows, study.out / "sequence07.csv")
+    if study.out is not None and not study.only:
         draw(paths, claims, poses, STEPS, study.out / "sequence07.png")
-    text = page(rows, time.perf_counter() - began, count)
+    text = page(rows, count)
     write_page(text, None if study.out is None else study.out / "sequence07.md")

@@ -107,3 +107,14 @@ def test_a_smoothed_step_is_nearer_than_a_reading_and_than_a_filtered_step():
     steps = [SE3().compose(SE3().inverse(path[:, :-1]), path[:, 1:]) for path in (*paths, poses)]
     errors = [SE3().minus(step, steps[-1]).square().mean().sqrt() for step in steps[:-1]]
     assert errors[2] < 0.95 * min(errors[:2])
+
+
+def test_members_with_room_for_the_state_are_the_extended_filter():
+    data, _ = driven(30, runs=2)
+    paths = []
+    for options in ({"kind": "EKF"}, {"kind": "DEnKF", "members": 32, "slip": False}):
+        torch.manual_seed(1)
+        paths.append(pose_of(run(car_filter(**options), prepared(and_one_more(data))))[0])
+    apart = SE3().minus(*paths)
+    assert apart[..., 3:].norm(dim=-1).max() < 0.02, "m, of 25 driven; random draws are some tenths off"
+    assert apart[..., :3].norm(dim=-1).max() < 0.002

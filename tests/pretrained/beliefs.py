@@ -10,8 +10,11 @@ import torch_denkf
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
 
 _LEGS = {"imu": 6, "joints": 16, "joint_rates": 16, "contact": 4}
+_IMU = dict.fromkeys(("gyro", "accelerometer", "magnetometer"), 3) | dict.fromkeys(("unrest", "disturbance", "dt"), 1)
+_IMU |= {"moves": 9, "start": 34}
 _READINGS = {
     "car-odometry": {"flow": FLOW_SHAPE, "road": ROAD_SHAPE, "start": (5,)},
+    "imu": {key: (size,) for key, size in _IMU.items()},
     "quadruped": {key: (size,) for key, size in _LEGS.items()}
     | {("last", key): (10 * size,) for key, size in _LEGS.items()},
     "reacher": {"encoder": (2,), "action": (2,)},
@@ -26,6 +29,8 @@ def all_beliefs():
         generator = torch.Generator().manual_seed(0)
         data = {key: torch.rand(6, *shape, generator=generator) for key, shape in _READINGS[name].items()}
         data.update({key: each > 0.5 for key, each in data.items() if "contact" in key})
+        if name == "imu":
+            data["start"][:, :4] = torch.tensor([1.0, 0.0, 0.0, 0.0])
         torch.manual_seed(0)
         with torch.no_grad():
             belief = torch_denkf.from_pretrained(name).sequence(TensorDict(data, [6]))["belief"][-1]

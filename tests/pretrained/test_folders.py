@@ -183,7 +183,7 @@ def test_what_differs_is_named_and_saving_draws_no_random_numbers(tmp_path):
 
 
 def test_mistakes_are_named(tmp_path):
-    names = "car-odometry, quadruped, reacher, ur5-table"
+    names = "car-odometry, imu, quadruped, reacher, ur5-table"
     with pytest.raises(FileNotFoundError, match=f"no trained filter 'car' and no such folder; .* comes with {names}"):
         from_pretrained("car")
     with pytest.raises(FileNotFoundError, match=r"no filter in .*: it has no config\.json"):

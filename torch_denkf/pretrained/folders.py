@@ -21,7 +21,7 @@ def available() -> list[str]:
 
     Example:
         >>> available()
-        ['car-odometry', 'quadruped', 'reacher', 'ur5-table']
+        ['car-odometry', 'imu', 'quadruped', 'reacher', 'ur5-table']
     """
     return sorted(_registered.weights())
 

@@ -1,0 +1,1 @@
+"""Orientation of an inertial sensor on BROAD."""

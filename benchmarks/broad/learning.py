@@ -1,0 +1,309 @@
+"""Learns the numbers of ``torch_denkf.applications.imu``, three times without a third of the kinds: numbers.json.
+
+    python -m benchmarks.broad.learning --out benchmarks/broad/numbers.json
+
+The filter's equations run in C (``equations.c``, by the compiler ``cc``): three minutes of one core. The lag of the
+magnetometer and the latency of the readings are least squares. All other numbers are found by an evolution strategy
+that lowers, averaged over the trials, the total error plus the inclination error, in degrees, plus 0.3 times the
+negative logarithm of Student's density of heading and inclination. Factors on the standard deviations then make the
+90 % intervals hold 90 % on those trials. The numbers for all other sensors, ``all``, are geometric means of the three
+sets.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import math
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy import ndarray
+from torch import Tensor
+
+from benchmarks.broad.task import Trial, read_trials, simulated_trial
+from benchmarks.common.arguments import command, parse
+from torch_denkf.applications.imu.filter import ImuFilter, ImuSettings, moves
+from torch_denkf.applications.imu.log import block_size, imu_rows
+from torch_denkf.deployment.files import write_text
+from torch_denkf.functional.manifolds import SO3, rotation_matrix
+
+__all__ = ["Equations", "Rows", "beliefs", "learn", "minimised"]
+
+#: What the strategy changes; poles are three more. All others stay.
+FREE = (
+    *("gyro", "gyro_rate", "gyro_walk", "motion", "motion_unrest", "accelerometer", "gyro_scale", "gyro_skew"),
+    *("magnetic_bias", "magnetic_walk", "magnetometer", "magnetometer_rate", "field_walk"),
+    *("stray", "stray_unrest", "stray_time"),
+    *("lag_std", "heading", "heading_scale", "heading_floor", "tilt_scale", "tilt_floor"),
+)
+START = ImuSettings()
+#: Kinds that are left out together.
+FOLDS = (
+    ("attached magnet", "slow rotation", "fast translation"),
+    ("stationary magnet", "tapping", "fast rotation"),
+    ("phone vibration", "fast combined", "slow translation"),
+)
+LARGE = 0.15  # rad: errors beyond say nothing of the latency
+FREEDOM = 4.0  # of Student's t
+
+
+@dataclass(frozen=True)
+class Learning:
+    """Learns the numbers of the inertial sensor's filter."""
+
+    data: Path = Path("../shared/data/broad")  # folder with .npz files of BROAD
+    out: Path | None = None  # numbers.json
+    generations: int = 22  # of the evolution strategy
+    seed: int = 0
+    smoke: bool = False  # one simulated trial, one generation
+
+
+class Rows:
+    """A trial's rows, as the equations in C read them.
+
+    Args:
+        trial: with the truth.
+        settings: of which the lag and the block count.
+        every: so many blocks are scored.
+        six: whether the magnetometer is left out.
+        short: whether the rows behind the last that is scored are left out.
+    """
+
+    def __init__(self, trial: Trial, settings: ImuSettings, every: int = 3, *, six: bool = False, short: bool = False):
+        field = None if six else trial.magnetometer
+        rows = imu_rows(settings, trial.gyro, trial.acceleration, field, rate=trial.rate)
+        names = ("gyro", "accelerometer", "magnetometer", "unrest", "disturbance")
+        self.values = [np.ascontiguousarray(rows[name].numpy()) for name in names]
+        self.rest = np.ascontiguousarray(rows["rest_observed"].numpy(), np.uint8)
+        self.count, self.dt, self.state = len(rows), rows["dt"][0].item(), rows["start"][0].numpy().copy()
+        size = block_size(settings, trial.rate)
+        last = np.arange(self.count) * size + size - 1
+        self.scored = np.flatnonzero(trial.scored.numpy()[last])[::every]
+        self.truth = SO3().normalise(trial.orientation[torch.as_tensor(last[self.scored])])
+        self.rate = torch.as_tensor(self.values[0][self.scored])
+        if short:
+            self.count = int(self.scored[-1]) + 1
+
+
+class Equations:
+    """The filter in C."""
+
+    def __init__(self):
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "equations.so"
+            source = Path(__file__).parent / "equations.c"
+            options = ["-O3", "-march=native", "-ffast-math", "-shared", "-fPIC", "-lm"]
+            subprocess.run(["cc", source, *options[:-1], "-o", file, options[-1]], check=True)
+            self.library = ctypes.CDLL(str(file))
+
+    def __call__(
+        self, rows: Rows, s: ImuSettings, *, nine: bool = True, kept: ndarray | None = None
+    ) -> tuple[ndarray, ndarray, ndarray]:
+        """Orientations ``[N, 4]``, covariances ``[N, 9]`` about the body's axes, and states ``[N, 33]``.
+
+        Args:
+            rows: of the trial.
+            s: the numbers.
+            nine: whether the magnetometer is read.
+            kept: gets what a smoother needs, ``[N, 3 * 33 * 33 + 37]``.
+        """
+        motion = ImuFilter(s)
+        numbers = [s.gyro, s.gyro_rate, s.gyro_walk, 2 * sum(s.poles), s.motion, s.motion_unrest, s.accelerometer]
+        numbers += [s.magnetometer, s.magnetometer_rate, s.magnetic_walk, s.field_walk, s.rest, s.gravity]
+        numbers += [s.stray, s.stray_unrest, s.stray_time]
+        start = motion.initial.std.double().numpy()
+        step = moves(s.poles, rows.dt).numpy().copy()
+        found = np.empty((rows.count, 4)), np.empty((rows.count, 9)), np.zeros((rows.count, 33))
+        own = [*rows.values, rows.rest]
+        given = [step, np.array(numbers), np.ascontiguousarray(start), rows.state, *found]
+        last = None if kept is None else _pointer(kept)
+        arrays = (*map(_pointer, own), int(nine), *map(_pointer, given), last)
+        self.library.filter(rows.count, ctypes.c_double(rows.dt), *arrays)
+        return found
+
+
+def beliefs(
+    run: Equations, trial: Trial, settings: ImuSettings, *, six: bool = False, smooth: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Returns means ``[N, 34]`` and covariances of the orientation ``[N, 3, 3]``, as filter and smoother write them."""
+    rows = Rows(trial, settings, six=six)
+    kept = np.zeros((rows.count, 3 * 33 * 33 + 37)) if smooth else None
+    quaternion, cov, states = map(torch.as_tensor, run(rows, settings, nine=not six, kept=kept))
+    mean, cov = torch.cat([quaternion, states[:, 3:]], -1), cov.unflatten(-1, (3, 3))
+    if kept is not None:
+        mean, cov = _smoothed(mean, torch.as_tensor(kept))
+    axes = rotation_matrix(mean[:, :4])
+    return mean, axes @ cov @ axes.mT
+
+
+def _smoothed(mean: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns smoothed means and covariances of rotations about the body's axes (Rauch, Tung & Striebel)."""
+    moves, ahead, after = kept[:, : 3 * 33 * 33].unflatten(-1, (3, 33, 33)).unbind(1)
+    forecast = torch.cat([kept[:, -37:-33], kept[:, -30:]], -1)
+    space, found, cov = SO3(), [mean[-1]], after[-1]
+    turns = [cov[:3, :3]]
+    for t in range(len(mean) - 2, -1, -1):
+        gain = torch.linalg.solve(ahead[t + 1], moves[t + 1] @ after[t]).mT
+        turn = space.log(space.compose(space.inverse(forecast[t + 1, :4]), found[-1][:4]))
+        step = gain @ torch.cat([turn, found[-1][4:] - forecast[t + 1, 4:]])
+        back = gain.clone()
+        back[:, :3] = torch.linalg.solve(space.right_jacobian(turn), gain[:, :3], left=False)
+        cov = after[t] - gain @ ahead[t + 1] @ gain.mT + back @ cov @ back.mT
+        jacobian = torch.eye(33, dtype=cov.dtype)
+        jacobian[:3, :3] = space.right_jacobian(step[:3])
+        cov = jacobian @ cov @ jacobian.mT
+        cov = (cov + cov.mT) / 2
+        found.append(torch.cat([space.plus(mean[t, :4], step[:3]), mean[t, 4:] + step[3:]]))
+        turns.append(cov[:3, :3])
+    return torch.stack(found[::-1]), torch.stack(turns[::-1])
+
+
+def _pointer(array: ndarray) -> ctypes.c_void_p:
+    return array.ctypes.data_as(ctypes.c_void_p)
+
+
+def measures(run: Equations, rows: Rows, s: ImuSettings, *, nine: bool = True) -> dict[str, float]:
+    """Returns root mean square errors in degrees, logarithms of Student's density, and the coverage."""
+    quaternion, cov, _ = run(rows, s, nine=nine)
+    found = SO3().plus(torch.as_tensor(quaternion[rows.scored]), rows.rate * s.latency)
+    error = SO3().compose(found, SO3().inverse(rows.truth)).numpy()
+    error = error * np.where(error[:, :1] < 0, -1, 1)
+    w, x, y, z = error.T
+    axes = _matrices(found.numpy())
+    world = np.degrees(1) ** 2 * axes @ cov[rows.scored].reshape(-1, 3, 3) @ axes.transpose(0, 2, 1)
+    total, heading = np.degrees(2 * np.arccos(np.clip(w, 0, 1))), np.degrees(2 * np.arctan2(z, w))
+    tilt = np.degrees(2 * np.arccos(np.clip(np.hypot(w, z), 0, 1)))
+    variance = s.heading_scale**2 * world[:, 2, 2] + s.heading_floor**2
+    a, b = (s.tilt_scale**2 * world[:, i, i] + s.tilt_floor**2 for i in (0, 1))
+    c = s.tilt_scale**2 * world[:, 0, 1]
+    size = a * b - c * c
+    two = np.degrees(2) ** 2 * (b * x * x + a * y * y - 2 * c * x * y) / size
+    one, nu = heading**2 / variance, FREEDOM
+    return {
+        "total": np.sqrt((total**2).mean()),
+        "inclination": np.sqrt((tilt**2).mean()),
+        "surprise": ((nu + 1) / 2 * np.log1p(one / nu) + 0.5 * np.log(variance)).mean()
+        + ((nu + 2) / 2 * np.log1p(two / nu) + 0.5 * np.log(size)).mean(),
+        "heading_held": (one < 2.7055).mean(),
+        "tilt_held": (two < 4.6052).mean(),
+    }
+
+
+def _matrices(q: ndarray) -> ndarray:
+    w, x, y, z = q.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def minimised(
+    loss: Callable[[ndarray], float], start: ndarray, step: float, generations: int, seed: int, size: int = 14
+) -> ndarray:
+    """Minimises by separable CMA-ES (Ros & Hansen 2008, PPSN X) with mirrored samples; returns the best found."""
+    rng, n = np.random.default_rng(seed), len(start)
+    parents = size // 2
+    weights = math.log(parents + 0.5) - np.log(np.arange(1, parents + 1))
+    weights /= weights.sum()
+    mass = 1 / (weights**2).sum()
+    c_path, c_size = (4 + mass / n) / (n + 4 + 2 * mass / n), (mass + 2) / (n + mass + 5)
+    c_one = min(1.0, 2 / ((n + 1.3) ** 2 + mass) * (n + 2) / 3)
+    c_rank = min(1 - c_one, 2 * (mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass) * (n + 2) / 3)
+    usual = math.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n * n))
+    middle, spread, path, length = start.copy(), np.ones(n), np.zeros(n), np.zeros(n)
+    best = (math.inf, start)
+    for _ in range(generations):
+        draws = rng.standard_normal((parents, n))
+        steps = np.concatenate([draws, -draws]) * np.sqrt(spread)
+        losses = np.array([loss(middle + step * each) for each in steps])
+        order = np.argsort(losses)
+        if losses[order[0]] < best[0]:
+            best = losses[order[0]], middle + step * steps[order[0]]
+        chosen = steps[order[:parents]]
+        mean = weights @ chosen
+        middle = middle + step * mean
+        length = (1 - c_size) * length + math.sqrt(c_size * (2 - c_size) * mass) * mean / np.sqrt(spread)
+        path = (1 - c_path) * path + math.sqrt(c_path * (2 - c_path) * mass) * mean
+        spread = (1 - c_one - c_rank) * spread + c_one * path**2 + c_rank * (weights @ chosen**2)
+        step *= math.exp(min(0.3, c_size / (1 + c_size) * (np.linalg.norm(length) / usual - 1)))
+    return middle if loss(middle) < best[0] else best[1]
+
+
+def _numbers(s: ImuSettings) -> ndarray:
+    return np.log([getattr(s, name) for name in FREE] + list(s.poles))
+
+
+def _with(s: ImuSettings, logs: ndarray) -> ImuSettings:
+    values = np.exp(logs).tolist()
+    return replace(s, poles=values[len(FREE) :], **dict(zip(FREE, values, strict=False)))
+
+
+def latency(run: Equations, rows: Sequence[Rows], s: ImuSettings) -> float:
+    """Returns the time by which the orientations are late, by least squares of their errors on the rate of turn."""
+    above = below = 0.0
+    for each in rows:
+        found = torch.as_tensor(run(each, s)[0][each.scored])
+        error = SO3().log(SO3().compose(SO3().inverse(each.truth), found))
+        near = error.abs().amax(-1) < LARGE
+        above -= (error * each.rate)[near].sum().item()
+        below += each.rate[near].square().sum().item()
+    return above / below
+
+
+def learn(run: Equations, trials: Sequence[Trial], generations: int, seed: int) -> ImuSettings:
+    """Learns the numbers from some trials."""
+    plain = [Rows(trial, replace(START, lag=0.0)) for trial in trials]
+    weights = [np.square(each.values[0]).sum() for each in plain]
+    lags = [run(each, replace(START, lag_std=0.01))[2][-1, 29] for each in plain]
+    lag = float(np.average(lags, weights=weights))
+    rows = [Rows(trial, replace(START, lag=lag), short=True) for trial in trials]
+    s = replace(START, lag=lag, latency=latency(run, rows, START))
+
+    def loss(logs: ndarray) -> float:
+        found = [measures(run, each, _with(s, logs)) for each in rows]
+        value = float(np.mean([each["total"] + each["inclination"] + 0.3 * each["surprise"] for each in found]))
+        return value if math.isfinite(value) else 1e3
+
+    s = _with(s, minimised(loss, _numbers(s), 0.3, generations, seed))
+    s = replace(s, latency=latency(run, rows, s))
+    for name in ("heading", "tilt"):
+        low, high = 0.2, 8.0
+        for _ in range(18):
+            factor = math.sqrt(low * high)
+            scale, floor = getattr(s, f"{name}_scale") * factor, getattr(s, f"{name}_floor") * factor
+            tried = replace(s, **{f"{name}_scale": scale, f"{name}_floor": floor})
+            held = np.mean([measures(run, each, tried)[f"{name}_held"] for each in rows])
+            low, high = (factor, high) if held < 0.9 else (low, factor)
+        s = tried
+    return s
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Learns, and writes."""
+    options = parse(Learning, arguments)
+    run = Equations()
+    if options.smoke:
+        print(learn(run, [simulated_trial()], 1, options.seed))
+        return
+    trials, numbers, sets = read_trials(options.data), {}, []
+    for fold in FOLDS:
+        rest = [each for each in trials if each.kind not in fold]
+        sets.append(asdict(learn(run, rest, options.generations, options.seed)))
+        numbers |= dict.fromkeys(fold, sets[-1])
+        print(fold, sets[-1], flush=True)
+    numbers["all"] = {name: np.exp(np.mean(np.log([each[name] for each in sets]), 0)).tolist() for name in sets[0]}
+    page = {"command": command("broad.learning"), "seed": options.seed, "numbers": numbers}
+    if options.out is not None:
+        write_text(options.out, json.dumps(page, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

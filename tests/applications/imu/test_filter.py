@@ -1,0 +1,256 @@
+"""The inertial sensor's filter: against the same equations in numpy, and on data of its own model."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torch_denkf.applications.imu import imu, imu_rows, orientations
+from torch_denkf.applications.imu.filter import SPACE, ImuSettings, moves
+from torch_denkf.functional.manifolds import SO3, rotate
+from torch_denkf.smoothers import RTSSmoother
+
+SETTINGS = ImuSettings(
+    gyro=0.003,
+    gyro_scale=0.02,
+    gyro_skew=0.01,
+    magnetometer=1.0,
+    magnetic_bias=1.0,
+    lag=0.01,
+    lag_std=0.01,
+    heading=0.2,
+)
+
+
+def body_log(count=400, rate=100.0, seed=0):
+    """A body that rests for 2 s and then turns and sways; gyro with a bias, white noise on all."""
+    generator = torch.Generator().manual_seed(seed)
+    time = torch.arange(count, dtype=torch.float64).unsqueeze(-1) / rate
+    moving = time >= 2.0
+    rate_of_turn = moving * torch.tensor([1.5, -0.9, 1.2]) * (time * torch.tensor([3.0, 2.0, 4.0])).cos()
+    turns = [SO3().exp(torch.tensor([0.3, -0.2, 1.0], dtype=torch.float64))]
+    for step in rate_of_turn[1:] / rate:
+        turns.append(SO3().plus(turns[-1], step))
+    truth = torch.stack(turns)
+    back = SO3().inverse(truth)
+    push = moving * torch.tensor([1.0, 0.7, 0.4]) * (time * torch.tensor([5.0, 4.0, 6.0])).sin()
+
+    def noisy(value, size):
+        return value + size * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+
+    field = torch.tensor([0.0, 16.0, -41.0], dtype=torch.float64).expand(count, 3)
+    return truth, {
+        "gyro": noisy(rate_of_turn + torch.tensor([0.01, -0.02, 0.005]), 0.003),
+        "acceleration": noisy(rotate(back, push + torch.tensor([0.0, 0.0, 9.82])), 0.05),
+        "magnetometer": noisy(rotate(back, field), 0.3),
+    }
+
+
+# ------------------------------------------------------------------------------------------- the same in numpy
+
+
+def matrix(q):
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def skew(v):
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def rotation(v):
+    angle = np.linalg.norm(v)
+    if angle < 1e-12:
+        return np.eye(3) + skew(v)
+    k = skew(v / angle)
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+
+
+def left_jacobian(v):
+    angle = np.linalg.norm(v)
+    if angle < 1e-6:
+        return np.eye(3) + skew(v) / 2
+    k = skew(v / angle)
+    return np.eye(3) + (1 - np.cos(angle)) / angle * k + (1 - np.sin(angle) / angle) * k @ k
+
+
+def reference(rows, s):
+    """An error-state Kalman filter; the rotation's error stands in the world's axes."""
+    start = np.array([s.tilt] * 2 + [s.heading] + [s.gyro_bias] * 3)
+    errors = [s.gyro_scale if i == j else s.gyro_skew for i in range(3) for j in range(3)]
+    rest = [s.motion_start] * 9 + [s.magnetic_bias] * 3 + [s.field] * 2 + [s.lag_std] + [s.stray] * 3
+    cov = np.diag(np.concatenate([start, errors, rest]) ** 2)
+    turn, x = matrix(rows["start"][0, :4].numpy()), rows["start"][0, 4:].numpy().copy()
+    found = []
+    for t in range(len(rows)):
+        row = {key: value[t].numpy() for key, value in rows.items()}
+        gyro, dt = row["gyro"], row["dt"].item()
+        if t:
+            angles = (gyro - x[:3] - x[3:12].reshape(3, 3) @ gyro) * dt
+            f = np.eye(33)
+            spread = turn @ left_jacobian(angles) * dt  # of the gyro's errors, to a turn in the world's axes
+            f[:3, 3:6] = -spread
+            f[:3, 6:15] = -spread @ np.kron(np.eye(3), gyro)
+            step = np.kron(row["moves"].reshape(3, 3), np.eye(3))
+            f[15:24, 15:24] = step
+            fades = np.exp(-dt / s.stray_time)
+            f[30:, 30:] *= fades
+            x[27:] *= fades
+            turn, x[12:21] = turn @ rotation(angles), step @ x[12:21]
+            q = np.zeros(33)
+            q[:3] = s.gyro**2 + s.gyro_rate**2 * (gyro @ gyro)
+            q[3:6] = s.gyro_walk**2
+            q[21:24] = 2 * sum(s.poles) * (s.motion**2 + s.motion_unrest**2 * row["unrest"] ** 2)
+            q[24:27], q[27:29] = s.magnetic_walk**2, s.field_walk**2
+            stray = s.stray**2 + s.stray_unrest**2 * row["disturbance"].item() ** 2
+            q[30:] = stray * (1 - fades**2) / dt
+            cov = f @ cov @ f.T + np.diag(q * dt)
+
+        def update(read, predicted, h, variance):
+            nonlocal turn, x, cov
+            gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + variance * np.eye(3))
+            change = gain @ (read - predicted)
+            reset = np.eye(33)
+            reset[:3, :3] = left_jacobian(change[:3])
+            keep = np.eye(33) - gain @ h
+            cov = reset @ (keep @ cov @ keep.T + variance * gain @ gain.T) @ reset.T
+            turn, x = rotation(change[:3]) @ turn, x + change[3:]
+
+        up = x[18:21] + np.array([0, 0, s.gravity])
+        h = np.zeros((3, 33))
+        h[:, :3], h[:, 21:24] = turn.T @ skew(up), turn.T
+        update(row["accelerometer"], turn.T @ up, h, s.accelerometer**2)
+        if row["magnetometer_observed"]:
+            field, h, lag = np.array([0, *x[24:26]]) + x[27:], np.zeros((3, 33)), np.eye(3) + x[26] * skew(gyro)
+            h[:, :3], h[:, 24:27], h[:, 27:29] = lag @ turn.T @ skew(field), np.eye(3), (lag @ turn.T)[:, 1:]
+            h[:, 29], h[:, 30:] = skew(gyro) @ turn.T @ field, lag @ turn.T
+            noise = s.magnetometer**2 + s.magnetometer_rate**2 * (gyro @ gyro)
+            update(row["magnetometer"], lag @ turn.T @ field + x[21:24], h, noise)
+        if row["rest_observed"]:
+            h = np.zeros((3, 33))
+            h[:, 3:6] = np.eye(3)
+            update(gyro, x[:3], h, s.rest**2)
+        found.append((turn, x.copy(), cov))
+    return [np.stack(each) for each in zip(*found, strict=True)]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("axes", [9, 6])
+def test_it_is_the_error_state_kalman_filter(axes):
+    _, log = body_log()
+    if axes == 6:
+        del log["magnetometer"]
+    else:
+        log["magnetometer"][120:135] = torch.nan
+    rows = imu_rows(SETTINGS, **log, rate=100.0)
+    assert rows["rest_observed"].sum() > 3
+    out = imu(**dataclasses.asdict(SETTINGS)).double().sequence(rows.clone())["belief"]
+    turn, x, cov = reference(rows, SETTINGS)
+    found = np.stack([matrix(q) for q in out["mean"][:, :4].numpy()])
+    assert np.abs(found - turn).max() < 1e-6
+    assert np.abs(out["mean"][:, 4:].numpy() - x).max() < 1e-6
+    scale = np.sqrt(np.einsum("tii->ti", cov))
+    assert np.abs((out["cov"].numpy() - cov) / (scale[:, :, None] * scale[:, None])).max() < 1e-6
+
+
+# ------------------------------------------------------------------------------------- data of the model itself
+
+
+def drawn_rows(settings, runs=60, steps=100, seed=0):
+    """Rows and states of bodies that move, and whose sensors err, as the filter expects."""
+    torch.manual_seed(seed)
+    model, dt = imu(**dataclasses.asdict(settings)).double(), 0.035
+    rows = TensorDict(batch_size=[runs, steps])
+    time = torch.arange(steps, dtype=torch.float64) * dt
+    rows["gyro"] = torch.stack([(time * f).sin() for f in (1.0, 1.7, 2.3)], -1).expand(runs, -1, -1).contiguous()
+    rows["dt"] = torch.full((runs, steps, 1), dt, dtype=torch.float64)
+    rows["moves"] = moves(settings.poles, dt).expand(runs, steps, 9).contiguous()
+    rows["unrest"] = torch.full_like(rows["dt"], 0.5)
+    rows["disturbance"] = torch.full_like(rows["dt"], 0.3)
+    rows["rest_observed"] = torch.zeros(runs, steps, 1, dtype=torch.bool)
+    middle = SPACE.neutral(rows["dt"])
+    middle[28:30] = torch.tensor([16.0, -41.0])
+    rows["start"] = middle.expand(runs, steps, -1).contiguous()
+    transition, noise = model["transition"].module, model["transition"].process_noise
+    std = model.initial.std
+    states, accelerometer, magnetometer = [], [], []
+    for t in range(steps):
+        if t == 0:
+            state = SPACE.plus(rows["start"][:, 0], std * torch.randn(runs, 33, dtype=torch.float64))
+        else:
+            now = rows[:, t].clone()
+            now["belief", "ensemble"], now["belief", "mean"] = state.unsqueeze(1), state
+            state, variance = transition(now)["forecast", "ensemble"].squeeze(1), noise(now)["forecast", "noise"]
+            state = SPACE.plus(state, variance.sqrt() * torch.randn(runs, 33, dtype=torch.float64))
+        now = TensorDict({"forecast": {"ensemble": state.unsqueeze(1)}, **rows[:, t]}, [runs])
+        for name, to in (("accelerometer", accelerometer), ("magnetometer", magnetometer)):
+            value = model[name].module.module(now.clone()).get(("forecast", "observation")).squeeze(1)
+            variance = settings.accelerometer**2
+            if name == "magnetometer":
+                variance = model["magnetometer_noise"].module.compute(rows["gyro"][:, t])
+            to.append(value + torch.as_tensor(variance).sqrt() * torch.randn(runs, 3, dtype=torch.float64))
+        states.append(state)
+    rows["accelerometer"], rows["magnetometer"] = torch.stack(accelerometer, 1), torch.stack(magnetometer, 1)
+    return model, rows, torch.stack(states, 1)
+
+
+@torch.no_grad()
+def test_intervals_hold_on_data_of_the_model():
+    model, rows, states = drawn_rows(dataclasses.replace(SETTINGS, motion_unrest=2.0))
+    smoothed = RTSSmoother(model).sequence(rows)
+    errors = {}
+    for prefix in ("belief", "smoothed"):
+        away = SPACE.minus(states, smoothed[prefix, "mean"])[:, 20:, :3]
+        variance = smoothed[prefix, "var"][:, 20:, :3]
+        held = (away.square() < 1.645**2 * variance).double().mean((0, 1))
+        assert ((held > 0.85) & (held < 0.95)).all(), (prefix, held)
+        errors[prefix] = away.square().mean((0, 1))
+    assert (errors["smoothed"] < errors["belief"]).all()
+
+
+# --------------------------------------------------------------------------------------------------- a whole log
+
+
+@pytest.mark.parametrize("rate", [50.0, 286.0])
+def test_orientations_of_all_readings(rate):
+    truth, log = body_log(int(6 * rate), rate)
+    found = orientations(imu().double(), **log, rate=rate)
+    north = SO3().compose(truth, SO3().inverse(found.quaternion))  # turn in the world's axes
+    away = SO3().log(north)[int(2 * rate) :].rad2deg()
+    assert found.quaternion.shape == (len(truth), 4)
+    assert away[:, :2].square().mean().sqrt() < 0.5
+    assert away[:, 2].square().mean().sqrt() < 1.5
+    assert (found.std > 0).all()
+
+
+def test_within_a_block_the_gyro_turns_exactly():
+    count, rate = 140, 100.0
+    gyro = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64).expand(count, 3)
+    force = torch.tensor([0.0, 0.0, 9.82], dtype=torch.float64).expand(count, 3)
+    found = orientations(imu(gyro_scale=1e-9, gyro_skew=1e-9, gyro_bias=1e-9).double(), gyro, force, rate=rate)
+    angle = 2 * torch.atan2(found.quaternion[:, 3], found.quaternion[:, 0])
+    steps = torch.remainder(angle.diff() + torch.pi, 2 * torch.pi) - torch.pi
+    torch.testing.assert_close(steps, torch.full_like(steps, 0.02), atol=1e-9, rtol=0)
+    later = orientations(imu(gyro_bias=1e-9, latency=0.05).double(), gyro, force, rate=rate).quaternion
+    ahead = SO3().log(SO3().compose(SO3().inverse(found.quaternion), later))
+    torch.testing.assert_close(ahead[:, 2], torch.full_like(angle, 0.1), atol=1e-3, rtol=0)
+
+
+def test_a_log_that_is_not_one():
+    _, log = body_log(100)
+    with pytest.raises(ValueError, match=r"m/s\^2.*median of its size is 1\."):
+        imu_rows(SETTINGS, log["gyro"], log["acceleration"] / 9.82, rate=100.0)
+    with pytest.raises(ValueError, match="at least 5 readings"):
+        imu_rows(SETTINGS, log["gyro"][:3], log["acceleration"][:3], rate=100.0)
+    with pytest.raises(ValueError, match="not finite"):
+        imu_rows(SETTINGS, log["gyro"] / 0, log["acceleration"], rate=100.0)
+    with pytest.raises(ValueError, match="poles"):
+        imu(poles=(1.0, 2.0))

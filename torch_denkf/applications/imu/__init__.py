@@ -1,0 +1,6 @@
+"""Orientation from a gyro, an accelerometer and a magnetometer: filter, trained numbers, and the command for a log."""
+
+import lazy_loader
+
+# __init__.pyi names what is here, and where; a module is imported when one of its names is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

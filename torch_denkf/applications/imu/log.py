@@ -1,0 +1,221 @@
+"""A log of an inertial sensor: the rows that the filter reads, and an orientation for each reading."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torch_denkf._checks import check_number, check_shape
+from torch_denkf.applications.imu.filter import SPACE, ImuFilter, ImuSettings, moves
+from torch_denkf.functional.manifolds import SO3, quaternion_of, rotate, rotation_matrix
+from torch_denkf.smoothers import RTSSmoother
+
+__all__ = ["Orientations", "imu_rows", "orientations"]
+
+SLOW, UNREST, STILL, REST = 2.0, 1.0, 0.5, 1.5  # s: of means, of their squared deviations, of rest, of its length
+RATE, CHANGE, PUSH = 0.0349, 0.01745, 0.3  # at rest: rad/s, and deviations in rad/s and m/s^2 from the last half second
+
+
+class Orientations(NamedTuple):
+    """Orientations of a log.
+
+    Attributes:
+        quaternion: ``[T, 4]``, w first, from the sensor's axes to the world's.
+        std: standard deviations of rotations about the world's x, y and z, ``[T, 3]`` in rad: inclination about two
+            axes, and heading.
+        mean: the filter's beliefs, a point of its space for each block, ``[N, 34]``.
+        cov: their covariances ``[N, 33, 33]``.
+    """
+
+    quaternion: Tensor
+    std: Tensor
+    mean: Tensor
+    cov: Tensor
+
+
+def imu_rows(
+    settings: ImuSettings, gyro: Tensor, acceleration: Tensor, magnetometer: Tensor | None = None, *, rate: float
+) -> TensorDict:
+    """Makes the rows of :class:`ImuFilter` from a log: each is a block of readings, in the axes at the block's end.
+
+    The rotation within a block is exact: the gyro's readings are integrated one by one, and accelerometer and
+    magnetometer are turned to the block's end before their mean is taken.
+
+    Args:
+        settings: of the filter.
+        gyro: ``[T, 3]`` in rad/s, finite.
+        acceleration: ``[T, 3]`` in m/s^2; rows with NaN are missing.
+        magnetometer: ``[T, 3]`` in uT, likewise; ``None`` for 6 axes.
+        rate: readings a second.
+
+    Returns:
+        Rows ``[N]``; readings behind the last whole block are left out.
+
+    Raises:
+        ValueError: if shapes or units are wrong, a gyro's reading is not finite, or there is no whole block.
+    """
+    check_number("rate", rate, above=0)
+    for name, value in (("gyro", gyro), ("acceleration", acceleration), ("magnetometer", magnetometer)):
+        if value is not None:
+            check_shape(name, value, [len(gyro), 3], "[T, 3]")
+    if not gyro.isfinite().all():
+        raise ValueError("gyro has readings that are not finite; fill short gaps by interpolation, or cut the log.")
+    size = acceleration.norm(dim=-1).nanmedian().item()
+    if not 5 < size < 20:
+        raise ValueError(f"acceleration is in m/s^2, where gravity is 9.81; the median of its size is {size:.3g}.")
+    count, dt = block_size(settings, rate), 1 / rate
+    blocks = len(gyro) // count
+    if not blocks:
+        raise ValueError(f"a log needs at least {count} readings, one block of {settings.block} s; got {len(gyro)}.")
+    gyro, force = (value[: blocks * count].unflatten(0, (blocks, count)) for value in (gyro, acceleration))
+    turns, to_end = SO3().exp(gyro * dt), [SO3().neutral(gyro).expand(blocks, 4)]
+    for place in range(count - 1, 0, -1):
+        to_end.append(SO3().compose(turns[:, place], to_end[-1]))
+    back = SO3().inverse(torch.stack(to_end[::-1], 1))
+    total = SO3().compose(turns[:, 0], to_end[-1])
+    rows = TensorDict({"gyro": SO3().log(total) / (count * dt), "dt": gyro.new_full((blocks, 1), count * dt)}, [blocks])
+    rows["moves"] = moves(settings.poles, count * dt).to(gyro).expand(blocks, 9)
+    rows["accelerometer"], rows["accelerometer_observed"] = _mean(rotate(back, force))
+    if magnetometer is None:
+        rows["magnetometer"] = torch.zeros_like(rows["gyro"])
+        rows["magnetometer_observed"] = torch.zeros_like(rows["accelerometer_observed"])
+    else:
+        field = magnetometer[: blocks * count].unflatten(0, (blocks, count))
+        field = rotate(SO3().exp(-gyro * settings.lag), field)
+        rows["magnetometer"], rows["magnetometer_observed"] = _mean(rotate(back, field))
+    turned = _running_product(total)
+    for name, of in (("unrest", "accelerometer"), ("disturbance", "magnetometer")):
+        still = rotate(turned, rows[of])  # in axes that the gyro alone keeps
+        away = (still - _running_mean(still, rows["dt"], SLOW)).square().mean(-1, keepdim=True)
+        rows[name] = _running_mean(away, rows["dt"], UNREST).clamp_min(0).sqrt()
+    calm = rows["gyro"].norm(dim=-1, keepdim=True) < RATE
+    for name, limit in (("gyro", CHANGE), ("accelerometer", PUSH)):
+        away = rows[name] - _running_mean(rows[name], rows["dt"], STILL)
+        calm &= away.norm(dim=-1, keepdim=True) < limit
+    long = int(REST / (count * dt)) + 1
+    calm_rows = torch.nn.functional.pad(calm.squeeze(-1).long().cumsum(0), (long, 0))
+    rows["rest_observed"] = (calm_rows[long:] - calm_rows[:-long] == long).unsqueeze(-1)
+    rows["start"] = _start(rows).expand(blocks, -1)
+    return rows
+
+
+@torch.no_grad()
+def orientations(
+    model: ImuFilter,
+    gyro: Tensor,
+    acceleration: Tensor,
+    magnetometer: Tensor | None = None,
+    *,
+    rate: float,
+    smooth: bool = False,
+) -> Orientations:
+    """Runs the filter on a log, and gives an orientation and its standard deviations for each reading.
+
+    Within a block the gyro turns the last belief; the standard deviations are those of that belief.
+
+    Args:
+        model: of :func:`imu`, or ``from_pretrained("imu")``.
+        gyro: ``[T, 3]`` in rad/s.
+        acceleration: ``[T, 3]`` in m/s^2.
+        magnetometer: ``[T, 3]`` in uT; ``None`` for 6 axes, whose heading starts as north.
+        rate: readings a second.
+        smooth: whether all later readings count, too (Rauch-Tung-Striebel).
+
+    Raises:
+        ValueError: see :func:`imu_rows`.
+    """
+    settings, dtype = model.settings, next(model.parameters()).dtype
+    values = [None if value is None else value.to(dtype) for value in (gyro, acceleration, magnetometer)]
+    rows = imu_rows(settings, *values, rate=rate)  # type: ignore[arg-type]
+    prefix = "smoothed" if smooth else "belief"
+    out = (RTSSmoother(model) if smooth else model).sequence(rows, keep=[(prefix, "mean"), (prefix, "cov")])
+    return at_readings(settings, out[prefix, "mean"], out[prefix, "cov"], values[0], rate)  # type: ignore[arg-type]
+
+
+def at_readings(settings: ImuSettings, mean: Tensor, cov: Tensor, gyro: Tensor, rate: float) -> Orientations:
+    """Returns orientations at the readings of a log, from the beliefs at the ends of its blocks."""
+    count, length = block_size(settings, rate), len(gyro)
+    blocks = len(mean) + 1  # the last may be short
+    rates = torch.nn.functional.pad(gyro, (0, 0, 0, blocks * count - length)).unflatten(0, (blocks, count))
+    before = torch.cat([mean[:1], mean])  # what the readings of a block start from
+    _, bias, errors = SPACE.points(before)[:3]
+    rates = rates - bias.unsqueeze(1) - rates @ errors.unflatten(-1, (3, 3)).mT
+    turns = SO3().exp(rates / rate)
+    steps = [turns[:, 0]]
+    for place in range(1, count):
+        steps.append(SO3().compose(steps[-1], turns[:, place]))
+    begin = before[:, :4].clone()
+    begin[0] = SO3().compose(mean[0, :4], SO3().inverse(steps[-1][0]))
+    found = SO3().compose(begin.unsqueeze(1), torch.stack(steps, 1))
+    found[:-1, -1] = mean[:, :4]
+    found = SO3().compose(found, SO3().exp(rates * settings.latency))
+    variance = cov.diagonal(dim1=-2, dim2=-1)[:, :3]
+    degree = torch.pi / 180
+    scale = variance.new_tensor([settings.tilt_scale] * 2 + [settings.heading_scale])
+    floor = variance.new_tensor([settings.tilt_floor] * 2 + [settings.heading_floor]) * degree
+    std = (variance * scale.square() + floor.square()).sqrt()
+    std = torch.cat([std[:1], std]).unsqueeze(1).repeat(1, count, 1)
+    std[:-1, -1] = std[1:, 0].clone()
+    return Orientations(found.flatten(0, 1)[:length], std.flatten(0, 1)[:length], mean, cov)
+
+
+def block_size(settings: ImuSettings, rate: float) -> int:
+    """Returns how many readings make a block."""
+    return max(1, round(settings.block * rate))
+
+
+def _mean(readings: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the means of blocks ``[N, K, 3]`` over the readings that are there, and the mask ``[N, 1]``."""
+    known = readings.isfinite().all(-1, keepdim=True)
+    total = torch.where(known, readings, 0).sum(1) / known.sum(1).clamp_min(1)
+    return total, known.any(1)
+
+
+def _running_mean(values: Tensor, dt: Tensor, time: float) -> Tensor:
+    """Returns exponentially weighted means of the rows so far ``[N, K]``; they start with the first row."""
+    keep = (-dt[0, 0] / time).exp()
+    found, step = torch.cat([values[:1], (1 - keep) * values[1:]]), 1
+    while step < len(values):
+        found = torch.cat([found[:step], found[step:] + keep**step * found[:-step]])
+        step *= 2
+    return found
+
+
+def _running_product(turns: Tensor) -> Tensor:
+    """Returns the products of the rotations ``[N, 4]`` behind the first, up to each."""
+    found, step = torch.cat([SO3().neutral(turns).unsqueeze(0), turns[1:]]), 1
+    while step < len(turns):
+        found = torch.cat([found[:step], SO3().compose(found[:-step], found[step:])])
+        step *= 2
+    return found
+
+
+def _start(rows: TensorDict) -> Tensor:
+    """Returns the state that the first readings of accelerometer and magnetometer say; without one, north is x."""
+    first = rows["accelerometer_observed"].squeeze(-1).long().argmax()
+    up = rows["accelerometer"][first]
+    up = up / up.norm()
+    seen = rows["magnetometer_observed"][first].item()
+    field = rows["magnetometer"][first] if seen else torch.eye(3, dtype=up.dtype)[up.abs().argmin()]
+    east = torch.linalg.cross(field, up)
+    east = east / east.norm()
+    axes = torch.stack([east, torch.linalg.cross(up, east), up])
+    if not seen:  # heading zero: the body's x as far as it is level
+        axes = rotation_matrix(_level(up))
+    state = SPACE.neutral(up)
+    state[:4] = quaternion_of(axes)
+    state[28:30] = (axes @ field)[1:] if seen else 0
+    return state
+
+
+def _level(up: Tensor) -> Tensor:
+    """Returns the shortest rotation of the body that takes ``up`` to the world's z."""
+    z = torch.tensor([0.0, 0.0, 1.0], dtype=up.dtype)
+    axis, angle = torch.linalg.cross(up, z), torch.acos(up[2].clamp(-1, 1))
+    size = axis.norm()
+    if size < 1e-6:  # upright, or on its head
+        axis, size = torch.tensor([1.0, 0.0, 0.0], dtype=up.dtype), torch.ones((), dtype=up.dtype)
+    return SO3().exp(axis / size * angle)
