@@ -2,7 +2,6 @@
 
 import os
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,12 +11,8 @@ from torch import nn
 from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
 from tests.data.lerobot.lerobot_folder import write_version_2
 from torch_denkf.applications.car import read_kitti_drive, with_motion, write_drives
-from torch_denkf.applications.car.kitti.trajectories import write_trajectory
-from torch_denkf.applications.car.odometry.paths import read_path, write_path
-from torch_denkf.applications.car.odometry.tracking import TrackedBelief
 from torch_denkf.applications.ur5 import UR5ExperienceReplay
-from torch_denkf.applications.ur5.data.files import append_to_manifest, read_manifest, what_is_wrong, write_demo
-from torch_denkf.data import Images, LeRobotReplay
+from torch_denkf.data import LeRobotReplay
 from torch_denkf.data.lerobot.rows import recording_from_rows
 from torch_denkf.deployment import export_step
 from torch_denkf.deployment.folder import load_folder, save_folder
@@ -78,41 +73,6 @@ def test_robots_recordings(tmp_path, small_disk):
     assert list(disk.iterdir()) == []
 
 
-def test_own_recordings(tmp_path, small_disk):
-    for number in range(20):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((50, 150, 3), number, np.uint8))
-    disk = small_disk("300k")
-    with pytest.raises(OSError, match=FULL.format("pictures to .*disk0")):
-        Images(tmp_path, rate=10.0).read((50, 150), disk, False)
-    assert list(disk.iterdir()) == []
-
-
-def test_rendered_drives(drives, small_disk):
-    disk = small_disk("300k")
-    write_drives(disk, ["small"], frames=3)
-    with pytest.raises(OSError, match=FULL.format("sequences/town/image_2/.*png")):
-        write_drives(disk, ["town"], frames=30)
-    assert not left(disk)
-    assert [path.name for path in (disk / "sequences").iterdir()] == ["small"]
-    assert len(read_kitti_drive(disk, "small", cache=None)) == 3
-
-
-def collect(disk, demos):
-    for number in range(demos):
-        append_to_manifest(disk, write_demo(disk, make_demo(number, 8)))
-
-
-def test_collected_demos(small_disk):
-    disk = small_disk("24k")
-    with pytest.raises(OSError, match=FULL.format(r"demo(s|-00000\d)")):
-        collect(disk, 20)
-    entries = read_manifest(disk)
-    assert len(entries) >= 1
-    assert [what_is_wrong(disk, entry) for entry in entries.values()] == [None] * len(entries)
-    assert (disk / "demos.jsonl").read_bytes().endswith(b"}\n")  # no half line
-    assert not left(disk)
-
-
 def small_model(size):
     return nn.Linear(size, 1)
 
@@ -152,20 +112,6 @@ def test_an_exported_step(small_disk):
     with pytest.raises(OSError, match=FULL.format("kf.pt2")):
         export_step(kf, TensorDict({"observation": torch.ones(1)}), disk / "kf.pt2", compiled=False)
     assert list(disk.iterdir()) == []
-
-
-def test_paths(small_disk):
-    disk = small_disk("60k")
-    beliefs = [TrackedBelief(k, 0.1 * k, True, torch.rand(5), torch.rand(5), torch.rand(8, 5)) for k in range(1000)]
-    assert len(list(write_path(beliefs[:50], disk / "path.csv"))) == 50
-    written = write_path(beliefs, disk / "path.csv")
-    with pytest.raises(OSError, match=FULL.format("path.csv")):
-        list(written)
-    assert len(read_path(disk / "path.csv")) == 50
-    states = torch.stack([belief.mean for belief in beliefs])
-    with pytest.raises(OSError, match=FULL.format("path.txt")):
-        write_trajectory(disk / "path.txt", states)
-    assert os.listdir(disk) == ["path.csv"]
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])

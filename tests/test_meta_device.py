@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 
 from tests.applications.legged.test_environment import trotting
@@ -13,7 +12,7 @@ from tests.filters.test_meta_device import assert_there, make_tables, on_meta
 from tests.filters.test_spaces import KINDS, log
 from tests.filters.test_spaces import make as make_on_a_space
 from tests.waits import NothingWaits
-from torch_denkf import KalmanFilter, LinearGaussianEnv, NoisyPendulumEnv
+from torch_denkf import KalmanFilter, LinearGaussianEnv
 from torch_denkf.applications.legged import QUADRUPED, legged_filter, quadruped_env
 from torch_denkf.functional.kernels import small_system
 from torch_denkf.imperfect import RejectReadings
@@ -111,23 +110,6 @@ def test_an_environment_and_a_filter_in_it(way, monkeypatch):
     assert out["next", "belief", "mean"].shape == (4, 2)
 
 
-def test_a_pendulum():
-    env = NoisyPendulumEnv(0.1, missing=0.2, batch_size=[3])
-    torch.nn.Module.to(env, "meta")  # torchrl moves no bounds of an action there
-    with NothingWaits():
-        row = env._reset()
-        assert_there(row)
-        assert_there(env._step(row.set("action", torch.zeros(3, 1, device="meta"))))
-
-
-def test_environments_move_and_draw_what_they_drew():
-    one = torch.eye(2)
-    env = LinearGaussianEnv(one, one, [0.1, 0.1], [0.2, 0.2], batch_size=[3], seed=5)
-    expected = env.reset()["state"]
-    moved = LinearGaussianEnv(one, one, [0.1, 0.1], [0.2, 0.2], batch_size=[3], seed=5, device="cpu")
-    assert moved.reset()["state"].equal(expected)
-
-
 @pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
 def test_legged_filters(kind):
     env = quadruped_env(seed=1)
@@ -136,9 +118,3 @@ def test_legged_filters(kind):
     rows = on_meta(rows, None)
     with NothingWaits(), torch.no_grad():
         assert_there(filter.sequence(rows.copy()))
-
-
-def test_a_robot_given_as_numbers():
-    out = linear_kalman().to("meta").initialise({})
-    assert isinstance(out, TensorDict)
-    assert_there(out)

@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import warnings
 import zipfile
 from importlib import import_module
 from pathlib import Path
@@ -77,13 +76,6 @@ def check_trained_filters(wheel, folder):
     assert found.pop("package") == str(folder / "torch_denkf")
     for name, values in beliefs.all_beliefs().items():
         assert found[name] == pytest.approx(values, rel=1e-4, abs=1e-5), name
-
-
-def test_modules_is_a_relative_link():
-    link = ROOT / "modules"
-    assert link.is_symlink()
-    assert link.readlink() == Path("torch_denkf/modules")
-    assert (link / "stochastic.py").samefile(ROOT / "torch_denkf" / "modules" / "stochastic.py")
 
 
 #: The rooms that every user needs; with them go the files at the package's top, but for the one that looks robots up.
@@ -158,14 +150,6 @@ def test_what_an_import_costs():
     found = json.loads(done.stdout)
     assert found["functional"] == found["plots"] == []
     assert set(found["applications.car"]) <= {"cv2", "PIL", "torchrl"}, "data sets and their environments read images"
-
-
-@pytest.mark.parametrize("package", ["torch_denkf", "torch_denkf.data"])
-def test_importing_all_names_warns_of_none(package):
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
-        exec(f"from {package} import *; LeRobotReplay", {})
-    assert not [warning for warning in heard if "is now called" in str(warning.message)]
 
 
 def test_every_public_name_is_there():

@@ -203,20 +203,6 @@ def test_copies_compute_the_same(name):
         assert all(out[key].equal(expected[key]) for key in module.out_keys)
 
 
-@every_sub_model
-def test_train_and_eval_are_the_same(name):
-    module, td = make(name)
-    outputs = [run(module.train(mode), td) for mode in (True, False)]
-    assert all(outputs[0][key].equal(outputs[1][key]) for key in module.out_keys)
-
-
-@every_sub_model
-def test_float64(name):
-    module, td = make(name)
-    out = run(module.double(), td.to(torch.float64))
-    assert all(out[key].dtype != torch.float32 for key in module.out_keys)
-
-
 class TwoNoises(SubModel):
     """Adds two noises by name to a value, behind an entry of whole numbers."""
 

@@ -222,6 +222,7 @@ def main() -> None:
     models = [("EKF", "EKF", "RTS smoother", {})]
     if study.ukf:
         models.append(("UKF", "UKF", "", {}))
+    models.append(("DEnKF, 32 members", "DEnKF", "", {"members": 32}))
     models.append(("DEnKF, 32 members, no slip", "DEnKF", "", {"members": 32, "slip": False}))
     models.append(("DEnKF, 64 members", "DEnKF", "EnRTS, 64 members", {"members": 64}))
     if study.only:

@@ -12,10 +12,8 @@ from tests.filters.factories import (
     linear_kalman,
     linear_system,
     random_draws,
-    stepwise,
 )
 from tests.filters.gaussian_for_tests import directional_check, known_process_noise
-from tests.functional.checks import assert_compiled_is_eager
 from tests.smoothers.joint import COV, MEAN, drive
 from torch_denkf.baselines import IEnKS
 from torch_denkf.baselines.iterated_smoothing import iterated_smoothing
@@ -138,31 +136,6 @@ def test_a_learned_motion_learns(float64):
         step=1e-6,
         rtol=1e-4,
     )
-
-
-def test_steps_are_the_sequence(float64):
-    for kwargs in ({"rotate": True, "inflation": 1.1}, {"noise": known_process_noise()}):
-        smoother = linear(6, **kwargs)
-        frames = smoother.draw_noise(drive(2, 6))
-        assert_equal(stepwise(smoother, frames), smoother.sequence(frames.copy()), smoother.belief_keys, atol=1e-9)
-
-
-def test_nothing_observed_is_the_forecast(float64):
-    smoother = linear(6, inflation=1.3)
-    frames = drive(2, 4, resets=False)
-    frames["observed"] = torch.zeros(2, 4, 1, dtype=torch.bool)
-    out = smoother.sequence(frames)
-    assert_equal(out["belief"], out["forecast"], ["ensemble"], atol=1e-12)
-    assert out["smoothed", "ensemble"][:, 1:].equal(out["belief", "ensemble"][:, :-1])
-
-
-def test_compiled_is_eager():
-    values = torch.randn(3, 5, 2), torch.randn(3, 2), torch.rand(3, 2) + 0.5
-
-    def smooth(ensemble, reading, noise):
-        return iterated_smoothing(ensemble, torch.sin, reading, noise, iterations=2)
-
-    assert_compiled_is_eager(smooth, *values, rtol=1e-4, atol=1e-4)
 
 
 def test_what_it_cannot_do_it_says():

@@ -11,8 +11,6 @@ from torch_denkf.baselines import LSTMFilter
 from torch_denkf.modules import GaussianAround, ImageSensor
 from torch_denkf.objectives import GaussianLoss
 
-BELIEF = [("belief", name) for name in ("mean", "cov", "var", "hidden", "cell")]
-
 
 def reader(layers=1, **kwargs):
     """Estimates two numbers from readings of two, and their flags."""
@@ -41,11 +39,6 @@ def torch_lstm(filter, frames):
     return mean.unflatten(0, frames.shape[:-1]), hidden.transpose(0, 1), cell.transpose(0, 1)
 
 
-def assert_same(first, second, keys=BELIEF, atol=0.0):
-    for key in keys:
-        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol, msg=lambda m, k=key: f"{k}: {m}")
-
-
 @pytest.mark.parametrize("layers", [1, 2])
 @pytest.mark.parametrize("batch", [(3, 9), (2, 2, 6)])
 @pytest.mark.parametrize("update_at_reset", [True, False])
@@ -60,15 +53,6 @@ def test_a_sequence_is_torchs_lstm(float64, layers, batch, update_at_reset):
     if first:
         assert out["belief", "mean"][..., 0, :].equal(torch.tensor([1.0, -1.0]).expand(*batch[:-1], 2))
         assert out["belief", "var"][..., 0, :].equal(torch.tensor([4.0, 9.0]).expand(*batch[:-1], 2))
-
-
-@pytest.mark.parametrize("update_at_reset", [True, False])
-def test_resets_are_separate_runs(float64, update_at_reset):
-    filter, frames = reader(2, update_at_reset=update_at_reset), readings((1, 12))
-    frames["is_init"] = torch.zeros(1, 12, 1, dtype=torch.bool)
-    frames["is_init"][:, [0, 4, 9]] = True
-    runs = [filter.sequence(frames[:, start:end].copy()) for start, end in ((0, 4), (4, 9), (9, 12))]
-    assert_same(filter.sequence(frames.copy()), torch.cat(runs, 1), atol=1e-14)
 
 
 def test_a_flag_tells_a_missing_reading_from_a_reading_of_zero(float64):
@@ -125,13 +109,6 @@ def test_the_sensor_of_other_filters_is_trained_through_the_memory():
     assert len(unread) == 2
     assert all(filter.get_parameter(name).shape[0] == 2 and ".head." in name for name in unread)
     assert sensor.module["trunk"][0].weight.grad.abs().sum() > 0
-
-
-@pytest.mark.parametrize("wrong", [{"initial": None}, {"update_at_reset": True}])
-def test_a_vehicle_needs_its_pose(wrong):
-    given = {"motion": UnicyclePose(0.1), "initial": GaussianAround([0.1] * 5), **wrong}
-    with pytest.raises(ValueError, match="GaussianAround"):
-        LSTMFilter(None, features=4, state_dim=5, **given)
 
 
 # ------------------------------------------------------------------------------------------------------- a memory

@@ -6,11 +6,9 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional as F
 
-from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
-from torch_denkf.baselines.lstm_cell import LSTMUpdate, with_memory
-from torch_denkf.modules import GaussianAround, MomentPrior
+from torch_denkf.baselines.lstm_cell import LSTMUpdate
 
 BATCHES = [(), (3,), (2, 3)]
 KEYS = {"encoding_key": "code", "observation_key": "reading", "extra_keys": ["steps"]}
@@ -96,36 +94,6 @@ def test_gradients(float64):
     inputs = [torch.randn(2, 4), torch.randn(2, 2), torch.randn(2, 2, 3), torch.randn(2, 2, 3)]
     inputs = [*inputs, *(parameter.detach() for parameter in update.parameters())]
     assert torch.autograd.gradcheck(outputs, [part.requires_grad_() for part in inputs])
-
-
-@pytest.mark.parametrize(
-    ("sizes", "keys", "match"),
-    [
-        ({}, {}, "features=0"),
-        ({"features": 4}, {"observation_key": "y"}, "observation_dim=0"),
-        ({"features": 4, "extra_features": 1}, {}, "extra_features=1"),
-        ({}, {"encoding_key": None}, "something to read"),
-        ({"observation_dim": -1}, {"observation_key": "y", "encoding_key": None}, "observation_dim"),
-        ({"features": 4, "extra_features": -1}, {"extra_keys": ["u"]}, "extra_features"),
-    ],
-)
-def test_sizes_and_keys_belong_together(sizes, keys, match):
-    assert_refused(ValueError, match, LSTMUpdate, 2, **sizes, **keys)
-
-
-def test_errors_name_what_is_wrong():
-    update = LSTMUpdate(2, hidden_size=5, **{**SIZES, "features": 3}, **KEYS)
-    assert_refused(ValueError, r"8 inputs.*\[4, 2, 2, 1\]", update, frames((3,)))
-    assert_refused(KeyError, "'code'", update, frames((3,)).exclude("code"))
-
-
-def test_memory_is_empty_at_reset(float64):
-    prior = MomentPrior(torch.ones(2), torch.eye(2))
-    start = with_memory(prior, 5, num_layers=2)(TensorDict({}, [3]))["belief"]
-    for name in ("hidden", "cell"):
-        assert start[name].equal(torch.zeros(3, 2, 5))
-    assert start["mean"].equal(torch.ones(3, 2))
-    assert with_memory(GaussianAround([0.1] * 5), 5).state_dim == 5
 
 
 @pytest.mark.parametrize("batch", BATCHES)

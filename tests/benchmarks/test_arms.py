@@ -6,11 +6,9 @@ from tensordict import TensorDict
 
 pytest.importorskip("dm_control", reason="dm_control is not installed: pip install dm-control 'mujoco<4'")
 
-from benchmarks.arms.arms import ARMS, NOISE, SIDE, Average, Encoders, HoldAngles, make_env, make_one, wrap
-from benchmarks.arms.filters import DRIFT, LENGTH, ArmTransition, make_filter, train_motion
-from benchmarks.arms.page import COLUMNS, difference, page
-from benchmarks.arms.sensor import CELLS, FromPlaces, JointPlaces, JointSensor
-from benchmarks.arms.study import collect, scores
+from benchmarks.arms.arms import ARMS, NOISE, Encoders, make_one, wrap
+from benchmarks.arms.filters import DRIFT, LENGTH, ArmTransition
+from benchmarks.arms.sensor import FromPlaces, JointPlaces
 
 
 def physics_at(name, seed):
@@ -33,59 +31,6 @@ def test_reacher_knows_where_finger_and_target_are(seed):
     torch.testing.assert_close(velocity, torch.tensor(physics.data.qvel[:2]).float())
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_manipulator_knows_where_its_hand_is(seed):
-    arm, emitted, physics = physics_at("manipulator", seed)
-    angles, _ = arm.split(arm.state(emitted))
-    hand = torch.tensor(physics.named.data.site_xpos["pinch", ["x", "z"]]).float() - torch.tensor([0.0, 0.4])
-    torch.testing.assert_close(arm.tip(angles), hand, atol=1e-6, rtol=0)
-    assert not arm.goal(emitted).equal(arm.goal(emitted))  # another pose each time
-
-
-def test_manipulator_knows_its_weight():
-    arm, _, physics = physics_at("manipulator", 0)
-    angles = 2 * torch.rand(20, 4, dtype=torch.float64) - 1
-    for pose, held in zip(angles, arm.hold(angles), strict=True):
-        with physics.reset_context():
-            physics.named.data.qpos[["arm_root", "arm_shoulder", "arm_elbow", "arm_wrist"]] = pose.numpy()
-            physics.data.qvel[:] = 0
-        torque = torch.tensor(physics.data.qfrc_bias[:4]) / torch.tensor(physics.model.actuator_gear[:4, 0])
-        torch.testing.assert_close(held, torque, atol=2e-5, rtol=0)  # of full actions; the weights are rounded
-
-
-@pytest.mark.parametrize("name", sorted(ARMS))
-def test_cameras_see_as_far_as_stated(name):
-    arm, _, physics = physics_at(name, 0)
-    root = physics.named.data.xpos["upper_arm" if name == "manipulator" else "arm"]
-    towards = torch.tensor(root - physics.data.cam_xpos[0])
-    half = torch.deg2rad(torch.tensor(physics.model.cam_fovy[0] / 2)).tan() * towards.norm()
-    assert arm.view == pytest.approx(half.item(), rel=2e-3)
-    assert towards.abs().max().item() == pytest.approx(towards.norm().item())  # the root is in the middle
-
-
-@pytest.mark.parametrize("name", sorted(ARMS))
-def test_angles_follow_from_places(name):
-    arm = ARMS[name]
-    angles = 6.2 * torch.rand(50, arm.joints) - 3.1
-    torch.testing.assert_close(arm.angles(arm.places(angles)), angles, atol=1e-4, rtol=0)
-    torch.testing.assert_close(arm.angles(3 * arm.places(angles)), angles, atol=1e-4, rtol=0)
-
-
-@pytest.mark.parametrize("name", sorted(ARMS))
-def test_the_controller_reaches_the_goal_on_the_truth(name):
-    from tensordict.nn import TensorDictModule
-
-    arm = ARMS[name]
-    env = make_env(arm, False, 4)
-    env.set_seed(0)
-    policy = TensorDictModule(arm.control, in_keys=["state", "goal"], out_keys=["action"])
-    with torch.no_grad():
-        end = env.rollout(200, policy, break_when_any_done=False)[:, -1]
-    distance = (arm.tip(arm.split(end["next", "state"])[0]) - arm.tip(end["goal"])).norm(dim=-1)
-    assert distance.max() < 0.001  # m; gravity alone would leave the manipulator 1 cm below
-    env.close()
-
-
 def test_readings_have_the_stated_noise_and_are_missing_as_often_as_stated():
     arm = ARMS["reacher"]
     emitted = TensorDict({"position": torch.full((20000, 2), 3.0), "velocity": torch.ones(20000, 2)}, [20000])
@@ -96,47 +41,6 @@ def test_readings_have_the_stated_noise_and_are_missing_as_often_as_stated():
     assert abs(error.std() - NOISE) < 0.002  # its own deviation is 0.0004
     assert abs(out["observed"].float().mean() - 0.7) < 0.02
     assert out["state"][0].tolist() == pytest.approx([-0.98999, -0.98999, 0.14112, 0.14112, 1.0, 1.0], abs=1e-4)
-
-
-def test_held_readings():
-    arm = ARMS["reacher"]
-    hold = HoldAngles(arm, "reading")
-
-    def frame(angle, seen=True):
-        angle = torch.tensor([angle, 0.0])
-        return TensorDict({"reading": torch.cat([angle.cos(), angle.sin()]), "observed": torch.tensor([seen])}, [])
-
-    held = hold._reset(None, frame(3.1))
-    velocities = []
-    for angle, seen in ((3.1, True), (-3.1, True), (1.0, False), (-3.0, True)):
-        held = hold._step(held, frame(angle, seen))
-        angles, velocity = arm.split(held["held"])
-        velocities.append(velocity[0].item())
-    assert angles[0].item() == pytest.approx(-3.0)
-    step = (2 * torch.pi - 6.2) / arm.dt  # from 3.1 on to -3.1, not all the way back
-    expected = [0.0, 0.2 * step, 0.16 * step, 0.128 * step + 0.2 * 0.1 / arm.dt]
-    assert velocities == pytest.approx(expected, rel=1e-4)
-
-
-def test_held_places():
-    arm = ARMS["manipulator"]
-    hold = HoldAngles(arm, ("sensor", "reading"))
-    angles = torch.tensor([[0.1, 0.2, -0.3, 0.4], [0.2, 0.2, -0.3, 0.4]])
-    before, now = (
-        TensorDict({"sensor": {"reading": arm.places(pose).flatten(-2)}, "observed": torch.tensor([True])}, [])
-        for pose in angles
-    )
-    held = hold._step(hold._reset(None, before), now)
-    found, velocity = arm.split(held["held"])
-    torch.testing.assert_close(found, angles[1])
-    torch.testing.assert_close(velocity, torch.tensor([0.2 * 0.1 / arm.dt, 0.0, 0.0, 0.0]), atol=1e-4, rtol=1e-4)
-
-
-def test_angles_turn_as_in_mujoco():
-    arm = ARMS["reacher"]
-    motion = collect(arm, False, 2, 30, 0)
-    lead = make_filter(arm, motion, None, None)["transition"].lead
-    torch.testing.assert_close(lead, torch.ones(2), atol=2e-3, rtol=0)  # one step of semi-implicit Euler
 
 
 def transition(arm, bias=None):
@@ -157,42 +61,6 @@ def test_the_forecast_turns_by_the_new_velocity():
     turned = angles - torch.tensor([0.3, -0.5]) - arm.dt * velocity
     drift = [(DRIFT**2 * arm.dt * speed + arm.creep**2) ** 0.5 for speed in (1, 2)]
     assert turned.std(0).tolist() == pytest.approx(drift, rel=0.06)  # the drift alone
-
-
-def test_an_arm_that_is_held_stays_at_rest():
-    arm = ARMS["manipulator"]
-    move = transition(arm)
-    angles = torch.rand(30, 4) - 0.5
-    state, action = arm.join(angles, torch.zeros_like(angles)), torch.nn.functional.pad(arm.hold(angles), (0, 1))
-    with torch.no_grad():
-        held, pushed = (move.faster(state, action + more)[0] for more in (0.0, 0.1))
-    assert held.abs().max() < 1e-6
-    assert pushed.abs().max() > 1e-3
-
-
-def test_no_member_gets_faster_than_any_arm_was():
-    """Beyond, the network would claim ever larger noises, and the members' velocities would grow without end."""
-    arm = ARMS["reacher"]
-    move = transition(arm)
-    action, angles = torch.zeros(2), torch.tensor([0.3, -0.5])
-    with torch.no_grad():
-        at_the_limit = move.faster(arm.join(angles, torch.tensor([50.0, -50.0])), action)
-        beyond = move.faster(arm.join(angles, torch.tensor([1e4, -1e9])), action)
-        after = move.compute(arm.join(angles, torch.tensor([1e4, -1e9])).expand(8, -1), action)
-    for limit, value in zip(at_the_limit, beyond, strict=True):
-        assert value.equal(limit)
-    mean, std = at_the_limit  # all begin the step at the limit
-    least = 50 - mean.abs().max() - 5 * std.max()
-    for speed in (arm.split(after)[1] * torch.tensor([1.0, -1.0])).unbind(-1):
-        assert least < speed.min() <= speed.max() <= 50
-    assert arm.split(after)[1].abs().max() == 50
-
-
-def test_the_limit_is_a_quarter_above_the_fastest_of_each_joint():
-    arm = ARMS["reacher"]
-    motion = collect(arm, False, 2, 30, 0)
-    fastest = make_filter(arm, motion, None, None)["transition"].fastest
-    torch.testing.assert_close(fastest, 1.25 * arm.split(motion["state"])[1].flatten(0, 1).abs().max(0).values)
 
 
 def test_biases_fade_with_the_way_and_not_with_time():
@@ -225,81 +93,3 @@ def test_the_first_belief_shares_a_reading_between_places_and_biases():
     # What is read is place plus bias; the first place is on a circle, though, and so is compared across the link.
     spread = (JointPlaces(arm).compute(ensemble) - reading)[:, :2] @ torch.tensor([-angles[0].sin(), angles[0].cos()])
     assert spread.std().item() == pytest.approx(0.004, rel=0.03)  # the biases are taken away again
-
-
-def test_the_sensor_reads_where_its_maps_are_bright():
-    arm = ARMS["manipulator"]
-    sensor, angles = JointSensor(arm), torch.tensor([[0.9, -0.4, 0.5, 0.2], [-0.6, -0.8, 0.9, 0.9]])
-    places = arm.places(angles)
-    column, row = ((1 + sign * places[..., part] / arm.view) * CELLS / 2 - 0.5 for part, sign in ((0, 1), (1, -1)))
-    cells = torch.arange(float(CELLS))
-    bumps = -0.5 * ((cells - column[..., None, None]) ** 2 + (cells[:, None] - row[..., None, None]) ** 2)
-
-    class Bumps(torch.nn.Module):
-        def forward(self, pixels):
-            return bumps
-
-    sensor.module = Bumps()
-    pixels = torch.zeros(2, 1, SIDE, SIDE)
-    torch.testing.assert_close(sensor.compute(pixels), places.flatten(-2), atol=1e-4, rtol=0)
-    losses = sensor.losses(pixels, arm.join(angles, angles))
-    assert losses["loss_places"] < 1e-6
-    # The entropy of a Gaussian with a standard deviation of one cell in the plane: 1 + log(2 pi).
-    assert losses["loss_maps"].item() == pytest.approx(2.8379, abs=1e-3)
-
-
-def test_the_motion_is_learned_from_single_steps(tmp_path):
-    arm = ARMS["reacher"]
-    torch.manual_seed(0)
-    velocity, action = [torch.zeros(20, 2)], 2 * torch.rand(20, 100, 2) - 1
-    for step in range(99):
-        velocity.append(0.9 * velocity[-1] + 0.3 * action[:, step])
-    velocity = torch.stack(velocity, 1)
-    motion = TensorDict({"state": arm.join(arm.dt * velocity.cumsum(1), velocity), "action": action}, [20, 100])
-    denkf = make_filter(arm, motion, None, None)
-    train_motion(denkf, motion, 400, tmp_path, 0)
-    with torch.no_grad():
-        mean, _ = denkf["transition"].faster(motion["state"][:, :-1], action[:, :-1])
-    error = (mean - velocity.diff(dim=1)).square().mean().sqrt()
-    assert error < 0.1 * velocity.diff(dim=1).std()
-
-
-def test_small_pictures_are_means_of_the_rendering():
-    fine = torch.arange(4.0 * SIDE * SIDE).reshape(1, 2 * SIDE, 2 * SIDE)
-    small = Average()._apply_transform(fine)
-    assert small.shape == (1, SIDE, SIDE)
-    assert small[0, 0, 0] == fine[0, :2, :2].mean()
-    assert small[0, -1, -1] == fine[0, -2:, -2:].mean()
-
-
-def test_scores_of_an_estimate_that_is_off_by_a_constant():
-    arm = ARMS["reacher"]
-    angles, goal = torch.zeros(3, 8, 2), torch.zeros(3, 8, 2)
-    state, off = arm.join(angles, angles), arm.join(angles + torch.tensor([0.1, 0.0]), angles + 2)
-    episodes = TensorDict(
-        {"next": {"state": state, "held": off, "reward": torch.ones(3, 8, 1)}, "goal": goal, "action": angles + 0.5},
-        [3, 8],
-    )
-    (row, *_), length = scores(arm, episodes, "held"), 24 * 2 * torch.sin(torch.tensor(0.05)).item()
-    assert row["angle"] == pytest.approx(0.1 * 57.29578 / 2**0.5, rel=1e-4)
-    assert (row["velocity"], row["return"], row["effort"]) == pytest.approx((2.0, 8.0, 0.25))
-    assert row["tip"] == pytest.approx(0.0, abs=1e-5)  # cm: the arm is where it should be, and believes otherwise
-    assert (row["error"], row["offset"]) == pytest.approx((length, length), rel=1e-4)
-
-
-def test_the_page_pairs_episodes(tmp_path):
-    base = {"task": "reacher", "source": "encoders", "seed": 0, "cpu_s": 60.0}
-    zeros = dict.fromkeys(("velocity", "tip", "error", "offset", "return", "effort"), 1.0)
-    rows = [
-        {**base, **zeros, "missing": missing, "estimate": estimate, "episode": episode, "angle": angle + 10 * episode}
-        for missing in (0.0, 0.3)
-        for estimate, angle in (("reading", 4.0), ("belief", 2.0), ("truth", 0.0))
-        for episode in range(4)
-        if estimate != "truth" or not missing
-    ]
-    case = {"task": "reacher", "source": "encoders", "missing": 0.3}
-    # Every pair differs by -2; the readings' mean is 19.
-    assert difference(rows, "angle", **case) == "-2.00 [+nan, +nan], -11%"
-    COLUMNS.write(rows, tmp_path / "table.csv")
-    assert page(COLUMNS.read(tmp_path / "table.csv")) == page(rows)
-    assert "| 30% | truth | 15.00" in page(rows)  # of the episodes without missing readings

@@ -1,19 +1,14 @@
 """The study's environments, inputs, filters and statistics, against closed forms."""
 
-import math
-
-import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
-from torchrl.envs import ExplorationType, check_env_specs, set_exploration_type
+from torchrl.envs import ExplorationType
 from torchrl.modules import get_primers_from_module, set_recurrent_mode
 
 from benchmarks.control import hike
 from benchmarks.control.arms import ARMS, Inputs
-from benchmarks.control.page import draw, interquartile_mean, page, reached, summary
-from benchmarks.control.ppo import PPO, ActorHead, Head, Settings
-from benchmarks.control.run import Budget, make_env, rollout
+from benchmarks.control.ppo import PPO, Head, Settings
+from benchmarks.control.run import make_env, rollout
 from benchmarks.control.sac import Units
 from benchmarks.control.tasks import TASKS
 
@@ -24,55 +19,12 @@ def env_of(task, arm, count=4, cell=(0.2, 0.3), seed=0):
     return make_env(task, arm, count, cell, seed, filter)
 
 
-def test_the_ground_is_a_maximum_of_three_ridges():
-    # On the crest of the first: density 1 / (2 pi 0.4 0.1).
-    assert hike.altitude(torch.tensor([-0.4, -0.8])).item() == pytest.approx(
-        -math.exp(-1 / (2 * math.pi * 0.4 * 0.1)) + 0.2 * -1.2 - 0.02, abs=1e-6
-    )
-    # Far from all of them it is a slope.
-    assert hike.altitude(torch.tensor([-3.0, 3.0])).item() == pytest.approx(-1.02, abs=1e-4)
-
-
-def test_a_hike_is_its_strides_and_its_noise():
-    env = hike.MountainHike(2000, 0.1)
-    data = env.rollout(hike.STEPS)
-    moved = data["next", "state"] - data["state"] - hike.STRIDE * data["action"]
-    count = moved.numel()
-    assert moved.std().item() == pytest.approx(hike.PROCESS, rel=5 / (2 * count) ** 0.5)
-    torch.testing.assert_close(
-        data["next", "reward"].squeeze(-1), hike.altitude(data["next", "state"] + hike.START), atol=1e-6, rtol=1e-6
-    )
-    assert data["next", "truncated"][:, -1].all()
-    assert data["action"].abs().max() <= 1
-
-
 def test_the_exact_filter_holds_the_truth():
     """Its errors have the variances that it believes: chi-square of all of them, two a step."""
     env = make_env(TASKS["hike"], ARMS["Kalman"], 500, (0.4, 0.0), 0, hike.exact_filter(0.4))
     data = env.rollout(hike.STEPS)["next"]
     errors = (data["belief", "mean"] - data["state"]).square() / data["belief", "var"]
     assert errors[:, -1].mean().item() == pytest.approx(1, abs=5 * (2 / 1000) ** 0.5)
-
-
-@pytest.mark.parametrize(
-    ("task", "arm"),
-    [(task, arm) for task in TASKS for arm in ARMS if ARMS[arm].filter != "exact" or TASKS[task].exact is not None],
-)
-def test_specs(task, arm):
-    check_env_specs(env_of(task, arm))
-
-
-def test_all_arms_walk_through_the_same_worlds():
-    truths = []
-    for arm in ("last reading", "LSTM", "belief mean", "truth"):
-        torch.manual_seed(0)
-        env = env_of("hike", arm)
-        with torch.no_grad():
-            data = env.rollout(10, lambda td: td.set("action", torch.ones(4, 2)))
-        truths.append((data["state"], data["observation"].nan_to_num(7.0)))
-    for state, reading in truths[1:]:
-        assert state.equal(truths[0][0])
-        assert reading.equal(truths[0][1])
 
 
 def test_what_is_seen_is_the_last_reading_and_the_last_action():
@@ -89,16 +41,6 @@ def test_what_is_seen_is_the_last_reading_and_the_last_action():
     assert seen[:, 0, 3].eq(0).all()
 
 
-def test_a_set_encoder_knows_no_order():
-    head = Head(3, 2, torch.ones(3), "ensemble")
-    ensemble = torch.randn(5, 8, 3)
-    torch.testing.assert_close(head(ensemble), head(ensemble[:, torch.randperm(8)]))
-    plain = Head(3, 2, torch.ones(3))
-    plain.load_state_dict(head.state_dict())
-    same = ensemble[:, :1].expand(5, 8, 3)
-    torch.testing.assert_close(head(same), plain(same[:, 0]))
-
-
 @pytest.mark.parametrize("reader", [Head(6, 2, torch.tensor([1.0, 2.0, 4.0])), Units(torch.tensor([1.0, 2.0, 4.0]))])
 def test_beliefs_are_read_in_units_of_the_scale(reader):
     """Means 1, 4, 12 and variances 1, 16, 64 are 1, 2, 3 and standard deviations 1, 2, 2 of 1, 2 and 4."""
@@ -109,23 +51,6 @@ def test_beliefs_are_read_in_units_of_the_scale(reader):
         plain.load_state_dict(reader.state_dict(), strict=False)
         expected = plain(expected)
     torch.testing.assert_close(reader(mean, variance), expected)
-
-
-def test_ppo_holds_actions_within_the_limit():
-    """The mean is zero and one standard deviation is the limit: 32 % of the actions are at it."""
-    torch.manual_seed(0)
-    ppo = PPO(ARMS["truth"], Inputs(0, 1, torch.ones(3), 2.0), TASKS["pendulum"].settings, 1)
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        out = ppo.policy(TensorDict({"state": torch.zeros(4000, 3)}, [4000]))
-    torch.testing.assert_close(out["action"], 2 * out["raw"].clamp(-1, 1))
-    assert out["action"].abs().eq(2).float().mean().item() == pytest.approx(0.317, abs=0.037)
-
-
-def test_actors_begin_alike():
-    head = ActorHead(3, 1, torch.tensor([1.0, 1.0, 8.0]))
-    mean, std = head(torch.randn(7, 3))
-    assert mean.abs().max() < 0.02
-    assert std.eq(1).all()
 
 
 @pytest.mark.parametrize("arm", ["LSTM", "GRU"])
@@ -183,102 +108,3 @@ def test_advantages_and_targets_are_those_of_a_constant_critic():
         torch.testing.assert_close(found.sort().values, expected, atol=1e-4, rtol=1e-4)
         torch.testing.assert_close(target, found + value, atol=1e-4, rtol=1e-4)
     assert reward.equal(data["next", "reward"])  # the collected ones stay as they were
-
-
-def test_ppo_raises_the_reward():
-    """Steps that are rewarded by their first action: its mean goes up, the second one's stays."""
-    torch.manual_seed(0)
-    ppo = PPO(ARMS["truth"], Inputs(0, 2, torch.ones(2), 1.0), Settings(gamma=0.5, lmbda=0.5, epochs=3), 4)
-    env = env_of("hike", "truth", count=8)
-    for _ in range(4):
-        data = rollout(env, ppo.policy, hike.STEPS, ExplorationType.RANDOM)
-        data["next", "reward"] = data["action"][..., :1].clone()
-        ppo.update(data)
-    with torch.no_grad():
-        loc = ppo.actor.get_dist(data).mean.mean((0, 1))
-    assert loc[0] > 0.3
-    assert loc[1].abs() < 0.2
-    assert ppo.optimiser.param_groups[0]["lr"] == pytest.approx(0.05 * 1e-3)
-    assert ppo.loss.clip_epsilon.item() == pytest.approx(0.2)
-
-
-def test_statistics():
-    assert interquartile_mean([1.0, 2.0, 3.0, 100.0]) == 2.5
-    center, low, high = summary([1.0, 2.0, 3.0, 4.0, 5.0])
-    assert center == 3
-    assert 1 < low < 3 < high < 5
-    assert summary([2.0])[0] == 2.0
-    assert np.isnan(summary([2.0])[1])
-
-
-def rows(ends=(1000, 2000, 3000)):
-    """Three tests or more, of which the last two count."""
-    for arm, final in (("LSTM", -20.0), ("belief mean", -10.0), ("truth", -5.0)):
-        for seed in range(2):
-            for steps, value in zip(ends, (*[-40.0] * (len(ends) - 2), final - 5, final), strict=True):
-                entries = {"arm": arm, "seed": seed, "env_steps": steps, "return": value - seed, "wall_s": 1.0}
-                yield {"task": "hike", "cell": "noise 0", **entries}
-
-
-def test_tables():
-    table = list(rows())
-    assert reached(table, "hike", "noise 0", "belief mean") == "2"
-    assert reached(table, "hike", "noise 0", "LSTM") == "3"
-    text = page(table)
-    assert "control.png" not in text  # one noise makes no line
-    assert "| noise 0 | 10.0 |" in text  # more than the LSTM, with both seeds
-    assert "| noise 0 | 2 | -20.5 [-21.0, -20.0] | -10.5 [-11.0, -10.0] | -5.5 [-6.0, -5.0] |" in text
-
-
-def test_the_page_names_the_budget_that_ran(monkeypatch):
-    """Five tests until 98,400 steps, 41 batches of 32 hikes, are the study's; anything else is not called so."""
-    monkeypatch.setattr("sys.argv", ["control", "--smoke"])
-    plain, tiny = "`python -m benchmarks.control`", "`python -m benchmarks.control --smoke`"
-    study = page(list(rows((21600, 40800, 60000, 79200, 98400))))
-    assert plain in study
-    assert "Each test is of 100 episodes" in study
-    assert "a run has 5 tests" in study
-    for other in (page(list(rows())), page(list(rows((40800, 60000, 98400))))):
-        assert plain not in other
-        assert "episodes" not in other
-        assert "a run has 3 tests" in other
-    smoke = page(list(rows()), Budget(episodes=2))
-    assert plain not in smoke
-    assert tiny in smoke
-    assert "Each test is of 2 episodes" in smoke
-    uneven = [row for row in rows() if (row["seed"], row["env_steps"]) != (1, 1000)]
-    assert "a run has" not in page(uneven)
-
-
-def test_zero_has_no_sign():
-    table = [
-        row | {"return": row["return"] if row["arm"] == "LSTM" else -20.04 - 1.005 * row["seed"]} for row in rows()
-    ]
-    assert "| noise 0 | 0.0 [0.0, 0.0] |" in page(table)
-
-
-def test_the_picture_is_of_tasks_with_two_noises(tmp_path):
-    table = list(rows())
-    draw(table, tmp_path / "none.png")
-    assert not (tmp_path / "none.png").exists()
-    draw([*table, *({**row, "cell": "noise 0.2"} for row in table if row["arm"] != "truth")], tmp_path / "two.png")
-    assert (tmp_path / "two.png").exists()
-
-
-def test_the_actors_loss_filters_slices_from_what_was_stored_and_trains_the_filter():
-    """Without process noise all is determined: the policy is the one that collected, and the ratio is one."""
-    torch.manual_seed(0)
-    task, arm = TASKS["pendulum"], ARMS["belief mean, end to end"]
-    filter = task.unlearned(8)
-    with torch.no_grad():
-        filter["transition"].module["noise"].log_variance.fill_(-60.0)
-    env = make_env(task, arm, 3, (0.2, 0.3), 0, filter)
-    ppo = PPO(arm, Inputs(0, 1, torch.tensor(task.scale), task.limit), task.settings, 1, filter=filter)
-    data = rollout(env, ppo.policy, 80, ExplorationType.RANDOM)
-    said = []
-    ppo.loss.register_forward_hook(lambda *args: said.append(args[-1]["kl_approx"].item()))
-    before = {name: parameter.detach().clone() for name, parameter in filter.named_parameters()}
-    ppo.update(data)
-    assert abs(said[0]) < 1e-4
-    still = {name for name, parameter in filter.named_parameters() if parameter.equal(before[name])}
-    assert still == {"module.transition.module.noise.log_variance"}  # that of e^-60 has no gradient

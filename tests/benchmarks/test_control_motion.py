@@ -44,23 +44,3 @@ def test_velocities_move_the_cart_and_the_pole(before, after):
         for position, angle, *velocities in (before, after)
     )
     torch.testing.assert_close(push.compute(before, torch.tensor([[0.5]])), after, atol=1e-6, rtol=1e-6)
-
-
-def test_carts_start_in_the_middle_and_still_with_the_pole_hanging():
-    """Position, angle and both velocities have standard deviations of 0.01: dm_control's own start."""
-    count = 4000
-    position, cos, sin, velocity, turn = cartpole.NoisyCartpole(count, 0.1).reset()["state"].T
-    assert cos.max() < -0.99
-    start = torch.stack([position, torch.atan2(-sin, -cos), velocity, turn])
-    torch.testing.assert_close(start.std(1), torch.full((4,), 0.01), rtol=5 / (2 * count) ** 0.5, atol=0)
-    torch.testing.assert_close(start.mean(1), torch.zeros(4), rtol=0, atol=5 * 0.01 / count**0.5)
-
-
-def test_an_episode_is_ten_seconds_long():
-    """250 actions of 0.04 s, as in dm_control; it ends by its length, and no earlier."""
-    data = cartpole.NoisyCartpole(3, 0.1).rollout(400)
-    assert data.shape == (3, 250)
-    for key in ("truncated", "done"):
-        assert not data["next", key][:, :-1].any()
-        assert data["next", key][:, -1].all()
-    assert not data["next", "terminated"].any()

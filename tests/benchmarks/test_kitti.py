@@ -1,26 +1,22 @@
 """The parts of the KITTI study that a wrong table could come from."""
 
-import json
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from benchmarks.common.tables import pick
 from benchmarks.kitti.evaluation import errors, integrate, last_velocities
 from benchmarks.kitti.folds import Fold, Part, Statistics, make_fold, with_disturbances
 from benchmarks.kitti.recipes import FILTERS
 from benchmarks.kitti.sensors import SENSORS, SensorOfFold
 from benchmarks.kitti.streams import DISTURBANCES, LONGEST, Stream
-from benchmarks.kitti.study import rows_of
-from benchmarks.kitti.tables import COLUMNS, by_drive, markdown
-from benchmarks.kitti.training import calibration_error, certain_gain, log_gains, run_filter
+from benchmarks.kitti.tables import by_drive
+from benchmarks.kitti.training import log_gains, run_filter
 from tests.applications.car.odometry.test_streams import readings
 from torch_denkf.applications.car import dead_reckoning
 from torch_denkf.applications.car.modules.pairs import PairObservation
-from torch_denkf.applications.car.odometry.streams import all_frames, lose_frames, take_spans
+from torch_denkf.applications.car.odometry.streams import all_frames
 
 
 def streams(*drives, cameras=("image_0",)):
@@ -50,38 +46,11 @@ def test_no_fold_trains_on_its_test_drive_in_any_condition_or_camera(test, rende
         assert set.union(*roles) == set("abcdef") - {test}
 
 
-def test_a_fold_that_leaks_is_refused():
-    part = Part(Stream("root", "a", "image_0", condition="blur"))
-    with pytest.raises(ValueError, match=r"\['a'\] would be trained and tested on"):
-        Fold("a", [part], [], [], test=streams("a"))
-
-
-def test_too_few_drives_are_refused():
-    with pytest.raises(ValueError, match="too few"):
-        make_fold("a", streams("a", "b"), [], [])
-
-
-def test_disturbances_together_weigh_half_as_much_as_the_clean_stream():
-    parts = with_disturbances([Part(*streams("a"), weight=2.0)])
-    assert sum(part.weight for part in parts if part.stream.condition == "clean") == 2.0
-    assert sum(part.weight for part in parts if part.stream.condition != "clean") == pytest.approx(1.0)
-
-
 def test_dead_reckoning_holds_the_last_reading_and_before_the_first_the_true_start():
     values = [[9.0, 9.0], [1.0, 0.1], [9.0, 9.0], [2.0, 0.2], [9.0, 9.0]]
     read = all_frames(readings(values, [False, True, False, True, False]))
     expected = torch.tensor([[7.0, 0.7], [1.0, 0.1], [1.0, 0.1], [2.0, 0.2], [2.0, 0.2]])
     torch.testing.assert_close(last_velocities(read, 0.1), expected)
-
-
-def test_dead_reckoning_takes_the_mean_over_a_gap_unless_it_is_too_wide():
-    read = readings([[7.0, 0.7], [6.0, 0.1], [9.0, 9.0], [8.0, 0.2], [9.0, 9.0], [30.0, 0.3]], longest=3)
-    out = take_spans(read, torch.tensor([0, 1, 0, 2, 0, 2]))
-    torch.testing.assert_close(out["sensor", "ensemble"].mean(1)[3], torch.tensor([16.0, 0.4]))
-    path = last_velocities(out, 0.1)
-    torch.testing.assert_close(path[3:5], torch.tensor([[8.0, 0.2]] * 2))  # 2 x 0.6 m are within reach
-    torch.testing.assert_close(path[5], torch.tensor([30.0, 0.3]))  # held 8 m/s over 0.2 s: within reach, as it knows
-    torch.testing.assert_close(last_velocities(out, 0.3)[3:], torch.tensor([[6.0, 0.1]] * 3))  # 2 x 1.8 m are not
 
 
 def test_errors_of_a_path_that_is_a_tenth_too_fast():
@@ -111,14 +80,6 @@ def test_gains_are_those_of_clean_unseen_drives():
     torch.testing.assert_close(log_gains(fold, base), torch.tensor([0.03, -0.04]), rtol=1e-4, atol=0)
 
 
-def test_a_gain_counts_where_drives_agree_on_it():
-    """Student's t of -0.03, -0.01, -0.02, -0.04 is -3.87; the bound for four drives is 3.18, for three 4.30."""
-    assert certain_gain(torch.tensor([-0.03, -0.01, -0.02, -0.04])) == pytest.approx(-0.025)
-    assert certain_gain(torch.tensor([-0.03, -0.01, -0.02])) == 0.0  # t = 3.46
-    assert certain_gain(torch.tensor([0.03, -0.01, -0.02, -0.04])) == 0.0
-    assert certain_gain(torch.tensor([0.03])) == 0.0
-
-
 def test_every_filter_predicts_what_a_sensor_with_a_gain_reads():
     sensor = SENSORS["flow"](facts := Statistics(torch.zeros(2), torch.ones(2), torch.zeros(2), torch.ones(2), 0.1))
     for name in ("denkf", "dekf", "bkf", "dpf_m_lrn"):
@@ -131,16 +92,6 @@ def test_every_filter_predicts_what_a_sensor_with_a_gain_reads():
         assert "logarithm" not in " ".join(model.state_dict())
 
 
-def test_the_calibration_counts_the_path_and_the_crps_of_the_velocities(monkeypatch):
-    run = TensorDict({"state": torch.zeros(1, 9, 5), "belief": {"mean": torch.zeros(1, 9, 5)}}, [1, 9])
-    run["belief", "mean"][..., :2] = torch.tensor([3.0, -4.0])  # 5 m off
-    run["belief", "var"] = torch.full((1, 9, 5), 4.0)
-    monkeypatch.setattr("benchmarks.kitti.training.run_all", lambda *_: [run, run])
-    recipe = SimpleNamespace(unit=torch.tensor([1.0, 2.0]))
-    crps = 2.0 * (math.sqrt(2) - 1) / math.sqrt(math.pi)  # of a Gaussian whose mean is right
-    assert calibration_error(recipe, None, []) == pytest.approx(5.0 * (crps + crps / 2) / 2, rel=1e-6)
-
-
 def row(drive, seed, value, **entries):
     row = {"filter": "denkf", "sensor": "flow", "condition": "clean", "window": 100, "coverage90": 0.9}
     return {**row, "drive": drive, "seed": seed, "translation_m_per_m": value, "rotation_deg_per_m": 0.1, **entries}
@@ -150,30 +101,6 @@ def test_a_drive_counts_once_by_the_median_of_its_seeds_and_the_mean_of_its_came
     rows = [row("a/image_0", 0, 1.0), row("a/image_1", 0, 3.0), row("a/image_0", 1, 5.0), row("a/image_1", 1, 5.0)]
     rows += [row("a/image_0", 2, 90.0), row("a/image_1", 2, 90.0), row("b/image_2", 0, 7.0)]
     assert by_drive(rows, "translation_m_per_m") == {"a": 5.0, "b": 7.0}
-
-
-def test_the_table_survives_its_file(tmp_path):
-    rows = [row("a/image_0", 0, 0.25), row("b/image_0", 0, 0.75, coverage90=float("nan"))]
-    rows += [row("a/image_0", 0, 0.125, filter="floor"), row("b/image_0", 0, 0.125, filter="floor")]
-    COLUMNS.write(rows, tmp_path / "table.csv")
-    again = COLUMNS.read(tmp_path / "table.csv")
-    assert (tmp_path / "table.csv").read_text().splitlines()[0] == ",".join(COLUMNS.names)
-    assert "coverage90" not in pick(again, drive="b/image_0", filter="denkf")[0]
-    assert by_drive([r for r in again if r["filter"] == "denkf"], "translation_m_per_m") == {"a": 0.25, "b": 0.75}
-    text = markdown(again, "header")
-    assert "| clean | denkf | flow | 0.500 ± 0.250 |" in text
-    assert "| clean | floor: true v and theta_dot | truth | 0.125 ± 0.000 |" in text
-
-
-def test_rows_of_several_filters_bring_dead_reckoning_once(tmp_path):
-    for name, value in (("denkf", 1.0), ("dekf", 2.0)):
-        folder = tmp_path / "folds" / f"a-{name}-flow-0"
-        folder.mkdir(parents=True)
-        rows = [row("a/image_0", 0, value, filter=name)]
-        rows += [row("a/image_0", 0, 10 * value, filter=shared) for shared in ("dead_reckoning", "floor")]
-        (folder / "rows.json").write_text(json.dumps(rows))
-    found = {(r["filter"], r["translation_m_per_m"]) for r in rows_of(tmp_path)}
-    assert found == {("denkf", 1.0), ("dekf", 2.0), ("dead_reckoning", 10.0), ("floor", 10.0)}
 
 
 def facts():
@@ -190,27 +117,6 @@ def smooth_drive(count, encoding):
     entries = {"observed": torch.ones(count, LONGEST, 1).bool(), "ensemble": samples, "encoding": encoding}
     state = torch.cat([path, velocity], -1)
     return TensorDict({"state": state, "spans": TensorDict(entries, batch_size=[count, LONGEST])}, [count])
-
-
-@pytest.mark.parametrize("name", sorted(FILTERS))
-def test_every_recipe_follows_readings_over_gaps_with_one_set_of_parameters(name):
-    """Untrained filters on readings of a known truth: a drive whose speed changes, 30 % of the frames missing."""
-    torch.manual_seed(0)
-    recipe = FILTERS[name](SENSORS["flow"](facts()), facts())
-    model = recipe.build()
-    sensorless = recipe.part(model, sensor=False)
-    own = {id(p) for p in model.parameters()}
-    assert {id(p) for p in sensorless.parameters()} <= own
-    assert any(True for _ in sensorless.parameters())
-    read = smooth_drive(60, recipe.encoding)
-    state = read["state"]
-    with torch.no_grad():
-        out = run_filter(recipe, model, [all_frames(read), lose_frames(read, seed=1)])
-    assert out["belief", "var"][..., :5].isfinite().all()
-    if name == "dpf_m_lrn":  # before training, nothing connects its readings with its state
-        return
-    end = (out["belief", "mean"][:, -1, :2] - state[-1, :2]).norm(dim=-1)
-    assert (end < 0.1 * 8 * 0.1 * len(state)).all(), end  # a tenth of the way
 
 
 @pytest.mark.parametrize("name", ["dekf", "bkf"])

@@ -1,29 +1,10 @@
 """The frontier of the KITTI study: the same weights at other sizes, means over drives."""
 
-import pytest
 import torch
 
-from benchmarks.kitti.folds import Fold, Statistics
-from benchmarks.kitti.frontier import COLUMNS, draw, means, processor_times, scores
-from benchmarks.kitti.recipes import FILTERS
-from benchmarks.kitti.sensors import SENSORS
-from benchmarks.kitti.study import Job, Study
-from benchmarks.kitti.training import load_filter, run_filter
+from benchmarks.kitti.frontier import COLUMNS, means
 from tests.benchmarks.test_kitti import smooth_drive
 from torch_denkf.applications.car.odometry.streams import all_frames
-from torch_denkf.training.checkpoint import write_checkpoint
-
-
-@pytest.fixture
-def trained(tmp_path):
-    """A folder with an untrained DEnKF of 32 members, its recipe and its model."""
-    facts = Statistics(torch.tensor([9.0, 0.0]), torch.tensor([3.0, 0.1]), torch.zeros(2), torch.ones(2), 0.1)
-    torch.manual_seed(0)
-    recipe = FILTERS["denkf"](SENSORS["flow"](facts), facts)
-    model = recipe.build()
-    notes = {"filter": "denkf", "sensor": "flow", "facts": vars(facts)}
-    write_checkpoint(tmp_path / "filter.pt", {"model": model.state_dict(), "inflation": 1.1, **notes})
-    return tmp_path, recipe, model
 
 
 def drive(recipe, members):
@@ -32,34 +13,6 @@ def drive(recipe, members):
     samples = read["spans", "ensemble"]
     read["spans"]["ensemble"] = samples[:, :, torch.arange(members) % samples.shape[2]]
     return all_frames(read)
-
-
-def test_the_size_that_was_trained_gives_what_was_trained(trained):
-    folder, recipe, model = trained
-    recipe.set_inflation(model, 1.1)
-    reading = drive(recipe, 32)
-    with torch.no_grad():
-        own = run_filter(recipe, model, [reading])["belief", "mean"]
-        for options in ({}, {"size": 32}, {"size": 32, "scheme": "sensor"}):
-            again, loaded, *_ = load_filter(folder, **options)
-            assert torch.equal(run_filter(again, loaded, [reading])["belief", "mean"], own)
-
-
-@pytest.mark.parametrize("scheme", ["sensor", "perturbed", "sakov"])
-def test_other_sizes_and_updates_carry_the_weights_and_follow_the_drive(trained, scheme):
-    folder, _, model = trained
-    recipe, other, *_ = load_filter(folder, size=64, scheme=scheme)
-    assert recipe.sensor.ensemble_size == 64
-    for (name, mine), theirs in zip(other.named_parameters(), model.parameters(), strict=True):
-        assert torch.equal(mine, theirs), name
-    reading = drive(recipe, 64)
-    row = scores(recipe, other, reading)
-    assert row["window"] == 100
-    assert row["translation_m_per_m"] < 0.05
-    assert 0 < row["crps"] < 2  # readings are off by 2.8 on the average
-    times = processor_times(recipe, other, reading[:10], smoke=True)
-    assert set(times) == {"ms_per_step", "eager_ms_per_step"}
-    assert min(times.values()) > 0
 
 
 def row(name, drive, value, window=100, **entries):
@@ -76,10 +29,3 @@ def test_means_are_over_drives_that_are_long_enough_and_a_drive_counts_once():
     assert (second["filter"], second["drives"], second["crps"]) == ("b", 1, 14.0)
     assert set(first) <= set(COLUMNS.names)
     assert means(rows[3:4])[0]["translation_m_per_m"] == 90.0  # where no drive is long enough, all count
-
-
-def test_no_trained_filter_is_an_error(tmp_path, monkeypatch):
-    study = Study(command="frontier", out=tmp_path)
-    monkeypatch.setattr("benchmarks.kitti.frontier.make_jobs", lambda _: [Job(study, Fold("t", [], [], []), "flow", 0)])
-    with pytest.raises(FileNotFoundError, match=r"no trained denkf in .*folds; run table"):
-        draw(study)

@@ -2,7 +2,6 @@
 
 from itertools import pairwise
 
-import pytest
 import torch
 
 from benchmarks.common.lorenz96 import lorenz96_step, lorenz96_tendency
@@ -41,8 +40,3 @@ def test_step_is_of_fourth_order():
     # Halving the step divides the error by 2⁴, up to the next order in dt.
     for coarse, fine in pairwise(errors):
         assert 14 < coarse / fine < 18
-
-
-def test_three_variables_are_too_few():
-    with pytest.raises(ValueError, match="N >= 4"):
-        lorenz96_tendency(torch.zeros(3))

@@ -1,25 +1,11 @@
 """The study's scores, against closed forms and scikit-free counts."""
 
-from dataclasses import asdict
-from pathlib import Path
-
 import pytest
 import torch
 from tensordict import TensorDict
 
-from benchmarks.monitor.arm import ArmGuard
-from benchmarks.monitor.car import CarGuard, gates_of
-from benchmarks.monitor.drives import believed_spans, stretches
-from benchmarks.monitor.scores import Run, afterwards, auroc, detection, false_alarms, spans_of
-from benchmarks.monitor.study import COLUMNS, Study, page
-from torch_denkf.applications.car.vision.poses import KITTI_DT
-from torch_denkf.applications.car.vision.signs import PICTURE_SIGNS, flow_signs
-
-
-def test_spans_are_first_and_behind_the_last():
-    fault = torch.tensor([0, 1, 1, 0, 0, 1]).bool()
-    assert spans_of(fault) == [(1, 3), (5, 6)]
-    assert spans_of(torch.zeros(4, dtype=torch.bool)) == []
+from benchmarks.monitor.drives import believed_spans
+from benchmarks.monitor.scores import Run, afterwards, auroc, detection, false_alarms
 
 
 def test_auroc_counts_pairs():
@@ -47,12 +33,6 @@ def test_detection_leaves_out_what_follows_a_fault():
     assert afterwards(torch.arange(40.0).unsqueeze(0), fault, 5).tolist() == [[30, 31, 32, 33, 34]]
 
 
-def test_faults_end_before_the_drive_does():
-    hit = stretches(200)
-    assert spans_of(hit) == [(40, 60), (100, 120), (160, 180)]
-    assert not stretches(51).any()
-
-
 def test_the_shortest_pair_that_is_believed():
     def reading(steps):
         entries = {"ensemble": torch.full((4, 2, 2), float(steps)), "encoding": torch.zeros(4, 3)}
@@ -69,49 +49,3 @@ def test_the_shortest_pair_that_is_believed():
     assert chosen["steps"].flatten().tolist() == [1, 2, 3, 0]
     assert chosen["observed"].flatten().tolist() == [True, True, True, False]
     assert chosen["sensor", "ensemble"][:3, 0, 0].tolist() == [1, 2, 3]
-
-
-def test_the_flow_takes_the_road_s_place_where_the_two_contradict():
-    """Clean readings are off by up to 10 %, and the flow's distances are 20 % short; then a car hides the road."""
-    steps, generator = 400, torch.Generator().manual_seed(0)
-    speed = 10 + torch.rand(steps, 1, generator=generator)
-
-    def reading(read, plane, shown=0.0):
-        shown = torch.full((steps, len(PICTURE_SIGNS)), shown)
-        ensemble = torch.stack([read, torch.zeros_like(read)], -1).expand(steps, 4, 2)
-        of_flow = flow_signs(plane.squeeze(-1), torch.ones(steps, 13, 69), read.squeeze(-1) * KITTI_DT)
-        entries = {"signs": torch.cat([shown, of_flow], -1), "plane": plane, "sensor": {"ensemble": ensemble}}
-        return TensorDict({**entries, "observed": torch.ones(steps, 1, dtype=torch.bool)}, [steps])
-
-    plane = 0.8 * speed * KITTI_DT
-    clean = reading(speed * (0.9 + 0.2 * torch.rand(steps, 1, generator=generator)), plane)
-    gates = gates_of([clean], CarGuard(rate=0.01))
-    assert gates.scale == pytest.approx(1.25, rel=0.02)
-    slow = reading(0.2 * speed, plane)
-    hidden = gates.answered(slow)
-    assert torch.allclose(slow["sensor", "ensemble"][:, 0, :1], 0.2 * speed)  # what came is left as it was
-    assert torch.allclose(hidden["sensor", "ensemble"][..., 0].mean(-1, keepdim=True), gates.scale * 0.8 * speed)
-    assert hidden["observed"].all()
-    untouched = gates.answered(clean)
-    changed = (untouched["sensor", "ensemble"] != clean["sensor", "ensemble"]).flatten(1).any(-1)
-    assert changed.float().mean() <= 0.011
-    assert not gates.answered(reading(speed, plane, 0.9))["observed"].any()  # what the pictures show says no
-
-
-def test_a_page_of_every_kind_of_row(tmp_path):
-    rows = [
-        {"task": "ur5", "fault": "none", "false_alarms_per_1000": 0.5, "error": 1.0, "error_gated": 1.1},
-        {"task": "kitti-real", "fault": "black", "auroc": 0.98, "delay_steps": 1.0, "found": 1.0},
-    ]
-    rows[1] |= {"false_alarms_per_1000": 0.5, "error_ratio": 1.02, "false_steps_per_1000": 0.5}
-    COLUMNS.write(rows, tmp_path / "monitor.csv")
-    assert sorted(COLUMNS.read(tmp_path / "monitor.csv"), key=COLUMNS.order) == sorted(rows, key=COLUMNS.order)
-    text = page(rows, Study())
-    assert "| kitti-real | black | 0.98 | 1 | 1 | 0.5 | 1.020 |" in text
-
-
-def test_the_settings_are_those_that_the_trials_chose():
-    page = (Path(__file__).parents[2] / "benchmarks/monitor/results/choice.md").read_text()
-    for task, guard in (("car", CarGuard()), ("arm", ArmGuard())):
-        chosen = ", ".join(f"{name} {value:g}" for name, value in asdict(guard).items())
-        assert f"| {task}: chosen | {chosen} |" in page

@@ -1,8 +1,6 @@
 import torch
-from tensordict import TensorDict
 
-from benchmarks.occlusion.arm import Damped, cells
-from benchmarks.occlusion.study import SETTLED, scores, times
+from benchmarks.occlusion.study import scores
 from benchmarks.occlusion.task import HEIGHT, PILLAR, RADIUS, WIDTH, drawn, filter_of, runs
 
 
@@ -25,18 +23,6 @@ def test_the_ball_stays_in_its_box_and_is_seen_where_it_is():
     assert (((x - PILLAR[0]).abs() < RADIUS) | ((x - PILLAR[1]).abs() < RADIUS) | ~partly).all()
 
 
-def test_times_do_not_overlap_and_after_is_one_second():
-    data = runs(50, 150, 1)
-    masks = times(data)
-    assert sum(mask.int() for mask in masks.values()).max() == 1
-    assert not any(mask[:, :SETTLED].any() for mask in masks.values())
-    began = masks["after"] & ~torch.nn.functional.pad(masks["after"], (1, 0))[:, :-1]
-    assert masks["after"].sum() <= 10 * began.sum()
-    exact = scores(data["state"][..., :2], torch.ones(50, 150, 2), data)
-    assert {exact[f"error_{when}"] for when in masks} == {0.0}
-    assert {exact[f"coverage_{when}"] for when in masks} == {1.0}
-
-
 def test_filters_that_know_of_the_camera_find_the_ball_behind_the_pillar():
     """A camera that reads the middle of the pillar there, and an encoding that tells: heads that know, by hand."""
     data = runs(20, 100, 2)
@@ -57,21 +43,3 @@ def test_filters_that_know_of_the_camera_find_the_ball_behind_the_pillar():
             out = filter.sequence(data.clone())
         errors.append(scores(out["belief", "mean"][..., :2], out["belief", "var"][..., :2], data)["error_hidden"])
     assert errors[1] < 0.5 * errors[0]
-
-
-def test_an_arm_is_seen_behind_the_box_and_after_it_where_rows_say_so():
-    steps = torch.arange(120)
-    boxed = ((steps >= 40) & (steps < 60)).view(1, -1, 1)
-    data = TensorDict(
-        {"state": torch.zeros(1, 120, 7), "boxed": boxed, "valid": torch.ones(1, 120, 1).bool()}, [1, 120]
-    )
-    mean = torch.where(boxed, 2.0, torch.where((steps >= 60).view(1, -1, 1) & (steps < 90).view(1, -1, 1), 3.0, 1.0))
-    found = cells(mean.deg2rad().expand(1, 120, 7), torch.full((1, 120, 7), 1.5).deg2rad(), data)
-    assert found[::3] == ["1.00", "2.00", "3.00"]
-    assert found[1::3] == ["100 %", "100 %", "0 %"]
-
-
-def test_rates_that_fade_as_in_the_recordings():
-    rate = 0.1 * 0.9 ** torch.arange(50).unsqueeze(-1) * torch.ones(7)
-    motion, pair = Damped([torch.cat([rate.cumsum(0), rate], -1)]), torch.cat([torch.ones(7), torch.full((7,), 0.2)])
-    torch.testing.assert_close(motion(pair), torch.cat([torch.full((7,), 1.18), torch.full((7,), 0.18)]))

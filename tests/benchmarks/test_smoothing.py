@@ -7,7 +7,6 @@ from scipy.integrate import solve_ivp
 
 from benchmarks.smoothing.cases import CASES
 from benchmarks.smoothing.ours import rows
-from benchmarks.smoothing.study import COLUMNS, Study, joined, page
 from benchmarks.smoothing.systems import SYSTEMS, Cycle, lorenz63_step, simulate
 
 
@@ -43,14 +42,3 @@ def test_a_smoother_is_better_than_its_filter(float64):
     case = next(case for case in CASES if case.name == "lorenz63-EnKS-5")
     for row in rows(case, [0, 1], 60):
         assert row["rmse_smoother"] < 0.8 * row["rmse_filter"] < 1.2
-
-
-def test_rows_meet_and_the_page_compares_them(tmp_path):
-    case = CASES[0]
-    ours = [{**case.labels(), "seed": s, "rmse_filter": 0.6, "rmse_smoother": (0.2, 0.3)[s]} for s in range(2)]
-    theirs = [{**case.labels(), "seed": s, "dapper_rmse_filter": 0.5, "dapper_rmse_smoother": 0.3} for s in range(2)]
-    rows = joined([*ours, *theirs])
-    COLUMNS.write(rows, tmp_path / "smoothing.csv")
-    assert COLUMNS.read(tmp_path / "smoothing.csv") == rows
-    (line,) = [line for line in page(rows, Study()).splitlines() if line.startswith("| lorenz63")]
-    assert line == "| lorenz63 | EnKS | 5 | 100 | 0.600 | 0.250 | 0.500 | 0.300 | smoother 0.32 | yes |"

@@ -1,14 +1,11 @@
 """The study behind trained sensors: its Gaussian model is the library's filter, its weights are least squares."""
 
-from functools import partial
-
 import pytest
 import torch
 from torch.testing import assert_close
 
 from benchmarks.smoothing import gaussian, linear, real
 from benchmarks.smoothing.gaussian import Series
-from benchmarks.smoothing.recordings import Task
 
 
 def series_for_tests(target=True, count=3, steps=14):
@@ -35,16 +32,6 @@ def test_the_fitted_model_is_the_library_filter_and_smoother(float64, target):
         assert_close(real.mean_square(mean, series.truth), square, rtol=1e-7, atol=1e-9)
 
 
-def test_fitting_makes_the_smoother_better(float64):
-    series = [series_for_tests(count=8)]
-
-    def error(parameters):
-        mean = gaussian.believe(gaussian.model_of(parameters, series), series[0], 2)[1]
-        return float((mean - series[0].truth)[:, 3:-2].square().mean(1).log().mean())
-
-    assert error(gaussian.fit(series, 2, 12)) < error(gaussian.fit(series, 2, 0)) - 0.1
-
-
 def test_weights_find_what_only_later_readings_say(float64):
     reading = torch.randn(4, 60, 2)
     truth = torch.zeros_like(reading)
@@ -57,24 +44,3 @@ def test_weights_find_what_only_later_readings_say(float64):
     assert real.mean_square(linear.estimates(series, found, real.LAG), truth).max() < 1e-8
     past = linear.estimates(series, linear.weights([series], 0), 0)
     assert real.mean_square(past, truth).min() > 2, "no weights of earlier readings can know it"
-
-
-def test_readings_that_are_missing_are_held(float64):
-    series = series_for_tests(count=1, steps=5)
-    series.observed[:] = torch.tensor([False, True, False, True, True]).reshape(1, 5, 1)
-    now = linear.windows(series, 0)[0, :, 0, linear.BACK]
-    assert now.tolist() == series.reading[0, [1, 1, 1, 3, 4], 0].tolist()
-
-
-def test_rows_and_page(tmp_path):
-    task = Task("kitti", ("speed m/s", "turn rate rad/s"), range(3, 5), (32,), 4, *[lambda *_: None] * 3)
-    say = partial(real.rows_of, task, method="EnKS", members=32, draws=4)
-    rows = say("real", "01 02", torch.tensor([[1.0, 4.0], [9.0, 4.0]]), torch.tensor([[0.64, 4.0], [5.76, 4.0]]))
-    assert [row["rmse_filter"] for row in rows] == [1, 2, 3, 2]
-    joint = say("test", "11 demos", torch.ones(11, 2), torch.ones(11, 2))
-    assert [row["recording"] for row in joint] == ["11 demos"] * 2
-    real.COLUMNS.write(rows, tmp_path / "rows.csv")
-    assert len(real.COLUMNS.read(tmp_path / "rows.csv")) == 4
-    lines = [line for line in real.page(rows, []).splitlines() if line.startswith("| kitti")]
-    assert lines[0] == "| kitti | real | speed m/s | EnKS | 32 | 2.0000 | 1.6000 | 20.0% | yes |"
-    assert lines[1].endswith("| 0.0% | no |")

@@ -13,10 +13,3 @@ def test_dynamax_computes_the_same_beliefs(kind, batch):
     from benchmarks.speed.against_dynamax import same_beliefs
 
     same_beliefs(make_gaussian_filter(kind), kind, batch)
-
-
-def test_another_filter_is_noticed():
-    from benchmarks.speed.against_dynamax import same_beliefs
-
-    with pytest.raises(AssertionError, match="UKF, B=1: means"):
-        same_beliefs(make_gaussian_filter("EKF"), "UKF", 1)

@@ -3,16 +3,9 @@
 import math
 
 import pytest
-import torch
-from tensordict import TensorDict
 
 from benchmarks.ur5.demos import Roles
-from benchmarks.ur5.evaluation import blackout, errors, sensor_rows
-from benchmarks.ur5.motion import SIZE, with_rates
-from benchmarks.ur5.pictures import draw_all
-from benchmarks.ur5.readings import BLACK, Windows, blackouts, fail
-from benchmarks.ur5.sensors import SENSORS, TurnedWrist
-from benchmarks.ur5.tables import COLUMNS, markdown
+from benchmarks.ur5.evaluation import errors
 from tests.benchmarks.ur5_for_tests import states
 
 
@@ -23,39 +16,7 @@ def test_who_is_tested_is_not_trained_on():
         Roles({1, 2}, [2], [4], [5])
 
 
-def test_pictures_need_beliefs(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no beliefs in"):
-        next(draw_all(tmp_path))
-
-
 # ------------------------------------------------------------------------------------------------ failing cameras
-
-
-def test_conditions_hide_what_they_say():
-    readings = TensorDict({"observed": torch.ones(40, 100, 1, dtype=torch.bool)}, [40, 100])
-    black = fail(readings, "black20")["observed"].squeeze(-1)
-    assert (~black).sum(1).tolist() == [BLACK] * 40
-    first = black.int().argmin(1)
-    assert torch.equal(first, blackouts(40, 100))
-    assert all(not row[begin : begin + BLACK].any() for row, begin in zip(black, first, strict=True))
-    missing = fail(readings, "missing")["observed"]
-    assert abs(float(missing.float().mean()) - 0.7) < 0.025  # 3.5 standard errors of 4000 draws
-    assert bool(missing[:, 0].all())
-    assert bool(readings["observed"].all())
-
-
-def test_windows_begin_wrong_as_they_are_told_and_are_true_otherwise():
-    full = with_rates(states(3, 50))
-    entries = {"state": full[..., :10], "motion": full, "observed": torch.ones(3, 50, 1, dtype=torch.bool)}
-    std = torch.linspace(0.1, 1.0, SIZE)
-    windows = Windows([TensorDict(entries, [3, 50])], 8, std).sample(torch.Generator().manual_seed(0), 400)
-    wrong = (windows["start"] - windows["motion"]) / std
-    torch.testing.assert_close(wrong[:, 0], wrong[:, -1], atol=1e-4, rtol=0)
-    # 400 draws: the standard error of a standard deviation is 0.035.
-    torch.testing.assert_close(wrong[:, 0].std(0), torch.ones(SIZE), atol=0.15, rtol=0)
-    rates = windows["state"][:, 1:, :7] - windows["state"][:, :-1, :7]
-    torch.testing.assert_close(windows["motion"][:, 1:, 10:17], rates)
-    assert 0.6 < float(windows["observed"].float().mean()) < 0.95
 
 
 # --------------------------------------------------------------------------------------------------------- scores
@@ -74,48 +35,4 @@ def test_errors_are_means_of_absolute_ones_with_wrapped_angles_and_without_the_f
     assert scores["ee_mae_cm"] == pytest.approx(1.0, abs=1e-4)
 
 
-def test_a_blackout_is_scored_in_its_own_rows():
-    truth, begin = torch.zeros(1, 80, 10), torch.tensor([30])
-    mean, var = truth.clone(), torch.full((1, 80, 17), math.radians(1.0) ** 2)
-    mean[:, 30:50, :7] = math.radians(2.0)
-    var[:, 49] = math.radians(5.0) ** 2
-    var[:, 65] = math.radians(1.5) ** 2
-    scores = blackout(mean, var, truth, begin)
-    assert list(scores.values()) == pytest.approx([2.0, 1.0, 5.0, 1.5], abs=1e-4)
-
-
-def test_a_perfect_sensor_has_no_error_where_it_sees():
-    truth = states(2, 6)
-    truth[..., 5] = 3.0
-    samples = TurnedWrist()(truth).unsqueeze(-2) + 0.001 * torch.tensor([-1.0, 1.0])[:, None]
-    reading = TensorDict({"state": truth, "sensor": {"ensemble": samples}}, [2, 6])
-    reading["observed"] = torch.ones(2, 6, 1, dtype=torch.bool)
-    (row,) = sensor_rows(SENSORS["keypoints"], {"clean": reading}, {})
-    assert row["joint_mae_deg"] < 1e-3
-    assert row["ee_mae_cm"] < 1e-3
-    assert row["coverage90"] == 1.0
-
-
 # ---------------------------------------------------------------------------------------------------------- tables
-
-
-def test_the_table_keeps_what_it_was_given(tmp_path):
-    scores = {"joint_mae_deg": 1.25, "ee_mae_cm": 0.25, "coverage90": 0.9, "ms_per_step": 2.0, "parameters": 7}
-    scores |= {f"J{i}_deg": 1.0 for i in range(1, 8)}
-    names = {"filter": "denkf", "sensor": "glimpse", "domain": "sim", "training": "sim", "seed": 0, "demos": 43}
-    rows = [{**names, **scores, "condition": c, "ensemble_size": 32} for c in ("clean", "black20", "missing")]
-    rows[1] |= {"blackout_joint_mae_deg": 2.0, "std_before_deg": 1.0, "std_blind_deg": 3.0, "std_after_deg": 1.1}
-    rows.append({**names, **scores, "condition": "clean", "ensemble_size": 8, "joint_mae_deg": 4.5})
-    rows[-1]["validation_crps"] = 1.5
-    COLUMNS.write(rows, tmp_path / "table.csv")
-
-    def place(row):
-        return row["condition"], row["ensemble_size"]
-
-    assert sorted(COLUMNS.read(tmp_path / "table.csv"), key=place) == sorted(rows, key=place)
-    assert (tmp_path / "table.csv").read_text().splitlines()[0] == ",".join(COLUMNS.names)
-    text = markdown(rows, "header")
-    assert "| sim | glimpse | denkf | 1.25 / 0.25 / 90 % |" in text
-    assert "| 8 | 1.500 | 4.50 | 0.250 | 90 % | 2.00 |" in text
-    assert "| 32 |  | 1.25 | 0.250 | 90 % | 2.00 |" in text
-    assert "| sim | sim | glimpse | denkf | 2.00 | 1.00 | 3.00 | 1.10 |" in text

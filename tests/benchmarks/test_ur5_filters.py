@@ -1,23 +1,13 @@
 """Sensors, motion and filters of the UR5 study."""
 
-import copy
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
-from tensordict import TensorDict
 
-from benchmarks.common.arms import AtRest, WithBias
-from benchmarks.ur5.evaluation import errors
-from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
-from benchmarks.ur5.members import KINDS, recipe_of, thresholds_of
-from benchmarks.ur5.motion import ERRORS, FADING, SIZE, ArmMotion, BiasedReading, open_loop, with_rates
-from benchmarks.ur5.readings import read_head
-from benchmarks.ur5.recipes import FILTERS
-from benchmarks.ur5.recipes.denkf import localisation
-from benchmarks.ur5.sensors import MEMBERS, NEAR, SENSORS, NearForecast, TurnedWrist, side_of, wrist_of
-from benchmarks.ur5.training import run_filter
+from benchmarks.ur5.glimpse import project
+from benchmarks.ur5.motion import ArmMotion, open_loop, with_rates
+from benchmarks.ur5.sensors import TurnedWrist, side_of, wrist_of
 from tests.benchmarks.ur5_for_tests import FACTS, states
 from torch_denkf.applications.ur5.simulation.domains import Domain
 
@@ -31,16 +21,6 @@ def test_a_reading_of_the_turned_wrist_gives_the_state_back_from_any_angle_withi
     torch.testing.assert_close(wrist_of(reading, state[:, 5] + 1.5), state, atol=1e-5, rtol=0)
     other = wrist_of(reading, state[:, 5] + math.pi)  # half a turn on it looks the same
     torch.testing.assert_close(other[:, 5], state[:, 5] + math.pi, atol=1e-5, rtol=0)
-
-
-def test_a_radian_of_the_wrist_is_a_unit_of_its_reading():
-    state = states(3).double().requires_grad_()
-    reading = TurnedWrist()(state)
-    slope = torch.stack(
-        [torch.autograd.grad(reading[:, n].sum(), state, retain_graph=True)[0][:, 5] for n in (5, 6, 7, 8)]
-    )
-    torch.testing.assert_close(slope[:2].norm(dim=0), torch.ones(3, dtype=torch.double))
-    torch.testing.assert_close(slope[2:].norm(dim=0), torch.ones(3, dtype=torch.double))
 
 
 def test_a_clear_picture_decides_the_half_turn_and_an_open_one_leaves_it_to_the_forecast():
@@ -57,38 +37,7 @@ def test_a_clear_picture_decides_the_half_turn_and_an_open_one_leaves_it_to_the_
     torch.testing.assert_close(other, state[:, 5] + math.pi, atol=1e-5, rtol=0)
 
 
-def test_samples_that_leave_it_open_turn_to_the_side_of_the_forecast():
-    state = states(2)
-    state[:, 5] = torch.tensor([1.0, 1.0])
-    samples = TurnedWrist()(state).unsqueeze(1).repeat(1, 4, 1)
-    samples[..., 7:9] = 0.0
-    forecast = torch.zeros(2, 3, SIZE)
-    forecast[0, :, 5], forecast[1, :, 5] = torch.tensor([0.5, 1.0, 1.2]), torch.tensor([1.0, 4.0, 4.2])
-    td = TensorDict({"sensor": {"ensemble": samples}, "forecast": {"ensemble": forecast}}, [2])
-    near = NearForecast(SENSORS["keypoints"])(td)[NEAR]
-    expected = torch.tensor([1.0, 1.0 + math.pi])
-    torch.testing.assert_close(near[..., 5], expected.unsqueeze(-1).expand(2, 4), atol=1e-5, rtol=0)
-
-
-def test_a_factor_scales_the_samples_around_their_mean():
-    near = NearForecast(SENSORS["paper"])
-    samples = states(2, 5)
-    td = TensorDict({"sensor": {"ensemble": samples}, "forecast": {"ensemble": torch.zeros(2, 3, SIZE)}}, [2])
-    near.factor = 1.5
-    out = near(td)[NEAR]
-    torch.testing.assert_close(out.mean(1), samples.mean(1))
-    torch.testing.assert_close(out.std(1), 1.5 * samples.std(1))
-
-
 # ------------------------------------------------------------------------------------------------------ the motion
-
-
-def test_rates_are_the_joints_changes_and_an_episode_begins_at_rest():
-    sequence = states(2, 5)
-    full = with_rates(sequence)
-    torch.testing.assert_close(full[:, 1:, 10:17], sequence[:, 1:, :7] - sequence[:, :-1, :7])
-    torch.testing.assert_close(full[:, 1:, 17:], full[:, 1:, 10:17] - full[:, :-1, 10:17])
-    assert float(full[:, 0, 10:].abs().max()) == 0.0
 
 
 def test_the_place_follows_the_joints_and_keeps_a_share_of_its_difference():
@@ -102,17 +51,6 @@ def test_the_place_follows_the_joints_and_keeps_a_share_of_its_difference():
     torch.testing.assert_close(moved[:, 17:], moved[:, 10:17] - state[:, 10:17])
     expected = motion.place(moved[:, :7]) + 0.5 * (state[:, 7:10] - motion.place(state[:, :7]))
     torch.testing.assert_close(moved[:, 7:10], expected)
-
-
-def test_noise_of_an_acceleration_moves_its_joint_and_its_rate_in_the_same_step():
-    torch.manual_seed(0)
-    recipe = FILTERS["dekf"](
-        SENSORS["keypoints"].build(FACTS, 4), SENSORS["keypoints"], FACTS, ArmMotion(FACTS), ERRORS
-    )
-    matrix = recipe.modules()["transition"].process_noise.matrix
-    column = matrix[:, 3 + 2]  # the place comes first, then J1 to J7: a3
-    assert column.nonzero().flatten().tolist() == [2, 12, 19]
-    assert matrix[:, 0].nonzero().flatten().tolist() == [7]  # x
 
 
 def test_open_loop_errors_are_those_of_a_constant_acceleration():
@@ -129,16 +67,6 @@ def test_open_loop_errors_are_those_of_a_constant_acceleration():
         assert found[f"after_{n}_deg"] == pytest.approx(float(error), rel=1e-6)
 
 
-def test_biases_fade_and_add_to_the_reading():
-    motion = ArmMotion(FACTS)
-    network = WithBias(motion)
-    state = torch.cat([states(3), torch.zeros(3, 14), torch.ones(3, 10)], -1)
-    moved = network(state)
-    torch.testing.assert_close(moved[:, :SIZE], motion(state[:, :SIZE]))
-    torch.testing.assert_close(moved[:, SIZE:], torch.full((3, 10), FADING))
-    torch.testing.assert_close(BiasedReading()(state), state[:, :10] + 1)
-
-
 # ------------------------------------------------------------------------------------------------ sensors, filters
 
 
@@ -153,115 +81,3 @@ def test_places_project_as_a_pinhole_has_it():
     # Another camera, from above: its target is in the middle, too.
     above = Domain(camera=(-0.1, 0.02, 2.0), target=(-0.2, 0.0, 0.1), field=40.0)
     assert project(torch.tensor([-0.2, 0.0, 0.1]), above).abs().max() < 1e-6
-
-
-def test_a_second_look_is_aimed_at_where_the_coarse_code_says():
-    torch.manual_seed(0)
-    trunk = GlimpseTrunk(torch.nn.Flatten(), 2, 12, 16)
-    images = torch.rand(300, 3, 2, 2)
-    # Places whose projections are linear in the picture.
-    places = torch.tensor([-0.18, 0.02, 0.27]) + torch.tensor([0.0, 0.01, 0.0]) * images[:, :1, 0, 0]
-    assert trunk.aim(images, project(places)) < 0.01
-    assert trunk(torch.rand(2, 3, 2, 2)).shape == (2, 16)
-    assert keypoint_trunk()(torch.rand(2, 3, 32, 32)).shape == (2, 256)
-
-
-def test_the_first_look_gets_a_smaller_picture():
-    trunk, pictures = keypoint_trunk().eval(), torch.rand(2, 3, 224, 224)
-    smaller = torch.nn.functional.interpolate(pictures, (112, 112), mode="area")
-    torch.testing.assert_close(trunk(pictures), trunk(smaller))
-
-
-@pytest.fixture(scope="module")
-def readings():
-    """Three demos of an arm at a constant rate, read without bias: a filter must follow."""
-    torch.manual_seed(0)
-    motion = ArmMotion(FACTS)
-    motion.damping.data.fill_(12.0)  # rates last
-    state = torch.cat([states(3), 0.01 * torch.randn(3, 7), torch.zeros(3, 7)], -1)
-    path = [state]
-    with torch.no_grad():
-        state[:, 7:10] = motion.place(state[:, :7])
-        for _ in range(39):
-            path.append(motion(path[-1]))
-    path = torch.stack(path, 1)
-    sensor = SENSORS["keypoints"].build(FACTS, 32)
-    samples = TurnedWrist()(path[..., :10]).unsqueeze(-2) + 0.01 * torch.randn(3, 40, MEMBERS, 13)
-    encoding = torch.zeros(3, 40, 64)
-    td = TensorDict({"state": path[..., :10], "motion": path, "action": path[..., :7]}, [3, 40])
-    td["sensor"] = TensorDict({"ensemble": samples, "encoding": encoding}, [3, 40])
-    td["observed"] = torch.ones(3, 40, 1, dtype=torch.bool)
-    return sensor, motion, td
-
-
-@pytest.mark.parametrize("name", sorted(FILTERS))
-def test_every_filter_carries_the_table_first_and_follows_a_sensor_that_is_right(name, readings):
-    sensor, motion, td = readings
-    torch.manual_seed(0)
-    recipe = FILTERS[name](copy.deepcopy(sensor), SENSORS["keypoints"], FACTS, motion, ERRORS)
-    model = recipe.build()
-    out = run_filter(recipe, model, td)
-    assert out["belief", "mean"].shape[-1] >= 10
-    assert torch.isfinite(out["belief", "mean"]).all()
-    scores = errors(out["belief", "mean"][..., :10], td["state"])
-    assert scores["joint_mae_deg"] < 2.0, scores  # the start is 1 to 3 degrees off, in rates, too
-    wide = copy.deepcopy(model)
-    recipe.set_inflation(wide, 1.5)
-    tempered = run_filter(recipe, wide, td)
-    spread = [float(each["belief", "var"][:, 10:, :10].log().mean()) for each in (out, tempered)]
-    assert spread[1] > spread[0]
-
-
-def test_localisation_keeps_covariances_and_the_gripper_apart():
-    state, reading = localisation(34)
-    assert torch.linalg.eigvalsh(reading).min() > -1e-6  # its product with a covariance is one (Schur)
-    assert torch.equal(state[24:], reading)  # biases
-    assert torch.equal(state[:7], state[10:17])  # rates go with their joints
-    assert torch.equal(state[:7], state[17:24])  # and so do accelerations
-    gripper = [6, 16, 23, 30]
-    arm = [index for index in range(34) if index not in gripper]
-    assert (state[arm, 6] == 0).all()
-    assert (state[gripper][:, [0, 1, 2, 3, 4, 5, 7, 8, 9]] == 0).all()
-    assert (state[gripper, 6] == 1).all()
-    assert torch.equal(localisation(24)[0], state[:24])
-
-
-def test_each_localisation_is_what_the_page_calls_it():
-    def made(name, size):
-        preset = SENSORS["keypoints"]
-        return FILTERS[name](preset.build(FACTS, 4), preset, FACTS, ArmMotion(FACTS), ERRORS, size)
-
-    found = {}
-    for kind in KINDS:
-        thresholds = thresholds_of(kind, 8)
-        analysis = recipe_of(SimpleNamespace(recipe=made), kind, thresholds[-1], 8).modules()["analysis"]
-        found[kind] = (thresholds, analysis.state_taper is not None, analysis.significance)
-    able = [1.0, 1.5, 2.0]  # 3 standard deviations are more than 8 members can show
-    assert found == {
-        "none": ([None], False, None),
-        "factors": ([None], True, None),
-        "significance": (able, False, 2.0),
-        "both": (able, True, 2.0),
-    }
-
-
-def test_a_head_on_features_is_the_sensor_on_pictures():
-    torch.manual_seed(0)
-    sensor = SENSORS["glimpse"].build(FACTS, 5).eval()
-    pixels = torch.rand(2, 3, 32, 32)
-    codes = TensorDict({"code": sensor.module["trunk"](sensor._prepare(pixels))}, [2])
-    sensor.module["head"].sample = False
-    whole = sensor(TensorDict({"pixels": pixels}, [2]))
-    head = sensor.module["head"].forward(codes["code"], sample=False)
-    torch.testing.assert_close(whole["sensor", "ensemble"][:, 0], sensor.loc + sensor.scale * head)
-    sensor.module["head"].sample = True
-    assert read_head(sensor, codes, 7)["sensor", "ensemble"].shape == (2, 7, 13)
-
-
-def test_a_belief_at_rest_is_padded():
-    from torch_denkf.modules import AroundState
-
-    initial = AtRest(AroundState(torch.zeros(27), ensemble_size=3), 27, 10)
-    state = states(2)
-    belief = initial(TensorDict({"state": state}, [2]))["belief", "mean"]
-    torch.testing.assert_close(belief, torch.cat([state, torch.zeros(2, 17)], -1))

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from tests.envs.opengl import needs_opengl
 
@@ -10,7 +9,7 @@ pytest.importorskip("cv2")
 needs_opengl()
 
 from benchmarks.ur5 import laboratory  # noqa: E402
-from benchmarks.ur5.laboratory import Drawn, Pasted, colours, find_camera, foreground, look_of, without_arm  # noqa: E402
+from benchmarks.ur5.laboratory import Drawn, find_camera, look_of  # noqa: E402
 
 TRUE = np.array([1.36, 0.06, 0.88, -0.17, 0.01, 0.26, 0.02, 34.0, 0.0])
 GAIN, OFFSET = np.array([0.6, 0.5, 0.4]), np.array([30.0, 25.0, 20.0])
@@ -29,12 +28,7 @@ def seen():
     drawn.close()
 
 
-def test_what_covers_few_frames_is_not_behind(seen):
-    frames, _, stripes = seen
-    corner = (slice(0, 30), slice(0, 30))  # where no arm was
-    assert np.abs(without_arm(frames)[corner] - stripes[corner]).max() <= 0.5
-
-
+@pytest.mark.slow
 def test_the_camera_is_found(seen):
     frames, joints, _ = seen
     found, share = find_camera(frames, joints, ((20, 4.0, 5), (30, 1.5, 5)))
@@ -48,32 +42,3 @@ def test_the_camera_is_found(seen):
     true, near, before = (silhouettes(look) for look in (look_of(TRUE), found, laboratory.SIM))
     drawn.close()
     assert np.abs(near - true).sum() < 0.25 * np.abs(before - true).sum()
-
-
-def test_colours_are_those_that_the_frames_were_painted_with(seen):
-    frames, joints, _ = seen
-    drawn = Drawn(SIDE, look_of(TRUE))
-    gain, offset = colours(drawn, frames.astype(np.float32), joints)
-    drawn.close()
-    assert np.abs(gain - GAIN).max() < 0.02
-    assert np.abs(offset - OFFSET).max() < 2
-
-
-def test_a_brighter_frame_without_an_arm_has_no_foreground(seen):
-    _, _, stripes = seen
-    assert foreground(1.1 * stripes[None], stripes).sum() == 0
-
-
-def test_pasted_arms_stand_where_the_frames_have_them(seen, monkeypatch):
-    frames, joints, stripes = seen
-    monkeypatch.setattr(laboratory, "find_camera", lambda *_: (look_of(TRUE), 0.0))
-    states = torch.cat([torch.from_numpy(joints).float(), torch.zeros(len(joints), 3)], -1)
-    paste = Pasted(torch.from_numpy(frames.transpose(0, 3, 1, 2)), states)
-    monkeypatch.setattr(laboratory, "HELD", 0.0)
-    pictures = paste(states[:4]).permute(0, 2, 3, 1).numpy().astype(float)
-    paste.close()
-    assert pictures.shape == frames[:4].shape
-    shown = foreground(frames[:4].astype(float), stripes) == 1
-    error = np.abs(pictures - frames[:4]).mean(-1)
-    # Other light, other shades: but nearer to the frame's arm than what is behind it is.
-    assert error[shown].mean() < 0.6 * np.abs(stripes - frames[:4]).mean(-1)[shown].mean()

@@ -27,14 +27,6 @@ def test_variances_settle_where_the_riccati_equation_has_them():
         torch.testing.assert_close(variance[0, -1, number], cov[0, 0], rtol=1e-3, atol=0)
 
 
-def test_a_rate_that_lasts_moves_the_number_and_noise_moves_both():
-    filter = LinearFilter(2, 0, ERROR, CHANGE)
-    move, noise = filter.matrices()
-    damping = torch.sigmoid(torch.tensor(4.0))
-    torch.testing.assert_close(move[0], torch.tensor([[1.0, damping], [0.0, damping]]))
-    torch.testing.assert_close(noise[1], torch.full((2, 2), 0.09))
-
-
 @pytest.mark.slow
 def test_a_fitted_filter_is_as_good_as_the_one_that_knows_the_system(monkeypatch):
     monkeypatch.setattr("benchmarks.ur5.limits.LENGTH", 60)

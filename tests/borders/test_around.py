@@ -4,7 +4,6 @@ import hashlib
 import json
 import math
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -14,20 +13,16 @@ from benchmarks.common.lorenz96 import lorenz96_step
 from tests.borders.test_constructors import NAN, refuses
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.particle_for_tests import bootstrap
-from torch_denkf.applications.car import track
 from torch_denkf.applications.car.kitti.gaps import bridge_gaps
-from torch_denkf.applications.car.modules.member_gain import MemberGain
 from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
 from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.applications.car.odometry.training import train_car_filter
 from torch_denkf.applications.reacher import reacher
-from torch_denkf.data import Episode, EpisodeReplay
 from torch_denkf.deployment.folder import WEIGHTS, described, load_folder, save_folder
-from torch_denkf.envs import ReplayEnv
 from torch_denkf.modules import LearnedTransition, NoisyTransition
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, TransitionLoss
 from torch_denkf.pretrained import from_pretrained, save_pretrained
-from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
+from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
 
 INF = math.inf
 
@@ -116,56 +111,6 @@ def test_refused(case):
 @pytest.mark.parametrize("case", WRONG_TYPES.values(), ids=WRONG_TYPES)
 def test_wrong_types(case):
     refuses(*case, error=TypeError)
-
-
-@pytest.mark.parametrize("make", [RTSSmoother, EnRTS, EnKS, ParticleSmoother])
-def test_smoothers_of_another_belief(make):
-    other = linear_denkf("etkf") if make is RTSSmoother else linear_kalman()
-    with pytest.raises(TypeError, match=f"{make.__name__} takes a filter with"):
-        make(other)
-
-
-@pytest.mark.parametrize("shape", [(2, 3), (2,)])
-@pytest.mark.parametrize("make", [linear_kalman, linear_denkf])
-def test_an_age_of_another_shape(make, shape):
-    filter = FixedLag(make(), 2)
-    row = filter.initialise(TensorDict({"observation": torch.zeros(2, 2)}, [2]))
-    row["smoothed", "age"] = torch.zeros(shape, dtype=torch.int64)
-    with pytest.raises(ValueError, match="age of what is smoothed must be"):
-        filter.step(row)
-
-
-def test_samples_of_another_size_name_the_standard_deviations():
-    with pytest.raises(ValueError, match="entries of std"):
-        MemberGain([0.1] * 3, ensemble_size=8)(TensorDict({("sensor", "ensemble"): torch.zeros(8, 2)}))
-
-
-FRAME = np.zeros((24, 72, 3), np.uint8)
-TRACKED = {
-    "text": ({"frames": ["a", "b"]}, "frame 0 is a str"),
-    "text, looked at for black": ({"frames": [FRAME, "b"], "black_level": 3}, "frame 1 is a str"),
-    "times": ({"times": ["a", "b", "c"]}, "times are those of the frames"),
-    "a day": (
-        {"frames": [FRAME] * 4, "times": [0.0, 0.1, 86400.0, 86400.1], "black_level": None},
-        "steps without a frame before frame 2.*Its time is 86400",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", TRACKED.values(), ids=TRACKED)
-def test_track(case):
-    given, match = case
-    with pytest.raises(ValueError, match=match):
-        list(track(car_filter(ensemble_size=4), **{"frames": [FRAME] * 3, "calibration": (42, 42, 35, 11), **given}))
-
-
-@pytest.mark.parametrize(("asked", "error"), [("z", KeyError), (7, KeyError), (-1, KeyError), (1.5, TypeError)])
-def test_episodes(asked, error):
-    step = torch.arange(10).unsqueeze(-1)
-    rows = TensorDict({"step": step, "time": 0.1 * step, "state": torch.rand(10, 2)}, [10])
-    data = EpisodeReplay(rows, [Episode("a", 0, 10)], for_tests=lambda episode: False)
-    with pytest.raises(error, match=f"episodes= .*{asked!r}|{asked!r}.*episodes= among"):
-        ReplayEnv(data, episodes=[asked])
 
 
 @pytest.mark.parametrize("change", [lambda value: value + INF, lambda value: value.long(), lambda value: value * NAN])

@@ -53,28 +53,3 @@ def test_a_path_that_is_no_text(tmp_path, byte, capsys):
     file.write_bytes(",".join(PATH_COLUMNS).encode() + b"\n" + row().encode() + byte + b"\n")
     assert main(["plot", str(file)]) == 2
     assert f"error: {file}:2 is no text in UTF-8 (byte 0x{byte[0]:02x})" in capsys.readouterr().err
-
-
-def test_pictures_into_a_file(tmp_path, capsys):
-    pytest.importorskip("matplotlib")
-    file = tmp_path / "path.csv"
-    file.write_text("\n".join([",".join(PATH_COLUMNS), *(row(frame=k, time_s=k, x_m=k) for k in range(3))]) + "\n")
-    for out in (file, file / "below"):
-        assert main(["plot", str(file), "--out", str(out)]) == 2
-        assert f"error: [Errno {20 if out.name == 'below' else 17}] cannot write {out}/path.png" in (
-            capsys.readouterr().err
-        )
-
-
-def test_demos_that_are_not_listed(tmp_path, capsys):
-    folder = tmp_path / "demos"
-    words = ["collect-ur5", "--out", str(folder)]
-    assert main([*words, "--demos", "2", "--no-pixels", "--max-steps", "4", "--processes", "1"]) == 0
-    assert main([*words, "--verify"]) == 0
-    lines = (folder / "demos.jsonl").read_bytes()
-    half = lines.index(b"\n") + 1
-    for kept in (lines[:half], lines[: half + 30], lines[:half] + bytes(half)):
-        (folder / "demos.jsonl").write_bytes(kept)
-        capsys.readouterr()
-        assert main([*words, "--verify"]) == 1
-        assert "demo-000001.npz is not listed in demos.jsonl; the collecting command" in capsys.readouterr().err

@@ -5,18 +5,14 @@ import re
 import pytest
 import torch
 from tensordict import TensorDict
-from torch._subclasses.fake_tensor import FakeTensorMode
 from torchrl.envs import ExcludeTransform, TransformedEnv
 
 from tests.filters.factories import M, S, linear_denkf, linear_kalman, linear_system, toy_denkf
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf import RejectReadings
-from torch_denkf._checks import has_values
 from torch_denkf.baselines import LSTMFilter
-from torch_denkf.deployment import export_step, load_step
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter, ParticleFilter
-from torch_denkf.functional import soft_resample, systematic_resample
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
@@ -158,21 +154,6 @@ def test_a_sequence_is_that_of_a_mask(name, masked, value):
 
 
 @ALL
-def test_steps_are_those_of_a_mask(name):
-    expected, spoiled, count = frames_of(name, 3, 12)
-    outs, filter = [], make(name)
-    for frames, prepare in ((expected, lambda td: td), (spoiled, rejecting(name))):
-        torch.manual_seed(0)
-        td, out = filter.initialise(prepare(frames[:, 0].copy())), []
-        for t in range(1, 12):
-            td = filter.step(prepare(td.update(frames[:, t])))
-            out.append(td.clone())
-        outs.append(torch.stack(out, 1))
-    same(filter, outs[1], outs[0])
-    assert outs[1][REJECTED].equal(count[:, 1:])
-
-
-@ALL
 @pytest.mark.parametrize("value", BAD)
 def test_a_bad_reading_raises_with_the_key(name, value):
     """In front of the filter; by itself it raises where its new belief is not finite."""
@@ -207,38 +188,6 @@ def test_readings_that_no_step_uses_may_be_anything(name):
     assert td["belief", "mean"].isfinite().all()
     with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
         env.step(env.rand_action(td))
-
-
-@pytest.mark.parametrize("value", BAD)
-def test_a_transform_that_raises(value):
-    env = TransformedEnv(base_env(batch_size=[2]), ExcludeTransform("observed"))
-    env.append_transform(RejectReadings({"observation": "observed"}, on_bad="raise"))
-    env.append_transform(DEnKFTransform(linear_kalman()))
-    td = env.rand_action(env.reset())
-    emit = env.base_env._emit
-    env.base_env._emit = lambda *args: emit(*args).update({"observation": torch.tensor([[0.0, 0.0], [value, 0.0]])})
-    with pytest.raises(ValueError, match=r"^'observation' is .* at \[1, 0\], and a reading must be"):
-        env.step(td)
-
-
-def test_the_transform_of_a_package(tmp_path):
-    """Behind what rejects readings; by itself it raises."""
-    frame = TensorDict({"observation": torch.zeros(2, 2), "observed": torch.ones(2, 1, dtype=torch.bool)}, [2])
-    step = load_step(export_step(linear_kalman(), frame, tmp_path / "step.pt2", compiled=False))
-
-    def rollout(*transforms, **options):
-        env = TransformedEnv(base_env(missing=0.4, batch_size=[2], seed=1), ExcludeTransform("observed"))
-        for transform in transforms:
-            env.append_transform(transform)
-        env.append_transform(DEnKFTransform(linear_kalman(), **options))
-        env.set_seed(1)
-        return env.rollout(9)["next", "belief", "mean"]
-
-    expected = rollout(RejectReadings({"observation": "observed"}))
-    torch.testing.assert_close(rollout(RejectReadings({"observation": "observed"}), packaged=step), expected)
-    assert expected.isfinite().all()
-    with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
-        rollout(packaged=step)
 
 
 def test_a_step_is_exact_up_to_the_limit():
@@ -316,23 +265,6 @@ def test_a_reading_that_no_particle_can_explain():
     assert out["info", "log_likelihood"].item() == -torch.inf
 
 
-@pytest.mark.parametrize("resample", [systematic_resample, soft_resample])
-def test_weights_that_are_not_a_number_stay_so(resample):
-    """And no index is out of bounds; the other rows are as they were."""
-    generator = torch.Generator().manual_seed(0)
-    points, weights = (
-        torch.randn(2, 16, 2, generator=generator),
-        torch.randn(2, 16, generator=generator).log_softmax(-1),
-    )
-    uniform = torch.rand(2, 1, generator=generator)
-    expected = resample(points, weights, uniform)
-    weights[0, 3] = torch.nan
-    moved, after = resample(points, weights, uniform)
-    assert after[0].isnan().all()
-    assert moved[1].equal(expected[0][1])
-    assert after[1].equal(expected[1][1])
-
-
 def test_only_what_nobody_can_look_at_is_passed_over():
     """Under vmap and of tensors without values nothing is said."""
     filter, check = linear_denkf(), RejectReadings({"observation": "observed"}, on_bad="raise")
@@ -349,14 +281,3 @@ def test_only_what_nobody_can_look_at_is_passed_over():
     for run in (means, torch.func.jacrev(means)):
         with pytest.raises(ValueError, match="observation"):
             run(readings[1])
-
-
-def test_whether_values_can_be_looked_at():
-    seen = []
-    torch.vmap(lambda row: seen.append(has_values(row)) or row)(torch.zeros(2))
-    torch.func.grad(lambda row: seen.append(has_values(row)) or row.sum())(torch.zeros(2))
-    torch.vmap(torch.func.grad(lambda row: seen.append(has_values(row)) or row.sum()))(torch.zeros(2, 2))
-    with FakeTensorMode():
-        seen.append(has_values(torch.zeros(2)))
-    seen += [has_values(torch.zeros(2, device="meta")), has_values(torch.zeros(2))]
-    assert seen == [False, True, False, False, False, True]

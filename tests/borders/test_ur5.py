@@ -35,14 +35,6 @@ def test_numbers_that_are_not_finite(tmp_path, key, value):
     refuses(tmp_path, "demo-000001.npz", f"'{key}'", "row 3", str(value))
 
 
-@pytest.mark.parametrize("steps", [[3, 3, 4], [-1, 2, 3], [0, 1, 8]])
-def test_pictures_of_rows_that_are_not_there(tmp_path, steps):
-    demo = make_demo(0, 8)
-    demo = replace(demo, steps=np.array(steps, np.int32), pixels=np.zeros((3, 3, 12, 16), np.uint8))
-    write_folder(tmp_path, [demo])
-    refuses(tmp_path, "demo-000000.npz", "'steps'", str(steps[0]))
-
-
 LINES = {
     "cut": ('{"demo": 1, "fi', f"{MANIFEST}:2", '{"demo": 1, "fi'),
     "empty": ("", f"{MANIFEST}:2", "''"),
@@ -70,12 +62,6 @@ def test_damaged_lines(root, case):
     refuses(root, *words)
     with pytest.warns(UserWarning, match=rf"{MANIFEST}:2 is damaged .*; its demo is made again"):
         assert list(read_manifest(root, skip_damaged=True)) == [0, 2, 3]
-
-
-def test_text_that_is_no_utf8(root):
-    (root / MANIFEST).write_bytes((root / MANIFEST).read_bytes() + b"\xff\n")
-    with pytest.raises(ValueError, match=rf"{MANIFEST}:5 is no text in UTF-8 \(byte 0xff\)"):
-        open_all(root)
 
 
 def test_a_last_line_that_is_being_written(root):

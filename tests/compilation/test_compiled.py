@@ -17,7 +17,6 @@ from tests.filters.factories import (
     toy_denkf,
     toy_frames,
 )
-from torch_denkf.compilation import need_compiler
 from torch_denkf.modules import ConstantNoise, LearnedObservation, StochasticMLP
 
 #: float32: a few roundings through eight steps; float64 likewise.
@@ -113,6 +112,7 @@ def test_what_changes_after_compiling_is_noticed(monkeypatch):
     assert means[-1].dtype == torch.double
 
 
+@pytest.mark.slow
 def test_a_new_filter_of_other_modules_or_options_compiles_its_own(float64):
     frames = toy_frames((2, 3), masks=0, resets=False)
     filter = toy_denkf().double().eval()
@@ -136,18 +136,6 @@ def test_a_new_filter_of_other_modules_or_options_compiles_its_own(float64):
     assert model.compiled is not compiled.compiled
     for other in means[1:]:
         assert not torch.allclose(other, means[0])
-
-
-def test_predictions_and_steps_without_a_reading_stay_eager(float64):
-    for make in (linear_denkf, linear_kalman):
-        eager, filter = make(), make().compile(backend="eager")
-        td = filter.initialise(TensorDict({"observation": torch.zeros(2)}))
-        predicted, left_out = filter.predict(td.copy()), filter.step(td.copy(), without=["observation"])
-        assert not filter.compiled._functions
-        expected = eager.predict(td.copy())["belief"]
-        for belief in (predicted["belief"], left_out["belief"]):
-            for key in ("mean", "var"):
-                assert belief[key].equal(expected[key])
 
 
 def test_a_policys_data_go_on_from_what_is_stored(float64):
@@ -188,58 +176,6 @@ def test_a_stochastic_analysis_of_a_users_own_compiles(float64):
         torch.testing.assert_close(out, outs[0], rtol=0, atol=1e-12)
 
 
-def test_a_first_call_that_resets_all_rows_is_compared_all_the_same():
-    """Looks at rows that go on: at a reset nothing of the transition shows, and one function serves all steps."""
-
-    def wrong_after_a_step(graph, example):
-        def run(*inputs):
-            (goes_on,) = (value for value in inputs if value.dtype == torch.bool)
-            off = goes_on.any().float()
-            return tuple(value + off if value.is_floating_point() else value for value in graph(*inputs))
-
-        return run
-
-    frames = TensorDict({"observation": torch.randn(2, 1, 2)}, [2, 1])
-    filter = linear_kalman().compile(chunk=1, backend=wrong_after_a_step)
-    with torch.no_grad(), pytest.raises(RuntimeError, match="compiled sequence is wrong"):
-        filter.sequence(frames)
-
-
-@pytest.mark.parametrize("batch", [1, 2])
-def test_one_graph_serves_all_chunks_lengths_and_first_elements(float64, batch):
-    graphs = []
-
-    def counted(graph, example):
-        graphs.append(graph)
-        return graph
-
-    eager, compiled = (toy_denkf().double().eval() for _ in range(2))
-    compiled.load_state_dict(eager.state_dict())
-    compiled.compile(chunk=3, backend=counted)
-    for length, resets in ((7, False), (4, True), (2, False), (9, True)):
-        frames = toy_frames((batch, length), masks=2, resets=resets)
-        eager.draw_noise(frames)
-        ours, theirs = (model.sequence(frames.copy()) for model in (compiled, eager))
-        assert_close(ours, theirs, eager.out_keys, torch.float64)
-        gradients = (
-            torch.autograd.grad(out["belief", "mean"].square().sum(), list(model.parameters()))
-            for out, model in ((ours, compiled), (theirs, eager))
-        )
-        for one, other in zip(*gradients, strict=True):
-            torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-11)
-    assert len(graphs) == 1
-
-
-def test_a_long_first_call_says_what_it_does(monkeypatch, caplog):
-    monkeypatch.setattr("torch_denkf.compilation.compiled.PATIENCE", 0.0)
-    frames = TensorDict({"observation": torch.randn(2, 3, 2)}, [2, 3])
-    filter = linear_kalman().compile(chunk=3, backend="eager")
-    for _ in range(2):
-        filter.sequence(frames.copy())
-    assert [record.message for record in caplog.records if "compiled sequence" in record.message]
-    assert len([record for record in caplog.records if record.name == "torch_denkf"]) == 1
-
-
 def test_a_compiled_step_draws_its_noise_outside_and_anew():
     filter = toy_denkf("perturbed").compile(chunk=1, backend="eager")
     td = filter.initialise(toy_frames((2,), masks=0, resets=False))
@@ -250,33 +186,3 @@ def test_a_compiled_step_draws_its_noise_outside_and_anew():
     assert means[0].equal(means[1])
     assert not means[0].equal(means[2])
     assert len(filter.compiled._functions) == 1
-
-
-def test_0_goes_back_to_eager():
-    filter = toy_denkf().compile(chunk=3, backend="eager")
-    assert filter.compile(chunk=0).compiled is None
-    with pytest.raises(ValueError, match="number of steps"):
-        filter.compile(chunk=-1)
-
-
-def test_pickles_without_what_was_compiled():
-    filter = toy_denkf().compile(chunk=3, backend="eager")
-    filter.compiled._functions["something"] = lambda: None
-    other = pickle.loads(pickle.dumps(filter))
-    assert other.compiled.chunk == 3
-    assert other.compiled._functions == {}
-
-
-def test_without_a_compiler_it_says_what_to_install(monkeypatch):
-    from torch._inductor import cpp_builder
-    from torch._inductor.exc import InvalidCxxCompiler
-
-    def none():
-        raise InvalidCxxCompiler
-
-    monkeypatch.setattr(cpp_builder, "get_cpp_compiler", none)
-    with pytest.raises(RuntimeError, match="apt install g"):
-        toy_denkf().compile()
-    assert toy_denkf().compile(backend="eager").compiled is not None  # dynamo alone needs none
-    with pytest.raises(RuntimeError, match="C\\+\\+ compiler"):
-        need_compiler()

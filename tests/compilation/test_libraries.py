@@ -12,10 +12,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from tests.conftest import COMPILED
-from tests.filters.factories import has_compiler, linear_kalman
+from tests.filters.factories import has_compiler
 from torch_denkf.compilation.libraries import clear_damaged_libraries, is_whole
 from torch_denkf.compilation.lock import locked
 
@@ -78,15 +77,6 @@ print(*sorted(loaded() - before))
 
 
 needs_compiler = pytest.mark.skipif(not has_compiler(), reason="torch.compile needs a C++ compiler")
-
-
-@needs_compiler
-def test_half_libraries_go_before_a_filter_is_compiled(cache, monkeypatch):
-    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(cache))
-    monkeypatch.setattr(torch, "compile", lambda function, **options: function)
-    filter = linear_kalman().compile()
-    filter.step(filter.initialise(TensorDict({"observation": torch.zeros(2)})))
-    assert [path.name for path in (cache / "ab").iterdir()] == ["cabwhole.so"]
 
 
 @needs_compiler

@@ -66,15 +66,6 @@ def test_small_tensors_go_as_one_and_gradients_stay(dtype):
         torch.testing.assert_close(value, other, rtol=tolerance, atol=tolerance)
 
 
-def test_large_tensors_stay_apart(monkeypatch):
-    monkeypatch.setattr(_partition, "LARGE", 4 * 5 * 4)
-    gradients, saved = run(compiled(steps, FewSavedTensors()), (4, 5), torch.float32)
-    assert sum(shape == (4, 5) for shape in saved) >= 6
-    assert max(shape[0] for shape in saved) == 5
-    for value, eager in zip(gradients, run(steps, (4, 5), torch.float32)[0], strict=True):
-        torch.testing.assert_close(value, eager, rtol=1e-5, atol=1e-5)
-
-
 def layers(x: torch.Tensor, first, bias, second, third) -> tuple[torch.Tensor, torch.Tensor]:
     """Five steps through a layer with bias and a second one; a third sees what the first one does."""
     outputs = []
@@ -117,19 +108,3 @@ def test_the_gradient_of_a_weight_is_one_product(monkeypatch, dtype, rows):
     tolerance = 1e-4 if dtype == torch.float32 else 1e-11  # of sums over 20,000 rows
     for value, eager in zip(gradients, run_layers(layers, dtype, rows), strict=True):
         torch.testing.assert_close(value, eager, rtol=tolerance, atol=tolerance * eager.abs().max().item())
-
-
-def test_a_weight_that_is_used_twice_in_a_step():
-    """Its gradient has two products with one g, that of the bias has g once."""
-
-    def shared(x, first, bias, second, third):
-        outputs = []
-        for _ in range(3):
-            x = x + torch.sin(torch.nn.functional.linear(x, first, bias) + third.sum() * x @ second @ first.mT)
-            outputs.append(x)
-        return x, outputs[1]
-
-    function = compiled(shared, FewSavedTensors())
-    expected = run_layers(shared, torch.float64, 3)
-    for value, eager in zip(run_layers(function, torch.float64, 3), expected, strict=True):
-        torch.testing.assert_close(value, eager, rtol=1e-11, atol=1e-11)

@@ -1,7 +1,6 @@
 """What tests of the data sets share: ways to ask for slices, what holds for them, and a bar that counts."""
 
 import numpy as np
-import pytest
 import torch
 from torchrl.data import SliceSampler, SliceSamplerWithoutReplacement
 
@@ -65,15 +64,6 @@ def check_indices(data):
             assert part[key].equal(rows[key][index]), key
 
 
-def check_nothing_is_deleted(data):
-    """The files are the user's."""
-    with pytest.raises(RuntimeError, match="by hand"):
-        data.delete()
-    with pytest.raises(RuntimeError):
-        data.extend(data[:2])
-    assert data.data_path == data.data_path_root == data.root
-
-
 def mean_brightness(rows):
     return rows.select("episode").set("mean", rows["pixels"].mean((-3, -2, -1)).unsqueeze(-1))
 
@@ -116,28 +106,3 @@ def check_slices(data, options, counter, keys):
         possible = {e.start + k for e in data.episodes for k in range(e.length - 5)}
         assert starts <= possible
         assert len(starts) > 0.75 * len(possible)  # of those that there are, most have turned up in 160 draws
-
-
-def counting_bars(monkeypatch):
-    """Puts a bar that counts in the place of tqdm's, and returns the list of those that appear."""
-    bars = []
-
-    class Bar:
-        def __init__(self, total, disable, delay, initial=0, **_):
-            self.total, self.n, self.closed = total, initial, False
-            assert delay >= 10  # silent without a terminal, unless it takes long
-            if disable:
-                return
-            bars.append(self)
-
-        def update(self, count):
-            self.n += count
-
-        def close(self, *_):
-            self.closed = True
-
-        __enter__ = lambda self: self  # noqa: E731
-        __exit__ = close
-
-    monkeypatch.setattr("torch_denkf.deployment.progress.tqdm", Bar)
-    return bars

@@ -19,7 +19,6 @@ import torch
 from tensordict import TensorDict
 
 from torch_denkf.cli.cache import Cache
-from torch_denkf.data import cache_entry
 from torch_denkf.data.cache import cached, entries_of, forget
 from torch_denkf.data.cache_entry import END, MANIFEST, CachedTensor, DamagedEntry, check_entry, is_entry, open_entry
 from torch_denkf.deployment.files import sweep
@@ -230,27 +229,6 @@ def test_every_byte_counts_for_the_whole_check(entry, capsys):
     assert Cache.main(["check", *words]) == 0
 
 
-@pytest.mark.parametrize("writable", [True, False])
-def test_a_copy_is_compared_as_a_whole_once(entry, monkeypatch, writable):
-    copy = entry.with_name(f"{NAME[:-1]}0")
-    shutil.copytree(entry, copy, copy_function=shutil.copyfile)  # other times of writing
-    if not writable:
-
-        def refuse(*_):
-            raise OSError(30, "Read-only file system")
-
-        monkeypatch.setattr(cache_entry, "_write_manifest", refuse)
-    summed, whole = [], cache_entry._whole
-    monkeypatch.setattr(cache_entry, "_whole", lambda stream: summed.append(Path(stream.name)) or whole(stream))
-    assert same(cached(copy, never), content())
-    assert sorted(summed) == sorted(copy.glob("*.bin"))
-    summed.clear()
-    assert same(cached(copy, never), content())
-    monkeypatch.setattr(cache_entry, "_COMPARED", {})  # as in another process
-    assert same(cached(copy, never), content())
-    assert len(summed) == (0 if writable else len(list(copy.glob("*.bin"))))
-
-
 def test_nothing_that_was_planted_is_executed(entry, tmp_path):
     """tensordict's own format may hold pickles; an entry of the cache that holds one is none."""
 
@@ -270,13 +248,6 @@ def test_nothing_that_was_planted_is_executed(entry, tmp_path):
     (entry / MANIFEST).unlink()
     assert same(cached(entry, content), content())
     assert set(os.listdir(tmp_path)) == {"cache"}
-
-
-def test_only_tensors_are_kept(tmp_path):
-    for value in ("text", torch.zeros(1, dtype=torch.complex64)):
-        with pytest.raises(TypeError, match="the cache holds tensors alone"):
-            cached(tmp_path / NAME, lambda value=value: TensorDict({"x": value}, []))
-    assert os.listdir(tmp_path) == []
 
 
 SLOW = """

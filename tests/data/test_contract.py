@@ -7,7 +7,7 @@ from torchrl.data import SliceSampler
 
 import torch_denkf
 import torch_denkf.data
-from tests.data.replay_for_tests import check_contract
+from tests.data.replay_for_tests import check_contract, check_slices, ways_to_slice
 from torch_denkf.applications.car import write_drives
 from torch_denkf.data import Episode, EpisodeReplay, LeRobotReplay
 from torch_denkf.data.episodes import hashed_share
@@ -42,6 +42,11 @@ def test_a_split_keeps_the_contract():
 # Samples --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("options", ways_to_slice(), ids=lambda options: " ".join(options))
+def test_slices_are_in_one_episode(options):
+    check_slices(make(5, **{"batch_size": 24, **options}), options, "step", ("state", "action", "time"))
+
+
 def test_user_transforms_see_slices():
     seen = []
     data = make(num_slices=3, slice_len=4, transform=lambda rows: seen.append(rows.shape) or rows)
@@ -66,13 +71,6 @@ def test_slices_that_may_be_shorter_stay_flat():
     assert set(masks.sum(-1).tolist()) <= {3, 4}
     spans = make(batch_size=8, sampler=SliceSampler(slice_len=4, span=True))
     assert spans.sample().batch_dims == 1
-
-
-def test_a_sampler_that_marks_no_ends():
-    data = make(batch_size=8, sampler=SliceSampler(num_slices=2, truncated_key=None, traj_key="episode"))
-    sample = data.sample()
-    assert (sample["state"][:, :, 1].diff(dim=1) == 1).all()
-    assert sample.shape == (2, 4)
 
 
 # Splits ---------------------------------------------------------------------------------------------------------------

@@ -31,13 +31,3 @@ def test_the_generator_alone_decides(options, length):
     assert (first.diff(dim=-1) == 1).all()  # slices of one episode each
     assert (first // 10 == first[:, :1] // 10).all()
     assert data.draw(torch.Generator().manual_seed(5)).shape == (4, 5)  # another length is for once
-
-
-def test_mistakes():
-    generator = torch.Generator()
-    with pytest.raises(ValueError, match="slices have 11 rows, but 3 episodes are shorter"):
-        numbered(num_slices=4, slice_len=5).draw(generator, 11)
-    with pytest.raises(ValueError, match="length is that of slices"):
-        numbered(batch_size=8).draw(generator, 4)
-    with pytest.raises(ValueError, match="leave it out"):
-        numbered(batch_size=8, prefetch=1).draw(generator)

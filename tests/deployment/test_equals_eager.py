@@ -110,33 +110,9 @@ def test_the_graph(name, tmp_path):
     assert_the_same(FILTERS[name](), tmp_path, compiled=False)
 
 
-@pytest.mark.parametrize("name", ["dEKF", "EKF of a known motion", "IEnKS"])
-def test_the_graph_in_double_precision(float64, name, tmp_path):
-    assert_the_same(FILTERS[name](), tmp_path, compiled=False)
-
-
-def test_the_graph_of_a_batch(tmp_path):
-    assert_the_same(learned_filter("EKF"), tmp_path, batch=(2,), compiled=False)
-
-
-def test_an_lstm_cell_is_taken_apart(tmp_path):
-    """Inductor compiles the whole cell to other numbers; the package of its parts is compared in the slow tests."""
-    export_step(lstm(), lstm().initialise(frames(4)[0]), tmp_path / "step.pt2", compiled=False)
-    graph = torch.export.load(tmp_path / "step.pt2").graph
-    called = {str(node.target) for node in graph.nodes if node.op == "call_function"}
-    assert "aten.sigmoid.default" in called
-    assert not [name for name in called if "lstm" in name]
-
-
 @needs_compiler
 @pytest.mark.parametrize(
     "name", ["EKF of a known motion", *(pytest.param(name, marks=pytest.mark.slow) for name in ("dEKF", "LSTMFilter"))]
 )
 def test_compiled(name, tmp_path):
     assert_the_same(FILTERS[name](), tmp_path)
-
-
-@needs_compiler
-@pytest.mark.slow
-def test_compiled_in_double_precision(float64, tmp_path):
-    assert_the_same(learned_filter("EKF"), tmp_path)

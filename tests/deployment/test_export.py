@@ -11,7 +11,7 @@ from torch import nn
 
 from torch_denkf.compilation import trace_below_autograd
 from torch_denkf.deployment import export, export_step, load_step
-from torch_denkf.filters import DEnKF, KalmanFilter
+from torch_denkf.filters import DEnKF
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, LearnedTransition, Select, StochasticMLP
 
 needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="no C++ compiler")
@@ -85,17 +85,6 @@ print(sorted(step.carry))
     assert done.stdout.strip() == "['belief.ensemble']"
 
 
-def test_what_does_not_fit_is_named(package):
-    step = load_step(package[2])
-    good = {name: package[1][tuple(name.split("."))] for name in step.inputs}
-    with pytest.raises(KeyError, match=r"needs 'reading' \[2\]"):
-        step({name: value for name, value in good.items() if name != "reading"})
-    with pytest.raises(ValueError, match=r"'reading' must be torch.float32 \[2\], got torch.float32 \[3\]"):
-        step({**good, "reading": torch.zeros(3)})
-    with pytest.raises(ValueError, match=r"'reading' must be torch\.float32"):
-        step({**good, "reading": torch.zeros(2, dtype=torch.float64)})
-
-
 def test_noise_drawn_inside_follows_the_seed_and_differs_from_step_to_step(tmp_path):
     filter = small_filter()
     example = TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)})
@@ -112,49 +101,6 @@ def test_noise_drawn_inside_follows_the_seed_and_differs_from_step_to_step(tmp_p
     assert first[1].equal(again[1])
     assert not first[0].equal(first[1])
     assert not first[0].equal(other[0])
-
-
-def test_a_batch_and_a_kalman_filter(tmp_path):
-    shift, noise = torch.tensor([[1.0, 0.1], [0.0, 1.0]]), 0.1 * torch.eye(2)
-    kf = KalmanFilter(
-        shift, torch.eye(2)[:1], process_noise_cov=noise, noise_cov=torch.eye(1), mean=torch.zeros(2), cov=torch.eye(2)
-    )
-    example = TensorDict({"observation": torch.randn(5, 1)}, [5])
-    step = load_step(export_step(kf, example, tmp_path / "kf.pt2", compiled=False))
-    belief = kf.initialise(example.copy())
-    out = step(
-        {
-            "observation": example["observation"],
-            "belief.mean": belief["belief", "mean"],
-            "belief.cov": belief["belief", "cov"],
-        }
-    )
-    expected = kf.step(belief.copy())
-    torch.testing.assert_close(out["belief.mean"], expected["belief", "mean"])
-    torch.testing.assert_close(out["belief.cov"], expected["belief", "cov"])
-
-
-def test_training_mode_is_left_as_it_was(tmp_path):
-    filter = small_filter().train()
-    export_step(
-        filter, TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)}), tmp_path / "a.pt2", compiled=False
-    )
-    assert filter.training
-
-
-def test_a_filter_in_training_is_exported_as_it_is_evaluated(tmp_path):
-    """A user's network with layers that depend on the mode: the package holds their deterministic forward."""
-    filter = small_filter()
-    filter = filter.with_modules(transition=LearnedTransition(nn.Sequential(nn.Dropout(0.5), nn.Linear(3, 3))))
-    example = TensorDict({"state": torch.ones(3), "reading": torch.zeros(2), "observed": torch.tensor([False])})
-    step = load_step(export_step(filter.train(), example, tmp_path / "a.pt2", compiled=False))
-    assert set(example.keys()) == {"state", "reading", "observed"}, "the example is left as it is"
-    row = filter.initialise(example.copy())
-    found = step({name: row[tuple(name.split("."))] for name in step.inputs})
-    assert set(step.outputs) == {f"belief.{name}" for name in ("ensemble", "mean", "var")}
-    expected = filter.eval().step(row)
-    for name in step.outputs:
-        torch.testing.assert_close(found[name], expected[tuple(name.split("."))])
 
 
 def test_errors(tmp_path, monkeypatch):
@@ -175,19 +121,6 @@ def test_errors(tmp_path, monkeypatch):
     torch.export.save(other, tmp_path / "other.pt2")
     with pytest.raises(ValueError, match="not one of export_step"):
         load_step(tmp_path / "other.pt2")
-
-
-def test_without_a_compiler_the_error_says_what_to_do(tmp_path, monkeypatch):
-    from torch._inductor import cpp_builder
-    from torch._inductor.exc import InvalidCxxCompiler
-
-    def none():
-        raise InvalidCxxCompiler
-
-    monkeypatch.setattr(cpp_builder, "get_cpp_compiler", none)
-    example = TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)})
-    with pytest.raises(RuntimeError, match=r"apt install g\+\+"):
-        export_step(small_filter(), example, tmp_path / "step.pt2")
 
 
 class Wrong(nn.Module):

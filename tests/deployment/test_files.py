@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from torch_denkf.compilation.lock import locked
-from torch_denkf.deployment.files import replacing, reserve, write_bytes, write_text
+from torch_denkf.deployment.files import replacing, write_bytes, write_text
 
 ROOT = Path(__file__).parents[2]
 
@@ -94,27 +94,6 @@ def test_links_stay_and_devices_are_written_to(tmp_path):
     assert not Path("/dev/null").is_file()
     with pytest.raises(IsADirectoryError, match=r"cannot write .*elsewhere: Is a directory .*choose another"):
         write_text(tmp_path / "elsewhere", "text")
-
-
-def test_errors_of_other_files_are_not_the_writers(tmp_path):
-    match = r"^\[Errno 2\] No such file or directory: '/nowhere'$"
-    with pytest.raises(FileNotFoundError, match=match), replacing(tmp_path / "a.txt"):
-        Path("/nowhere").read_text()
-    (tmp_path / "file").touch()
-    with pytest.raises(OSError, match=r"cannot write .*file/a.txt: .*; choose another folder"):
-        write_text(tmp_path / "file" / "a.txt", "")
-
-
-def test_space_is_reserved_where_the_file_system_does_not_know_how(tmp_path, monkeypatch):
-    def refuse(*_):
-        raise OSError(95, "not supported")
-
-    monkeypatch.setattr(os, "posix_fallocate", refuse)
-    with (tmp_path / "file").open("wb") as stream:
-        reserve(stream, 20_000_000)
-        stream.write(b"abc")
-    data = (tmp_path / "file").read_bytes()
-    assert (len(data), data[:4]) == (20_000_000, b"abc\0")
 
 
 def test_a_folder_is_one_process_s_alone(tmp_path):

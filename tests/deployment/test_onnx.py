@@ -9,12 +9,10 @@ import torch
 from tensordict import TensorDict
 
 from tests.deployment.test_equals_eager import bend, members, parts
-from tests.deployment.test_export import Wrong
 from tests.filters.factories import linear_kalman, toy_denkf, toy_frames
 from tests.filters.gaussian_for_tests import CONTROL, learned_filter, learned_frames, linear_frames
 from tests.filters.test_contract import fused, readings
-from torch_denkf.compilation import trace_below_autograd
-from torch_denkf.deployment import export, export_step, load_step, onnx_model
+from torch_denkf.deployment import export_step, load_step
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.modules import EnsembleAnalysis, LearnedTransition
 
@@ -116,29 +114,3 @@ def test_what_onnx_lacks_is_named(tmp_path):
     with pytest.raises(RuntimeError, match=r"aten\.randn_like.*process_noise"):
         export_step(restless, frame, path, format="onnx")
     assert not path.exists()
-
-
-def test_a_model_that_is_wrong_is_not_written(tmp_path, monkeypatch):
-    path, filter = tmp_path / "step.onnx", perturbed()
-    frame = TensorDict({"reading": torch.zeros(2)})
-    monkeypatch.setattr(export, "trace_below_autograd", lambda step, values: trace_below_autograd(Wrong(step), values))
-    with pytest.raises(RuntimeError, match=r'ONNX model is wrong: .*No file is written. Write format="pt2"'):
-        export_step(filter, frame, path, format="onnx")
-    assert not path.exists()
-
-
-def test_other_errors(tmp_path, monkeypatch):
-    frame, path = TensorDict({"observation": torch.zeros(1)}), tmp_path / "step.onnx"
-    with pytest.raises(ValueError, match=r"ends in \.onnx"):
-        export_step(one_number(), frame, tmp_path / "step.pt2", format="onnx")
-    with pytest.raises(ValueError, match='format is "pt2" or "onnx"'):
-        export_step(one_number(), frame, path, format="tflite")
-    path.write_bytes(b"no model")
-    with pytest.raises(ValueError, match=r"step\.onnx is no ONNX model, or it is damaged"):
-        load_step(path)
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ImportError, match=r"torch_denkf\[onnx\]"):
-        load_step(path)
-    monkeypatch.setattr(onnx_model, "find_spec", lambda name: None if name == "onnxscript" else 1)
-    with pytest.raises(ImportError, match=r"onnxscript.*torch_denkf\[onnx\]"):
-        export_step(one_number(), frame, path, format="onnx")

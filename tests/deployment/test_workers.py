@@ -64,7 +64,9 @@ def test_workers_of_a_killed_parent_end(tmp_path):
         time.sleep(0.05)
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=["killed", "interrupted"])
+@pytest.mark.parametrize(
+    "how", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)], ids=["killed", "interrupted"]
+)
 def test_workers_of_a_study_end_with_it(tmp_path, how):
     file, folder = tmp_path / "study.py", tmp_path / "begun"
     file.write_text(STUDY)

@@ -87,12 +87,6 @@ def test_the_distance_is_that_of_one_component(distance, warned):
     assert bool(said(filter, TensorDict({"reading": reading}, [1, STEPS]))) == warned
 
 
-def test_is_said_once():
-    filter = walk_filter([1e-3, 1e-3])
-    assert len(said(filter, walks())) == 1
-    assert not said(filter, walks())
-
-
 def test_a_wrong_start_and_outliers_are_forgiven():
     data = walks()
     data["reading"][:, : STEPS // 2 - 1] += 50.0  # as far off as a start could be

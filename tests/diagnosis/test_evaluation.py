@@ -5,7 +5,6 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.test_hidden_numbers import make
-from tests.functional.checks import assert_refused
 from torch_denkf.diagnosis import evaluate
 from torch_denkf.functional.manifolds import SE2, SO3, Euclidean, Product
 from torch_denkf.metrics import interval_coverage, nees, state_errors
@@ -108,13 +107,3 @@ def test_frames_are_filtered_first_and_smoothed_beliefs_are_scored_by_their_name
     assert smoothed.rmse.abs().max() < 1e-7
     assert smoothed.nees is None
     assert smoothed.coverage.tolist() == [1.0] * 3
-
-
-def test_wrong_calls_are_refused():
-    filter, data = make("etkf", SE2()), beliefs("etkf", SE2(), STD[:3], 12)
-    assert_refused(TypeError, "filter must be", evaluate, None, data)
-    assert_refused(KeyError, "'nothing'", evaluate, filter, data, "nothing")
-    assert_refused(KeyError, "smoothed", evaluate, filter, data, belief="smoothed")
-    assert_refused(ValueError, r"truth is \[\*B, T, N\]", evaluate, filter, data, data["state"][:, 1:])
-    assert_refused(ValueError, "nowhere known", evaluate, filter, data, NAN * data["state"])
-    assert_refused(ValueError, "12 members", evaluate, filter, data, level=0.95)

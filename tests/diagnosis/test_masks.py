@@ -10,7 +10,7 @@ from torchrl.envs import TransformedEnv
 from tests.filters.factories import Perturbed, linear_denkf, linear_kalman, linear_system
 from tests.filters.particle_for_tests import bootstrap
 from torch_denkf.envs import LinearGaussianEnv, MissingFrames
-from torch_denkf.filters import Filter, KalmanFilter
+from torch_denkf.filters import KalmanFilter
 from torch_denkf.transforms import DEnKFTransform
 
 
@@ -79,22 +79,6 @@ def test_no_false_alarm_where_the_mask_is_read(make):
         warnings.simplefilter("error")
         filter.sequence(readings(2, 3, observed=hidden(2, 3)))
         filter.step(filter.initialise(readings(observed=torch.tensor([False]))))
-
-
-@pytest.mark.parametrize("case", ["no mask", "nothing hidden", "another reads it"])
-def test_no_false_alarm_for_an_analysis_without_a_mask(case):
-    filter = with_analysis(Perturbed())
-    if case == "another reads it":
-        plain = linear_denkf("perturbed", noisy=True)
-        plain = plain.with_modules(analysis=linear_denkf("etkf")["analysis"])
-        second = Perturbed(reading="encoders", info="other")
-        second.in_keys[0] = ("belief", "ensemble")
-        filter = Filter({**dict(plain.module.items()), "second": second}, initial=plain.initial)
-    observed = {"no mask": None, "nothing hidden": torch.tensor([True])}.get(case, torch.tensor([False]))
-    td = filter.initialise(readings(observed=observed).set("encoders", torch.zeros(2)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        filter.step(td)
 
 
 # ------------------------------------------------------------------------------------------- masks of one reading

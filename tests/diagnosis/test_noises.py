@@ -138,12 +138,6 @@ def test_a_negative_covariance_that_was_given_is_named():
         filter.step(row)
 
 
-def test_without_check_finite_nothing_is_looked_at():
-    filter, frames = filter_and_frames("EKF", "R", "entry", "vector", [0.5, -1.0])
-    out = filter.with_options(check_finite=False).sequence(frames)
-    assert out["belief", "mean"][AT].isnan().all()
-
-
 # ------------------------------------------------------------------------------------------- causes of other numbers
 
 
@@ -172,13 +166,3 @@ def test_the_cause_is_the_input_and_not_the_motion(kind, what):
     with pytest.warns(UserWarning, match=r"NaN from row \[1, 1\] of the sequence on, because of .*" + message):
         out = filter.sequence(rows)
     assert out["belief", "mean"][0].isfinite().all()
-
-
-@pytest.mark.parametrize("kind", ["EKF", "etkf"])
-def test_a_belief_that_is_no_rotation_is_named(kind):
-    filter, rows = attitude(kind)
-    row = filter.initialise(rows[:, 0].copy()).update(rows[:, 1])
-    key = filter.carry_keys[0]
-    row[key] = torch.zeros_like(row[key])
-    with pytest.raises(ValueError, match=re.escape(f"{key!r}, which is no point of Product")):
-        filter.step(row)

@@ -1,7 +1,5 @@
 """Observers see each run of a filter before anything is written; they go with its copies."""
 
-import copy
-import pickle
 import warnings
 
 import pytest
@@ -12,7 +10,6 @@ from torchrl.envs import InitTracker, TransformedEnv
 from torchrl.modules import set_recurrent_mode
 
 from tests.filters.factories import Perturbed, linear_denkf, linear_kalman, linear_system
-from torch_denkf.diagnosis.once import Once
 from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.filters.finish import Record
 from torch_denkf.transforms import DEnKFTransform
@@ -97,32 +94,6 @@ def test_an_observer_that_raises_leaves_the_tensordict_as_it_was(way):
     assert all(td[key].equal(value) for key, value in before.items(True, True))
 
 
-def test_an_observer_that_raises_stops_an_environment_before_it_emits_a_belief():
-    filter, seen = linear_kalman(), Seen()
-    env = environment(DEnKFTransform(filter))
-    row = env.rand_action(env.reset())
-    filter.observers, seen.raises = [seen], True
-    with pytest.raises(RuntimeError, match="stop"):
-        env.step(row)
-    ((_, written),) = seen.records
-    assert not written
-
-
-def test_observers_see_only_the_ways_that_they_name():
-    filter, seen = linear_kalman(), Seen()
-    filter.observers, seen.ways = [seen], ("sequence",)
-    for way in WAYS:
-        run(filter, way)
-    assert {record.way for record, _ in seen.records} == {"sequence"}
-
-
-def test_a_function_is_an_observer():
-    filter, ways = linear_kalman(), []
-    filter.observers = [lambda filter, record: ways.append(record.way)]
-    filter.step(filter.initialise(frames(2)))
-    assert ways == ["step"]
-
-
 # -------------------------------------------------------------------------------------------- the default observers
 
 
@@ -156,24 +127,6 @@ def test_clearing_the_observers_silences_all():
         environment(DEnKFTransform(quiet)).rollout(3, TensorDictSequential(quiet, actor()))
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda filter: pickle.loads(pickle.dumps(filter))])
-@pytest.mark.parametrize("ran", [False, True])
-def test_observers_go_with_a_copy(copied, ran):
-    """Its own, and what was said of the original is not said again."""
-    filter, seen = blind(), Seen()
-    filter.observers.append(seen)
-    if ran:
-        assert len(masked(filter)) == 1
-        assert masked(filter) == []
-    other, before = copied(filter), len(seen.records)
-    (own,) = (one for one in other.observers if isinstance(one, Seen))
-    assert own is not seen
-    assert len(masked(other)) == (0 if ran else 1)
-    assert len(seen.records) == before
-    assert len(own.records) == before + 2
-    assert masked(other) == []
-
-
 def test_a_filter_of_other_modules_or_options_has_the_observers():
     filter, seen = linear_kalman(), Seen()
     filter.observers = [seen]
@@ -182,20 +135,6 @@ def test_a_filter_of_other_modules_or_options_has_the_observers():
         other.observers.clear()
     assert len(seen.records) == 2
     assert filter.observers == [seen]
-
-
-def test_each_warning_is_given_once():
-    class Far(Once):
-        def __call__(self, filter, record):
-            for name in ("mean", "var"):
-                if (record.written["belief", name].abs() > 1e-3).any():
-                    self.warn(name, f"{name} is large.")
-
-    filter = linear_kalman()
-    filter.observers = [Far()]
-    with pytest.warns(UserWarning, match="large. Said once.") as said:
-        run(filter, "step")
-    assert len(said) == 2
 
 
 # ------------------------------------------------------------------------------------------------------------- hooks

@@ -1,18 +1,11 @@
 """Oracle: held readings written down by hand, and a loop over what was emitted."""
 
-import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import InitTracker, SerialEnv, TransformedEnv, check_env_specs
-from torchrl.modules import LSTMModule
-from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
+from torchrl.envs import TransformedEnv
 
-from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import base_env
-from torch_denkf.envs import HoldReading, MissingFrames
+from torch_denkf.envs import HoldReading
 
 NAN = float("nan")
 
@@ -58,25 +51,6 @@ def test_values():
     assert hold._reset(last, frames((5.0, True))[0])["held"].item() == 5
 
 
-def test_components_and_images():
-    hold = HoldReading("gps", observed_key="there", out_key=("last", "gps"))
-    before = TensorDict({("last", "gps"): torch.tensor([[1.0, 2.0], [3.0, 4.0]])}, [2])
-    gps, there = torch.tensor([[5.0, NAN], [NAN, 8.0]]), torch.tensor([[True, False], [False, True]])
-    out = hold._step(before, TensorDict({"gps": gps, "there": there}, [2]))
-    assert out["last", "gps"].tolist() == [[5.0, 2.0], [3.0, 8.0]]
-    image = torch.arange(24, dtype=torch.uint8).reshape(2, 3, 2, 2)
-    before = TensorDict({"held": torch.full_like(image, 200)}, [2])
-    out = HoldReading("pixels")._step(before, TensorDict({"pixels": image, "observed": there[:, :1]}, [2]))
-    assert out["held"][0].equal(image[0])
-    assert out["held"][1].eq(200).all()
-    assert out["held"].dtype == torch.uint8
-
-
-@pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
-def test_specs(batch):
-    check_env_specs(held_env(batch_size=batch))
-
-
 def test_episodes_that_end_apart():
     """Rows of 3, 5 and 4 steps: each begins anew, and the others keep what they hold."""
     env = held_env(batch_size=[3], max_steps=[3, 5, 4])
@@ -87,17 +61,6 @@ def test_episodes_that_end_apart():
     began = data["step"].squeeze(-1).eq(0) & ~data["observed"].squeeze(-1)
     assert began.any()
     assert data["held"][began].eq(0).all()
-
-
-def test_in_workers_and_in_collectors():
-    env = SerialEnv(2, [lambda: held_env(seed=0, max_steps=4), lambda: held_env(seed=1, max_steps=7)])
-    check_env_specs(env)
-    data = env.rollout(30, break_when_any_done=False)
-    assert data["held"].equal(by_hand(data))
-    collector = Collector(held_env(batch_size=[2], max_steps=[3, 5]), None, frames_per_batch=80, total_frames=80)
-    for data in collector:
-        assert data["held"].equal(by_hand(data))
-    collector.shutdown()
 
 
 def test_environments_that_reset_by_themselves():
@@ -112,46 +75,3 @@ def test_environments_that_reset_by_themselves():
         [3],
     )
     assert HoldReading()._reset_on_native_autoreset(both, both)["held"].tolist() == [[7.0], [2.0], [0.0]]
-
-
-def test_behind_missing_frames():
-    """An environment whose readings always come gets a mask, and what is held."""
-    missing = MissingFrames(0.5, in_keys=["observation"])
-    env = TransformedEnv(ContinuousActionVecMockEnv(), missing).append_transform(HoldReading())
-    check_env_specs(env)
-    data = env.rollout(40)
-    observed = data["observed"].squeeze(-1)
-    assert data["held"][observed].equal(data["observation"][observed])
-    late = ~observed[1:]
-    assert data["held"][1:][late].equal(data["held"][:-1][late])
-
-
-@pytest.mark.parametrize(("key", "spoiled"), [("observation", True), ("held", False)])
-def test_an_lstm_needs_it(key, spoiled):
-    """A missing reading makes all that an LSTM writes NaN until the episode ends, without an error."""
-    width = base_env().observation_spec["observation"].shape[-1]
-    memory = LSTMModule(input_size=width, hidden_size=4, in_key=key, out_key="features")
-    env = held_env(seed=0).append_transform(InitTracker()).append_transform(memory.make_tensordict_primer())
-    actor = TensorDictModule(torch.nn.Linear(4, env.action_spec.shape[-1]), ["features"], ["action"])
-    data = env.rollout(20, TensorDictSequential(memory, actor))
-    after = (~data["observed"]).cumsum(0).squeeze(-1) > 0
-    assert after.any()
-    assert data["features"][after].isnan().all() == spoiled
-    assert data["features"].isnan().any() == spoiled
-
-
-def test_a_replay_buffer_finds_it_held_already():
-    data = held_env(batch_size=[2]).rollout(5).reshape(-1)
-    buffer = ReplayBuffer(storage=LazyTensorStorage(10), transform=HoldReading(), batch_size=4)
-    buffer.extend(data)
-    assert not buffer.sample()["held"].isnan().any()
-    bare = ReplayBuffer(storage=LazyTensorStorage(10), transform=HoldReading(), batch_size=4)
-    bare.extend(data.exclude("held", ("next", "held")))
-    assert_refused(KeyError, "to the environment", bare.sample)
-
-
-def test_what_is_not_there_is_named():
-    seen, unseen = frames((1.0, True), (1.0, True))
-    assert_refused(KeyError, r"'reading'.*in_key=", HoldReading("reading")._reset, seen, seen)
-    assert_refused(KeyError, r"'mask'.*MissingFrames", HoldReading(observed_key="mask")._reset, seen, seen)
-    assert_refused(KeyError, r"'held'.*env\.reset", HoldReading()._step, seen.exclude("held"), unseen)

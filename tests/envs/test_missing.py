@@ -3,11 +3,8 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
-from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
+from torchrl.envs import TransformedEnv, check_env_specs
 
-from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.envs import MissingFrames
 
@@ -41,27 +38,6 @@ def test_what_is_missing_already_stays_missing(width):
     assert abs((~kept).sum() - 1500) < 5 * (5000 * 0.3 * 0.7) ** 0.5
 
 
-def test_integer_images_and_nan():
-    td = TensorDict(
-        {"pixels": torch.full((4, 1, 2, 2), 200, dtype=torch.uint8), "gps": torch.full((4, 2), torch.nan)}, [4]
-    )
-    out = MissingFrames(1.0, in_keys=["pixels", "gps"])(td)
-    assert out["pixels"].dtype == torch.uint8
-    assert (out["pixels"] == 0).all()
-    assert (out["gps"] == 0).all()
-
-
-def test_generator():
-    def draw(seed):
-        transform = MissingFrames(0.5, generator=torch.Generator().manual_seed(seed))
-        return transform(TensorDict({"pixels": torch.ones(100, 1, 1, 1)}, [100]))["observed"]
-
-    state = torch.get_rng_state()
-    assert draw(1).equal(draw(1))
-    assert not draw(1).equal(draw(2))
-    assert torch.get_rng_state().equal(state)
-
-
 @pytest.mark.parametrize("batch", [(), (3,)])
 def test_in_an_environment(batch):
     env = TransformedEnv(base_env(batch_size=batch, missing=0.3), MissingFrames(0.4, in_keys=["observation"]))
@@ -79,31 +55,3 @@ def test_in_an_environment(batch):
     resets = torch.stack([env.reset()["observed"] for _ in range(60)])
     assert resets.any()
     assert not resets.all()
-
-
-def test_adds_the_mask_to_the_specs():
-    env = TransformedEnv(ContinuousActionVecMockEnv(), MissingFrames(0.5, in_keys=["observation"], observed_key="seen"))
-    check_env_specs(env)
-    assert env.observation_spec["seen"].shape == (1,)
-    assert env.rollout(3)["seen"].dtype == torch.bool
-    batched = SerialEnv(
-        2, lambda: TransformedEnv(ContinuousActionVecMockEnv(), MissingFrames(0.5, in_keys=["observation"]))
-    )
-    check_env_specs(batched)
-
-
-def test_in_a_replay_buffer():
-    buffer = ReplayBuffer(storage=LazyTensorStorage(10), transform=MissingFrames(1.0, in_keys=["gps"]), batch_size=4)
-    buffer.extend(TensorDict({"gps": torch.ones(10, 2)}, [10]))
-    sample = buffer.sample()
-    assert (sample["gps"] == 0).all()
-    assert not sample["observed"].any()
-
-
-@pytest.mark.parametrize("p", [-0.1, 1.1])
-def test_no_probability(p):
-    assert_refused(ValueError, r"in \[0, 1\]", MissingFrames, p)
-
-
-def test_missing_key_is_named():
-    assert_refused(KeyError, "'pixels'", MissingFrames(0.5), TensorDict({"gps": torch.ones(2)}))

@@ -4,15 +4,8 @@ import math
 
 import pytest
 import torch
-from tensordict import TensorDict
-from torchrl.envs import PendulumEnv, check_env_specs
 
 from torch_denkf.envs import NoisyPendulumEnv
-
-
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_specs(batch):
-    check_env_specs(NoisyPendulumEnv(0.1, missing=0.5, batch_size=batch))
 
 
 def test_motion_and_reward_are_those_of_gymnasium():
@@ -32,20 +25,6 @@ def test_motion_and_reward_are_those_of_gymnasium():
             torch.testing.assert_close(rollout["next", "state"][row, step], expected, atol=1e-3, rtol=1e-3)
     assert bool(rollout["next", "truncated"][:, -1].all())
     assert not rollout["next", "done"][:, :-1].any()
-
-
-def test_one_step_is_that_of_torchrl():
-    torch.manual_seed(0)
-    env, theirs = NoisyPendulumEnv(batch_size=[256]), PendulumEnv()
-    start = env.rollout(30)[:, -1].exclude("next")
-    ours = env.step(start.clone())["next"]
-    cos, sin, velocity = start["state"].unbind(-1)
-    there = TensorDict({"th": torch.atan2(sin, cos), "thdot": velocity, "action": start["action"]}, [256])
-    there["params"] = PendulumEnv.gen_params(batch_size=[256])["params"]
-    expected = theirs._step(there)
-    torch.testing.assert_close(ours["state"][:, 2], expected["thdot"])
-    torch.testing.assert_close(ours["state"][:, 0], expected["th"].cos(), atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(ours["reward"], expected["reward"])
 
 
 def test_readings_are_noisy_and_missing():

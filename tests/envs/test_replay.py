@@ -22,11 +22,6 @@ from torch_denkf.submodel import SubModel
 from torch_denkf.transforms import DEnKFTransform
 
 LENGTHS = [6, 9, 4, 7]
-OWN = ("state", "step", "time", "episode", "wheel")
-
-
-def doubled(rows):
-    return rows.set("double", 2 * rows["state"]).set(("deep", "wheel"), -rows["wheel"])
 
 
 def make(actions=True, transform=None):
@@ -116,14 +111,6 @@ def test_a_partial_reset_leaves_the_other_elements():
     same(now, data, torch.tensor([4, 17]))
 
 
-def test_episodes_by_number_and_name():
-    data = make()
-    assert ReplayEnv(data, episodes=["run3", 1]).reset()["episode"] == 3
-    rollout = ReplayEnv(data, episodes="run2").rollout(5, break_when_any_done=False)
-    assert rollout["state"][:, 1].tolist() == [0, 1, 2, 0, 1]
-    assert (rollout["state"][:, 0] == 2).all()
-
-
 def test_random_stretches_are_uniform_and_follow_the_seed():
     data = make()
 
@@ -147,7 +134,7 @@ def test_random_stretches_are_uniform_and_follow_the_seed():
     ("data", "kind"),
     [
         *((name, SerialEnv) for name in SETS),
-        ("own", ParallelEnv),
+        pytest.param("own", ParallelEnv, marks=pytest.mark.slow),
         pytest.param("kitti", ParallelEnv, marks=pytest.mark.slow),
     ],  # processes take 10 s to start
     indirect=["data"],
@@ -171,19 +158,6 @@ def test_batched_environments(data, kind):
     finally:
         if not env.is_closed:
             env.close()
-
-
-def test_transforms_of_the_data_set_are_seen():
-    data = make(transform=doubled)
-    env = ReplayEnv(data, batch_size=[3])
-    check_env_specs(env)
-    assert env.device is None
-    on_device = ReplayEnv(data, batch_size=[3], device="cpu")
-    check_env_specs(on_device)
-    now = on_device.reset()
-    assert now.device == now["double"].device == torch.device("cpu")
-    assert now["double"].equal(2 * now["state"])
-    assert now["deep", "wheel"].equal(-now["wheel"])
 
 
 # Actions --------------------------------------------------------------------------------------------------------------
@@ -225,32 +199,4 @@ def test_a_filter_is_driven_by_what_the_policy_commands():
     assert env.base_env.policy(now)["action"].equal(now["recorded", "action"])
 
 
-def test_rand_action_without_a_tensordict():
-    env = ReplayEnv(make())
-    env.reset()
-    env.step(env.rand_action(env.reset()))
-    assert env.rand_action()["action"].item() == 11  # run1 now, at its second row
-
-
 # Errors ---------------------------------------------------------------------------------------------------------------
-
-
-def test_errors_say_what_to_do(tmp_path_factory):
-    data = make()
-
-    def fails(error, match, **options):
-        with pytest.raises(error, match=match):
-            ReplayEnv(data, **options)
-
-    fails(KeyError, "no episode 'run9' among 4 of the data set, such as .*'run0'", episodes="run9")
-    fails(KeyError, "no episode 4 among 4", episodes=[0, 4])
-    fails(ValueError, "leave it out for all", episodes=[])
-    fails(ValueError, "start is a row of the episodes or 'random', got 'first'", start="first")
-    fails(ValueError, "pass length", start="random")
-    fails(ValueError, r"do not fit in 2 of 4 episodes: {'run0': 6, 'run2': 4}; .*Pass episodes=", length=7)
-    fails(ValueError, "at least 2 rows", length=1)
-    fails(ValueError, "start must be a whole number, at least 0; got -1", start=-1)
-    with pytest.raises(TypeError, match="got TensorDict"):
-        ReplayEnv(data[:])
-    with pytest.raises(ValueError, match="offers single rows"):
-        ReplayEnv(UR5ExperienceReplay(ten_demos(tmp_path_factory), frames_only=True, cache=None))

@@ -11,14 +11,9 @@ from torchrl.modules.utils import get_env_transforms_from_module
 
 from tests.filters.factories import (
     OBS,
-    A,
-    E,
     FixedEnsemble,
-    M,
     NoisyLinear,
-    S,
     assert_equal,
-    has_compiler,
     linear_denkf,
     linear_kalman,
     linear_system,
@@ -34,39 +29,12 @@ from torch_denkf.baselines import LSTMFilter
 from torch_denkf.envs.linear import LinearGaussianEnv
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis
-from torch_denkf.modules.belief import FromSensor, GaussianPrior
 from torch_denkf.modules.observation import LinearObservation, Select
 from torch_denkf.transforms import DEnKFTransform
 
 BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
 
 # ------------------------------------------------------------------------------------- parts of a composition
-
-
-def test_parts():
-    filter = toy_denkf()
-    assert isinstance(filter["transition"], type(filter[2]))
-    assert filter["transition"] is filter[2]
-    part = filter[1:3]
-    assert type(part) is TensorDictSequential
-    assert list(part) == [filter["noise"], filter["transition"]]
-    structure = filter.structure
-    assert [[part for _, part in parts] for parts in (structure.frames, [structure.transition], structure.update)] == [
-        [filter["sensor"], filter["noise"]],
-        [filter["transition"]],
-        [filter["observation"], filter["analysis"]],
-    ]
-    assert filter.carry_keys == [("belief", "ensemble")]
-    assert filter.belief_keys == BELIEF
-
-
-def test_select_subsequence():
-    filter = toy_denkf()
-    forecast = filter.select_subsequence(out_keys=[("forecast", "ensemble")])
-    assert list(forecast) == [filter["transition"]]
-    td = TensorDict({("belief", "ensemble"): torch.randn(E, S), "action": torch.zeros(A)})
-    assert set(forecast(td).keys()) == {"belief", "action", "forecast"}
-    assert list(filter.select_subsequence(out_keys=[("sensor", "noise")])) == [filter["sensor"], filter["noise"]]
 
 
 def test_modules_are_sorted_by_their_keys_whatever_their_order(float64):
@@ -121,13 +89,6 @@ def test_motion_behind_the_analysis(float64):
     assert belief[1, 4].equal(members)
 
 
-def test_unrelated_initial_belief():
-    filter = toy_denkf()
-    initial = GaussianPrior(torch.zeros(S), torch.ones(S), out_keys=[("b", "e"), ("b", "m"), ("b", "v")])
-    with pytest.raises(ValueError, match="No module of the filter reads"):
-        Filter(*filter, initial=initial)
-
-
 def test_a_filter_with_other_keys(float64):
     # A second filter on the same tensordict, in its own name space.
     plain = linear_denkf()
@@ -166,18 +127,6 @@ def test_a_filter_with_other_keys(float64):
     assert all(out["two", name].equal(expected["belief", name]) for name in ("ensemble", "mean", "var"))
 
 
-def test_errors():
-    filter = toy_denkf()
-    with pytest.raises(KeyError, match=r"carries its belief in \('belief', 'ensemble'\)"):
-        filter.step(TensorDict({"measurement": torch.zeros(M), "action": torch.zeros(A)}))
-    with pytest.raises(KeyError, match="carries its belief"):
-        filter(TensorDict({"measurement": torch.zeros(M), "is_init": torch.tensor([True])}))
-    with pytest.raises(KeyError, match="'measurement'"):
-        filter.sequence(TensorDict({"action": torch.zeros(4, A)}, [4]))
-    with pytest.raises(ValueError, match="time as its last batch dimension"):
-        filter.sequence(TensorDict({"measurement": torch.zeros(M)}))
-
-
 def test_a_state_dict_is_all_that_is_learned(float64):
     filter, fresh = toy_denkf(), toy_denkf()
     frames = filter.draw_noise(toy_frames((2, 5)))
@@ -187,50 +136,7 @@ def test_a_state_dict_is_all_that_is_learned(float64):
     assert_equal(fresh.sequence(frames.copy()), expected, filter.out_keys)
 
 
-def test_float32_agrees_with_float64(float64):
-    filter = toy_denkf("etkf")
-    frames = filter.draw_noise(toy_frames((3, 30), masks=OBS))
-    expected = filter.sequence(frames.copy())
-    single = frames.apply(lambda x: x.float() if x.is_floating_point() else x)
-    out = filter.float().sequence(single)
-    # 30 steps of arithmetic on numbers of size 1 at 6e-8 each.
-    for key in filter.out_keys:
-        assert out[key].dtype == torch.float32
-        torch.testing.assert_close(out[key].double(), expected[key], rtol=1e-3, atol=1e-4)
-
-
 # ------------------------------------------------------------------------------------------------ compilation
-
-
-@pytest.mark.parametrize(
-    ("layer", "backend"),
-    [
-        ("dropout", "aot_eager"),  # both graphs; test_compiled.py has one in C++
-        pytest.param("dropout", "inductor", marks=pytest.mark.slow),
-        pytest.param("flipout", "inductor", marks=pytest.mark.slow),
-    ],
-)
-def test_compiled_step_equals_eager(float64, layer, backend):
-    if backend == "inductor" and not has_compiler():
-        pytest.skip("torch.compile needs a C++ compiler")
-    filter = toy_denkf("sensor", layer)
-    td = filter.initialise(toy_frames((3,), resets=False))
-    filter.draw_noise(td)
-
-    def loss(step, td):
-        filter.zero_grad()
-        out = step(td.copy())
-        out["belief", "mean"].square().sum().backward()
-        return out.detach(), [p.grad.clone() for p in filter.parameters() if p.grad is not None]
-
-    torch._dynamo.reset()
-    eager, grads = loss(filter.step, td)
-    compiled, compiled_grads = loss(torch.compile(filter.step, fullgraph=True, backend=backend), td)
-    # Inductor fuses sums and uses fused multiply-adds: rounding, 1e-16, amplified by the solve.
-    assert_equal(compiled, eager, filter.out_keys, atol=1e-11)
-    assert len(grads) == len(compiled_grads) > 10
-    for grad, other in zip(grads, compiled_grads, strict=True):
-        torch.testing.assert_close(grad, other, rtol=1e-9, atol=1e-11)
 
 
 # ----------------------------------------------------------------------------------------------- in a policy
@@ -290,35 +196,3 @@ def test_policy_transform_and_sequence_agree(float64, update_at_reset, make):
     assert (by_sequence["belief", "mean"][:, 2] - by_sequence["belief", "mean"][:, 0]).norm(dim=-1).min() > 0.1
     # A slice starts from what is stored.
     assert_equal(filter.sequence(by_policy[:, 2:9].copy()), by_policy[:, 2:9], belief, atol=1e-13)
-
-
-def test_primer_of_every_kind_of_initial_belief():
-    for filter in (
-        linear_denkf(),
-        linear_kalman(),
-        linear_denkf(initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=6)),
-        toy_denkf(initial=FromSensor([0], [0.0] * S, [1.0] * S, ensemble_size=E)),
-    ):
-        state = torch.get_rng_state()
-        primer = filter.make_tensordict_primer()
-        assert torch.get_rng_state().equal(state), "no random numbers are used up"
-        carried = {("previous", *key) for key in filter.carry_keys} | {("previous", "known")}
-        assert set(primer.primers.keys(True, True)) == carried
-
-
-def test_summaries_follow_from_the_carry(float64):
-    for filter in (linear_denkf(), linear_kalman()):
-        td = filter.initial(TensorDict({}, [3]))
-        carried = td.select(*filter.carry_keys)
-        assert_equal(filter.summarise(carried), td, filter.belief_keys)
-
-
-def test_select_observation(float64):
-    # The paper's KITTI set-up: h selects known dimensions.
-    filter = linear_denkf()
-    filter = DEnKF(filter["transition"], None, Select([1]), ConstantNoise([0.5], in_key="y"),
-                   EnsembleAnalysis("etkf", observation_key="y"), initial=filter.initial)  # fmt: skip
-    out = filter.step(filter.initialise(TensorDict({"y": torch.zeros(1)})))
-    forecast = out["forecast", "ensemble"][:, 1]
-    gain = forecast.var() / (forecast.var() + 0.25)
-    torch.testing.assert_close(out["belief", "mean"][1], (1 - gain) * forecast.mean(), rtol=1e-12, atol=1e-14)

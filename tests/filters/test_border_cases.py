@@ -3,12 +3,10 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
-from torchrl.envs import FrameSkipTransform, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from tests.filters.beliefs_for_tests import BELIEF, COV, ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import (
-    FixedEnsemble,
     linear_denkf,
     linear_kalman,
     toy_denkf,
@@ -17,7 +15,6 @@ from tests.filters.factories import (
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.modules import (
     EnsembleAnalysis,
-    LearnedObservation,
 )
 from torch_denkf.transforms import DEnKFTransform
 
@@ -47,27 +44,6 @@ def test_stored_beliefs_start_anew_where_marks_say_so_and_nowhere_else(float64):
     assert not out[ENSEMBLE][0, 5].equal(stored[ENSEMBLE][0, 5])
 
 
-class MeanIfThere(FixedEnsemble):
-    """An initial belief around a mean, if there is one."""
-
-    def __init__(self, members):
-        super().__init__(members)
-        self.optional_keys = [MEAN]
-
-    def compute(self, mean=None, *, batch_size):
-        ensemble, *others = super().compute(batch_size=batch_size)
-        return ensemble if mean is None else ensemble + mean.unsqueeze(-2), *others
-
-
-@pytest.mark.parametrize("run", ["initialise", "sequence"])
-def test_a_start_knows_nothing_of_the_belief_that_is_there(run):
-    filter = linear_denkf()
-    filter = filter.with_modules(initial=MeanIfThere(filter.initial.members))
-    frames = TensorDict({"observation": torch.randn(3, 5, 2)}, [3, 5]).set(MEAN, torch.ones(3, 5, 2))
-    out = filter.sequence(frames)[:, 0] if run == "sequence" else filter.initialise(frames[:, 0])
-    assert (out[ENSEMBLE] == filter.initial.members).all()
-
-
 # ----------------------------------------------------------------------------------------------------------- groups
 
 
@@ -89,11 +65,6 @@ def test_marks_in_a_group_of_agents_reset_the_belief(float64, mark):
 
 
 # ------------------------------------------------------------------------------------------------ no rows, no steps
-
-
-def test_no_steps_are_refused():
-    with pytest.raises(ValueError, match=r"at least one step.*\[3, 0\]"):
-        linear_denkf().sequence(TensorDict({"observation": torch.zeros(3, 0, 2)}, [3, 0]))
 
 
 # ------------------------------------------------------------------------------------------------- what is returned
@@ -128,70 +99,4 @@ def test_the_covariance_of_an_ensemble_on_request(float64):
 # ------------------------------------------------------------------------------------------------- compiled, guards
 
 
-class Keyed(nn.Module):
-    """A network under a name that sounds like entries."""
-
-    def __init__(self):
-        super().__init__()
-        self.keys = nn.Linear(2, 2)
-
-    def forward(self, state):
-        return self.keys(state)
-
-
-def test_freezing_a_network_called_keys_is_noticed():
-    filter = linear_denkf()
-    filter = filter.with_modules(observation=LearnedObservation(Keyed()))
-    filter.compile(chunk=1, backend="eager")
-    frames, network = TensorDict({"observation": torch.randn(3, 2, 2)}, [3, 2]), filter["observation"].module.keys
-    network.requires_grad_(False)
-    filter.sequence(frames.copy())
-    network.requires_grad_(True)
-    filter.sequence(frames.copy())[MEAN].square().sum().backward()
-    assert network.weight.grad.abs().sum() > 0
-
-
-def test_guards_that_are_left_out_are_not_about_what_users_change():
-    from torch_denkf.compilation import worth_checking
-
-    class Guard:
-        def __init__(self, name, kind="TYPE_MATCH", is_global=False):
-            self.name, self.guard_type, self.is_global = name, kind, is_global
-
-    kept = ["L['steps'].structure.update[0][1].keys.weight", "L['x'].monkeys", "L['module']._modules['keys_in']"]
-    dropped = ["L['module'].in_keys[0]", "L['module'].optional_keys", "G['torch'].nn"]
-    guards = [Guard(name, is_global=name.startswith("G")) for name in (*kept, *dropped)]
-    assert worth_checking(guards) == [True] * 3 + [False] * 3
-
-
-def test_other_versions_of_torch_get_plain_inductor(monkeypatch, caplog):
-    from torch_denkf.compilation import options as inductor
-
-    monkeypatch.setattr(torch, "__version__", "3.1.0")
-    monkeypatch.setattr(inductor, "_said", False)
-    assert inductor.options_for_processors() == {"cpp_wrapper": True}
-    inductor.options_for_processors()
-    assert sum("plain inductor" in record.message for record in caplog.records) == 1
-
-
 # ------------------------------------------------------------------------------------------------------ frame skips
-
-
-def test_behind_a_frame_skip_the_belief_takes_one_step_a_skip():
-    env = base_env(seed=0, batch_size=[2])
-    filter = linear_denkf()
-    skipping = TransformedEnv(TransformedEnv(env, DEnKFTransform(filter)), FrameSkipTransform(3))
-    rollout = skipping.rollout(2)
-    row = filter.step(
-        rollout[:, 0].select("belief", "action").copy().set("observation", rollout["next", "observation"][:, 0])
-    )
-    close(rollout["next"][:, 0], row, [MEAN], atol=1e-6)
-    inside = TransformedEnv(
-        TransformedEnv(base_env(seed=0, batch_size=[2]), FrameSkipTransform(3)), DEnKFTransform(filter)
-    )
-    close(inside.rollout(2), rollout, [MEAN], atol=1e-6)
-
-
-def test_an_initial_belief_is_drawn_in_the_filters_precision():
-    filter = toy_denkf(action=False).double()
-    assert filter.initialise(TensorDict({}, [3]))[ENSEMBLE].dtype == torch.float64

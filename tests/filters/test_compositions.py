@@ -6,7 +6,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
-from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import InitTracker, TransformedEnv
 from torchrl.modules.utils import get_env_transforms_from_module
 
@@ -81,6 +80,7 @@ def with_carry(frames, beliefs):
     return frames.copy().set(BELIEF[0], beliefs[BELIEF[0]])
 
 
+@pytest.mark.slow
 @all_at_once
 def test_compiled_is_eager(float64, features):
     filter, frames, carry = prepared(features)
@@ -94,24 +94,6 @@ def test_compiled_is_eager(float64, features):
         expected_step,
         BELIEF,
     )
-
-
-@every_pair
-def test_a_replay_buffer_gives_the_sequence(float64, features):
-    filter, frames, carry = prepared(features)
-    data = frames if carry is None else with_carry(frames, stepped(filter, frames, carry))
-    expected = filter.sequence(data.copy())
-    episode = torch.arange(B).reshape(B, 1).expand(B, T)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(B * T),
-        sampler=SliceSampler(slice_len=T, traj_key="episode", cache_values=True),
-        batch_size=2 * T,
-    )
-    buffer.extend(data.copy().set("episode", episode).reshape(-1))
-    sample = buffer.sample()
-    out, which = filter.sequence(sample), sample["episode"].reshape(2, T)[:, 0]
-    assert sample.batch_size == (2 * T,)
-    close(out.reshape(2, T), expected[which], BELIEF)
 
 
 @every_pair

@@ -8,14 +8,8 @@ from torch import nn
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import (
-    AroundState,
     ConstantNoise,
-    EnsembleAnalysis,
-    LearnedTransition,
     LinearObservation,
-    NoisyTransition,
-    Select,
-    StochasticMLP,
 )
 from torch_denkf.modules.stochastic import FlipoutLinear
 
@@ -83,48 +77,6 @@ def test_reference_is_the_authors_code():
     # Flipout starts with a standard deviation of 0.0486 in the code; 0.05 here.
     std = nn.functional.softplus(transition.layers[0].weight_rho)
     torch.testing.assert_close(std, torch.full_like(std, 0.05))
-
-
-@pytest.mark.parametrize("preset", [DEnKF.paper, DEnKF.reference])
-@pytest.mark.parametrize("batch", [(), (2,)])
-def test_presets_filter_images(preset, batch):
-    denkf = preset(4, 3, image_shape=(3, 32, 48), ensemble_size=5, r=0.3)
-    td = TensorDict({"pixels": torch.randint(0, 256, (*batch, 3, 32, 48), dtype=torch.uint8)}, batch)
-    out = denkf.step(denkf.initialise(td))
-    torch.testing.assert_close(out["sensor", "noise"], torch.full((*batch, 3), 0.09))
-    assert out["belief", "ensemble"].shape == (*batch, 5, 4)
-    assert out["belief", "ensemble"].isfinite().all()
-    assert not out["belief", "ensemble"].equal(out["forecast", "ensemble"])
-
-
-def test_paper_arguments():
-    initial = DEnKF.paper(4, 3, image_shape=(3, 16, 16), ensemble_size=7).initial
-    denkf = DEnKF.paper(4, 3, image_shape=(3, 16, 16), initial=initial, ensemble_size=7, rate=0.5, update_at_reset=True)
-    assert denkf.initial is initial
-    assert denkf.update_at_reset
-    assert {net.rate for net in denkf.modules() if isinstance(net, StochasticMLP) and net.layer == "dropout"} == {0.5}
-
-
-def test_standard_prior():
-    denkf = DEnKF.paper(4, 3, image_shape=(3, 16, 16))
-    assert denkf.initial.mean.equal(torch.zeros(4))
-    assert denkf.initial.std.equal(torch.ones(4))
-
-
-def test_process_noise_of_another_width_leaves_the_analysis_its_own():
-    motion = NoisyTransition(
-        LearnedTransition(torch.zeros_like), ConstantNoise([0.1] * 3, in_key=("belief", "mean")), [0, 1, 2]
-    )
-    denkf = DEnKF(
-        motion,
-        None,
-        Select([0, 2]),
-        ConstantNoise([0.1, 0.2], in_key="y"),
-        EnsembleAnalysis("perturbed", observation_key="y"),
-        initial=AroundState([0.1] * 3, ensemble_size=8),
-    )
-    noise = denkf.draw_noise(TensorDict({"y": torch.zeros(5, 2)}, [5]))
-    assert noise["noise", "analysis"].shape == (5, 8, 2)
 
 
 def test_the_mask_of_a_filters_default_analysis_can_be_named(float64):

@@ -1,12 +1,10 @@
 """Oracles of all Gaussian filters (EKF, UKF, Backprop KF): the Kalman filter, differences of losses, the true noise."""
 
-from functools import partial
-
 import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.filters.factories import assert_equal, linear_kalman, linear_system, stepwise
+from tests.filters.factories import assert_equal, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import (
     BELIEF,
     CONTROL,
@@ -20,12 +18,9 @@ from tests.filters.gaussian_for_tests import (
     minimise,
     prior,
 )
-from torch_denkf.baselines import LSTMFilter
 from torch_denkf.modules import (
-    AroundState,
     CholeskyNoise,
     ConstantNoise,
-    GaussianPrior,
 )
 from torch_denkf.objectives import GaussianLoss
 
@@ -53,24 +48,6 @@ def test_actions_move_the_mean_alone(float64, name):
     moved = with_control["belief", "mean"][:, :-1] @ F.mT + frames["action"][:, :-1] @ torch.tensor(CONTROL).mT
     stepped = ~frames["is_init"][:, 1:].squeeze(-1)
     torch.testing.assert_close(with_control["forecast", "mean"][:, 1:][stepped], moved[stepped], rtol=0, atol=1e-12)
-
-
-@ALL
-@pytest.mark.parametrize("update_at_reset", [False, True])
-def test_step_equals_sequence(float64, name, update_at_reset):
-    filter = learned_filter(name, update_at_reset=update_at_reset)
-    frames = learned_frames(2, 12)
-    # Matrix products sum in another order for another number of rows: 1e-15, which the recursion may amplify.
-    assert_equal(stepwise(filter, frames), filter.sequence(frames.copy()), [*BELIEF, *INFO], atol=1e-11)
-
-
-@ALL
-def test_keys_and_modules(name):
-    filter = learned_filter(name)
-    assert filter.carry_keys == [("belief", "mean"), ("belief", "cov")]
-    assert filter.belief_keys == BELIEF
-    assert len(filter.structure.frames) == 2, "sensor and R run once on all frames"
-    assert filter.transition_module is filter["transition"]
 
 
 @pytest.mark.parametrize("name", ["EKF", "UKF"])
@@ -118,19 +95,6 @@ def test_all_parameters_have_the_gradient_of_a_difference(float64, name):
     directional_check(loss, filter.parameters())
 
 
-@pytest.mark.parametrize("name", ["EKF", "UKF"])
-def test_unobserved_nan_leaves_gradients_finite(float64, name):
-    frames = linear_frames(2, 10)
-    q = CholeskyNoise(2, r=0.3)
-    r = ConstantNoise([0.7, 0.5], trainable=True, in_key="observation")
-    filter = linear_filter(name, process_noise=q, noise=r)
-    out = filter.sequence(frames)
-    total = out["belief", "mean"].square().sum() + out["info", "log_likelihood"].sum()
-    for gradient in torch.autograd.grad(total, (q.raw, r.log_variance)):
-        assert gradient.isfinite().all()
-        assert (gradient != 0).all()
-
-
 # ------------------------------------------------------------------------------------------------------- training
 
 
@@ -173,13 +137,3 @@ def test_the_noise_is_read_where_its_module_writes_it(float64, name):
     torch.testing.assert_close(found["camera", "r"], R.expand(3, 12, 2), rtol=1e-14, atol=0)
     alone = linear_filter(name, noise=noise).sequence(frames.exclude("sensor"))
     assert_equal(alone, expected, [*BELIEF, *INFO], atol=0)
-
-
-@pytest.mark.parametrize("name", [*FILTERS, "LSTMFilter"])
-@pytest.mark.parametrize("initial", [GaussianPrior([0.0, 0.0], [1.0, 1.0]), AroundState([1.0, 1.0])])
-def test_the_initial_belief_of_an_ensemble_is_refused(name, initial):
-    lstm = partial(LSTMFilter, None, features=16, state_dim=2)
-    make = lstm if name == "LSTMFilter" else partial(linear_filter, name)
-    message = rf"{name} carries .*'cov'.*{type(initial).__name__}, writes .*MomentPrior.*GaussianAround"
-    with pytest.raises(ValueError, match=message):
-        make(initial=initial)

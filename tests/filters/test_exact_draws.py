@@ -11,7 +11,6 @@ from torch_denkf.functional.manifolds import SO3, Circle, Euclidean
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import FadingBias
-from torch_denkf.imperfect.bias import BiasedBelief
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
@@ -160,38 +159,12 @@ def test_perturbed_members_have_the_covariance_of_the_square_root_filter():
     torch.testing.assert_close(ensemble_cov(out["ensemble"]), ensemble_cov(expected["ensemble"]), rtol=0, atol=1e-9)
 
 
-def test_perturbations_of_as_many_components_as_members_are_plain():
-    td = TensorDict(
-        {"reading": torch.ones(6), "sensor": {"noise": torch.ones(6)}, ("noise", "self"): torch.randn(6, 6)}
-    )
-    td["forecast"] = TensorDict({"ensemble": torch.randn(6, S), "observation": torch.randn(6, 6)}, [])
-    out, expected = (
-        EnsembleAnalysis("perturbed", observation_key="reading", draws=draws)(td.copy())["belief", "ensemble"]
-        for draws in ("exact", "random")
-    )
-    assert out.equal(expected)
-
-
 def test_on_a_circle_members_lie_on_both_sides_of_the_turn():
     start = AroundState([0.3], ensemble_size=E, space=Circle())(TensorDict({"state": torch.tensor([3.1])}))
     noise = ConstantNoise([0.2], in_key=("belief", "mean"), out_key=("forecast", "noise"))
     members = NoisyTransition(Still(), noise, space=Circle())(start)["forecast", "ensemble"]
     var = Circle().minus(members, torch.tensor([3.1])).var(-2)
     torch.testing.assert_close(var, torch.tensor([0.13]), rtol=0, atol=1e-9)
-
-
-def test_biases_of_weighted_particles_are_drawn_at_random():
-    class Weighted(nn.Module):
-        in_keys: list = []  # noqa: RUF012
-        out_keys = [("belief", "ensemble"), ("belief", "log_weight")]  # noqa: RUF012
-        ensemble_size = E
-
-        def forward(self, td):
-            return td.set("belief", TensorDict({"ensemble": torch.randn(E, S), "log_weight": torch.zeros(E)}, []))
-
-    bias, noise = FadingBias([0.4], time=5.0, trainable=False), torch.randn(E, 1)
-    td = BiasedBelief(Weighted(), bias)(TensorDict({("noise", "self"): noise}))
-    torch.testing.assert_close(td["belief", "ensemble"][:, S:], 0.4 * noise)
 
 
 @pytest.mark.parametrize("space", [Circle(), SO3()])
@@ -284,16 +257,3 @@ def test_random_draws_stay_what_they_were():
     torch.testing.assert_close(out, plain + Q * td["noise", "self"])
     with pytest.raises(ValueError, match="draws"):
         NoisyTransition(LearnedTransition(nn.Linear(S, S)), noise, draws="exactly")
-
-
-def test_weighted_particles_draw_at_random():
-    td = TensorDict({("belief", "ensemble"): torch.zeros(E, S), ("belief", "log_weight"): torch.zeros(E)})
-    td["noise", "self"] = torch.ones(E, S)
-    noisy = NoisyTransition(still(), ConstantNoise(torch.ones(S), in_key=("belief", "ensemble")))
-    assert noisy(td)["forecast", "ensemble"].eq(1).all()
-
-
-def still():
-    return LearnedTransition(
-        nn.Linear(S, S, bias=False).requires_grad_(False).apply(lambda layer: layer.weight.zero_())
-    )

@@ -3,13 +3,10 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
-from tests.filters.factories import NoisyLinear, linear_denkf, linear_system, linear_with
-from torch_denkf.filters import Filter
+from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
 from torch_denkf.modules import SubModel
 from torch_denkf.running import run_module
-from torch_denkf.submodel import Call
 
 ENSEMBLE, FORECAST = ("belief", "ensemble"), ("forecast", "ensemble")
 
@@ -91,46 +88,3 @@ def test_noise_of_a_part_inside_is_found_by_its_place_inside():
     expected = belief @ F.mT + frames["noise", "transition.inner"][:, 1] @ root.mT
     for value in found:
         torch.testing.assert_close(value, expected)
-
-
-def test_a_module_sees_what_it_names_and_no_more():
-    class Counts(TensorDictModuleBase):
-        in_keys, out_keys = ["x"], ["count"]
-
-        def forward(self, tensordict):
-            return tensordict.set("count", torch.tensor(len(list(tensordict.keys(True, True)))))
-
-    entries = {"x": torch.zeros(2), ("belief", "mean"): torch.zeros(2)}
-    assert run_module(Counts(), entries, Call(torch.Size([]))) == {"count": torch.tensor(1)}
-
-
-def test_an_update_in_a_plain_module_is_that_of_the_sub_model():
-    plain = linear_denkf()
-
-    class OnTensorDicts(TensorDictModuleBase):
-        def __init__(self, module):
-            super().__init__()
-            self.inner, self.in_keys, self.out_keys = module, module.in_keys, module.out_keys
-            self.optional_keys, self.info_prefix = module.optional_keys, module.info_prefix
-
-        def forward(self, tensordict):
-            return self.inner(tensordict)
-
-    other = linear_with({}, analysis=OnTensorDicts(plain["analysis"]))
-    frames = TensorDict({"observation": torch.randn(3, 6, 2)}, [3, 6]).set("observed", torch.rand(3, 6, 2) < 0.6)
-    torch.testing.assert_close(other.sequence(frames.copy())[ENSEMBLE], plain.sequence(frames.copy())[ENSEMBLE])
-
-
-def test_one_module_may_be_all_of_a_step():
-    """It reads the belief and the frame, and writes over the belief: y1 is half of y0 and of the frame."""
-    mean = ("belief", "mean")
-    initial = TensorDictModule(torch.zeros_like, ["observation"], [mean])
-    filter = Filter(TensorDictModule(lambda m, o: (m + o) / 2, [mean, "observation"], [mean]), initial=initial)
-    frames = TensorDict({"observation": torch.arange(6.0).reshape(1, 6, 1)}, [1, 6])
-    frames["is_init"] = torch.zeros(1, 6, 1, dtype=torch.bool)
-    frames["is_init"][0, 3] = True
-    assert filter.sequence(frames.copy())[mean].flatten().tolist() == [0, 0.5, 1.25, 0, 2, 3.5]
-    row = frames[:, 5].copy().set(mean, torch.full((1, 1), 2.0))
-    assert filter.step(row)[mean].item() == 3.5
-    row = frames[:, 5].copy().set(("previous", *mean), torch.full((1, 1), 2.0))
-    assert filter(row)[mean].item() == 3.5

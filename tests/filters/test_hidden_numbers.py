@@ -218,19 +218,3 @@ def test_covariances_of_members_are_of_tangents(name):
     torch.testing.assert_close(out["belief", "cov"], expected, rtol=0, atol=1e-3)  # an update's mean is rounded
     torch.testing.assert_close(out["belief", "cov"][..., 0, :, :], expected[..., 0, :, :])
     torch.testing.assert_close(out[VAR][..., 0, :], expected[..., 0, :, :].diagonal(dim1=-2, dim2=-1))
-
-
-@pytest.mark.parametrize("kind", ["EKF", "UKF", "sensor", "particles", "IEnKS"])
-@pytest.mark.parametrize("name", ["SE3", "Product"])
-def test_nor_does_one_among_learned_samples(kind, name):
-    key, space = ("sensor", "ensemble"), SPACES[name]
-    data, hidden = frames(space)
-    rng = torch.Generator().manual_seed(4)
-    samples = space.plus(data["pose"][:, :1].unsqueeze(-2), 0.1 * torch.randn(T, E, space.tangent_dim, generator=rng))
-    data[key] = torch.where(hidden.unsqueeze(-2), data["pose"].unsqueeze(-2), samples)
-    data[key][:, :1] = samples
-    out, pose = filtered(make(kind, space, Whole(), space, key=key), data, key)
-    (gradient,) = torch.autograd.grad(out[MEAN].sum() + out[VAR].sum(), pose)
-    assert gradient.any()
-    for found in (out[MEAN], out[VAR], gradient):
-        torch.testing.assert_close(found, found[:, :1].expand_as(found), rtol=1e-12, atol=1e-12)

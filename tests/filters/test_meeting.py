@@ -3,12 +3,10 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.modules import set_recurrent_mode
-from torchrl.modules.utils import get_env_transforms_from_module
 
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import (
@@ -23,7 +21,7 @@ from tests.filters.factories import (
 from torch_denkf.filters import Filter
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.imperfect import RejectReadings
-from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LinearObservation, SubModel, Update
+from torch_denkf.modules import EnsembleAnalysis, LinearObservation, SubModel, Update
 from torch_denkf.transforms import DEnKFTransform, LastAction
 
 MEAN = ("belief", "mean")
@@ -75,24 +73,6 @@ def test_noise_that_depends_on_the_action_is_no_transition(float64, place):
     torch.testing.assert_close(stepwise(filter, frames)[MEAN], out[MEAN], rtol=0, atol=1e-12)
 
 
-class Reads(SubModel):
-    """A transition that reads what another module makes of the action."""
-
-    def __init__(self):
-        super().__init__(nn.Identity(), [("belief", "ensemble"), ("sensor", "noise")], [("forecast", "ensemble")])
-
-    def compute(self, ensemble, variance):
-        return ensemble + variance.unsqueeze(-2)
-
-
-def test_a_transition_behind_a_module_of_the_action_is_refused():
-    filter = driven(0)
-    with pytest.raises(
-        ValueError, match=r"'transition' forecasts the belief and reads .* which 'noise' makes of the act"
-    ):
-        Filter({**dict(filter.module.named_children()), "transition": Reads()}, initial=filter.initial)
-
-
 # ------------------------------------------------------------------------------------------------ marks, known beliefs
 
 
@@ -141,17 +121,6 @@ def test_an_episode_that_diverged_leaves_no_gradient_of_nan(float64):
 
 
 # -------------------------------------------------------------------------------------------- readings in policies
-
-
-@pytest.mark.parametrize("make", [linear_kalman, linear_denkf])
-def test_a_policy_refuses_what_is_not_finite(make):
-    frames = TensorDict({"observation": torch.randn(2, 5, 2), "action": torch.zeros(2, 5, 1)}, [2, 5])
-    frames["is_init"] = torch.zeros(2, 5, 1, dtype=torch.bool)
-    frames["observation"][1, 3, 0] = torch.nan
-    policy = TensorDictSequential(make(), ReplayedFrames(frames).player())
-    env = TransformedEnv(ReplayedFrames(frames), get_env_transforms_from_module(policy))
-    with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
-        env.rollout(5, policy)
 
 
 @pytest.mark.parametrize("make", [linear_kalman, linear_denkf])
@@ -256,66 +225,4 @@ def test_a_belief_that_torchrl_would_not_reset_is_refused(each):
         TransformedEnv(Groups(each=each), LastAction({("agents", "action"): "last"})).rollout(2)
 
 
-def test_a_belief_under_the_name_of_the_group_is_reset_with_it():
-    filter = random_walk(prefix="agents", observation_key=("agents", "x"))
-    env = TransformedEnv(Groups(each=False), DEnKFTransform(filter))
-    rollout = env.rollout(7, break_when_any_done=False)
-    x, mean = rollout["agents", "x"].squeeze(-1), rollout["agents", "belief", "mean"].squeeze(-1)
-    assert x[0].tolist() == [0, 10, 20, 0, 10, 20, 0]
-    assert mean[0, :3].tolist() == mean[0, 3:6].tolist()
-    assert mean[0, [0, 3, 6]].tolist() == [0, 0, 0]
-    assert (mean[1].diff() > 0).all()
-
-
 # --------------------------------------------------------------------------------------------------------- messages
-
-
-def test_what_is_no_tensordict_is_named():
-    with pytest.raises(TypeError, match=r"KalmanFilter takes a tensordict, or a dictionary .*; got NoneType"):
-        random_walk().step(None)
-
-
-def test_a_negative_covariance_is_no_divergence():
-    row = random_walk().initialise(TensorDict({"observation": torch.ones(2, 1)}, [2]))
-    row["belief", "cov"] = torch.full((2, 1, 1), -5.0)
-    with pytest.raises(ValueError, match=r"negative variances in \[\('belief', 'cov'\)\]"):
-        random_walk().step(row)
-
-
-def test_a_sensor_that_is_none_is_named_as_the_sensor():
-    with pytest.raises(TypeError, match=r"^sensor must be a TensorDict module, such as those of .*modules; got"):
-        linear_with({"sensor": torch.nn.Linear(2, 2)})
-
-
-def test_a_function_in_the_place_of_an_observation_is_told_its_module():
-    with pytest.raises(TypeError, match=r"^observation must be .*, or LearnedObservation\(f\) of a function f; got"):
-        linear_with({"observation": torch.sin})
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"observed_key": 5}, "observed_key of KalmanFilter is a key"),
-        ({"observation_key": ()}, "observation_key of KalmanFilter is a key"),
-        ({"init_key": b"is_init"}, "init_key of KalmanFilter is a key"),
-        ({"control_keys": "action"}, "control_keys of KalmanFilter is a list of keys"),
-        ({"prefix": 3}, "prefix of KalmanFilter is a name"),
-        ({"update_at_reset": 1}, "update_at_reset of KalmanFilter is True or False"),
-        ({"observd_key": "seen"}, "KalmanFilter takes no argument 'observd_key'; it takes transition,"),
-    ],
-)
-def test_arguments_are_checked_under_the_name_of_the_class_that_was_called(arguments, message):
-    with pytest.raises(TypeError, match=message):
-        random_walk(**arguments)
-
-
-def test_a_class_of_a_users_own_checks_its_keys_too():
-    class Own(GaussianPrior):
-        def __init__(self, *, own_key: "tuple[str, ...]" = (), **kwargs):
-            super().__init__([0.0], [1.0], **kwargs)
-
-    with pytest.raises(TypeError, match="out_keys of Own"):
-        Own(out_keys="belief")
-    assert isinstance(TensorDictModule(nn.Identity(), ["a"], ["b"]), nn.Module)
-    with pytest.raises(TypeError, match="trainable of ConstantNoise is True or False"):
-        ConstantNoise([1.0], trainable="no")

@@ -3,14 +3,15 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.modules import set_recurrent_mode
 
 from tests.filters.test_contract import FILTERS, every_filter, readings
 from tests.waits import NothingWaits
 from torch_denkf.functional.kernels import small_system
 from torch_denkf.functional.linalg import inverse_square_root
 
-deviced = pytest.mark.parametrize("device", ["meta", None], ids=["device", "no device"])
+deviced = pytest.mark.parametrize(
+    "device", ["meta", pytest.param(None, marks=pytest.mark.slow)], ids=["device", "no device"]
+)
 
 
 @pytest.fixture(autouse=True)
@@ -72,14 +73,6 @@ def test_each_way_to_run_stays_on_the_device_and_waits_for_nothing(name, device)
     for way, run in WAYS.items():
         with NothingWaits(), torch.set_grad_enabled(way == "training"):
             assert_there(run(filter, frames, start))
-
-
-@every_filter
-@deviced
-def test_recurrent_mode(name, device):
-    filter, frames, _ = filtered(name, device)
-    with set_recurrent_mode(True), torch.no_grad():
-        assert_there(filter(frames))
 
 
 @every_filter

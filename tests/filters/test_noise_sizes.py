@@ -6,11 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system, toy_denkf, toy_frames
-from torch_denkf.filters import Filter
-from torch_denkf.modules import ConstantNoise, LinearObservation, SubModel
-from torch_denkf.modules.stochastic import deterministic
-from torch_denkf.running import run_module
+from tests.filters.factories import FixedEnsemble, linear_denkf, linear_system, toy_denkf, toy_frames
 
 MEAN, ENSEMBLE = ("belief", "mean"), ("belief", "ensemble")
 
@@ -80,30 +76,6 @@ def test_sizes_that_only_the_entries_tell_are_enough_to_draw_in_bulk(case):
     assert filter.compiled._functions
 
 
-class SizeAtTheStep(NoisyLinear):
-    """A transition that asks for a size of its own."""
-
-    def draw_noise(self, batch_size, *, members=None, here=False, **kwargs):
-        return super().draw_noise(batch_size, members=members, **kwargs) if here else None
-
-    def noise_sizes(self, *values):
-        return {**super().noise_sizes(*values), "here": True}
-
-
-def test_a_size_that_only_the_step_knows_is_found_by_a_trial():
-    F, Q, _, _ = linear_system()
-    filter, frames, outs = linear_denkf("perturbed", noisy=True), readings(3, 5), []
-    filter = filter.with_modules(transition=SizeAtTheStep(F, torch.linalg.cholesky(Q)))
-    for chunk in (0, 2):
-        filter.compile(chunk=chunk, backend="eager")
-        torch.manual_seed(1)
-        outs.append(filter.sequence(frames.copy()))
-        assert filter.step(outs[-1][:, -1].copy())[MEAN].isfinite().all()
-    torch.testing.assert_close(outs[1][MEAN], outs[0][MEAN], rtol=0, atol=1e-12)
-    assert filter.compiled._functions
-    assert set(filter.draw_noise(frames.copy())["noise"].keys()) == {"transition", "analysis"}
-
-
 def test_flipout_in_a_sensor_has_a_perturbation_of_its_own_at_each_time():
     """As if the sequence were taken step by step; the noise drawn where it is needed is that drawn in bulk."""
     filter = toy_denkf(sensor_layer="flipout", layer="none", action=False)
@@ -115,91 +87,3 @@ def test_flipout_in_a_sensor_has_a_perturbation_of_its_own_at_each_time():
             given["noise", "sensor"] = filter["sensor"].draw_noise([3, 5], time=True, dtype=torch.float64)
         outs.append(filter.sequence(given)["sensor", "ensemble"])
     assert outs[0].equal(outs[1])
-
-
-class SideBySide(SubModel):
-    """Two noise modules for one reading, one behind the other."""
-
-    def __init__(self, *modules):
-        super().__init__(nn.ModuleList(modules), ["observation"], [("sensor", "noise")])
-
-    def on_entries(self, entries, call):
-        parts = [run_module(module, entries, call)[module.out_keys[0]] for module in self.module]
-        return {("sensor", "noise"): torch.cat(parts, -1)}
-
-
-def test_parts_of_different_sizes():
-    plain, other = linear_denkf("perturbed", noisy=True), linear_denkf("perturbed", noisy=True)
-    _, _, H, R = linear_system()
-    sd = torch.cat([R, R[:1]]).sqrt()
-    observation = LinearObservation(torch.cat([H, H[:1]]))
-    plain = plain.with_modules(observation=observation, noise=ConstantNoise(sd, in_key="observation"))
-    parts = (ConstantNoise(part, in_key="observation") for part in (sd[:1], sd[1:]))
-    other = other.with_modules(observation=observation, noise=SideBySide(*parts))
-    frames, outs = TensorDict({"observation": torch.randn(2, 5, 3)}, [2, 5]), []
-    assert set(other.draw_noise(frames.copy())["noise"].keys()) == {"transition", "analysis"}
-    for filter in (plain, other):
-        torch.manual_seed(1)
-        outs.append(filter.sequence(frames.copy())[MEAN])
-    torch.testing.assert_close(outs[1], outs[0])
-
-
-def test_a_deterministic_run_does_not_change_what_is_drawn_after_it():
-    filter, other = toy_denkf(), toy_denkf()
-    other.load_state_dict(filter.state_dict())
-    frames = toy_frames((3, 5))
-    with deterministic(other):
-        other.sequence(frames.copy())
-    outs = []
-    for model in (filter, other):
-        torch.manual_seed(1)
-        outs.append(model.sequence(frames.copy())[MEAN])
-    torch.testing.assert_close(*outs, rtol=0, atol=0)
-    assert {*other.draw_noise(frames.copy())["noise"].keys()} == {"initial", "sensor", "transition"}
-
-
-class Normalised(nn.Module):
-    """Batch normalisation of all rows, which in training needs more than one."""
-
-    def __init__(self):
-        super().__init__()
-        self.norm = nn.BatchNorm1d(2)
-
-    def forward(self, reading):
-        return self.norm(reading.flatten(0, -2)).reshape(reading.shape)
-
-
-def test_a_batch_normalisation_does_not_notice_the_trial_step():
-    """It counts one batch a sequence, in training; and all noise is drawn in bulk."""
-    sensor = TensorDictModule(Normalised(), ["raw"], ["observation"])
-    plain = linear_denkf("perturbed", noisy=True)
-    filter = Filter({"normal": sensor, **dict(plain.module.named_children())}, initial=plain.initial)
-    frames = TensorDict({"raw": torch.randn(3, 5, 2)}, [3, 5])
-    drawn = filter.draw_noise(frames.copy())
-    assert sensor.module.norm.num_batches_tracked == 0
-    assert {*drawn["noise"].keys()} >= {"transition", "analysis"}
-    filter.sequence(frames)
-    assert sensor.module.norm.num_batches_tracked == 1
-    assert all(part.training for part in filter.modules())
-
-
-def test_the_trial_step_calls_no_hooks():
-    filter, calls = linear_denkf("perturbed", noisy=True), []
-    filter["analysis"].register_forward_hook(lambda *_: calls.append("hook"))
-    filter["transition"].register_forward_pre_hook(lambda *_: calls.append("pre-hook"))
-    filter.draw_noise(readings(3, 5))
-    assert not calls
-
-
-def test_what_a_module_asked_for_before_is_drawn_where_its_reading_has_not_come():
-    filter = linear_denkf("perturbed", noisy=True)
-    filter.draw_noise(readings(3, 5))
-    drawn = filter.draw_noise(TensorDict({}, [3, 5]))["noise"]
-    assert drawn["analysis"].shape == (3, 5, 6, 2)
-
-
-def test_a_draw_of_which_a_part_is_missing_is_drawn_whole():
-    filter, frames = toy_denkf(layer="flipout"), toy_frames((3, 5))
-    drawn = filter.draw_noise(frames.copy())["noise", "transition"].exclude("perturbation")
-    frames["noise", "transition"] = drawn
-    assert {*filter.draw_noise(frames)["noise", "transition"].keys()} == {"signs", "perturbation"}

@@ -4,11 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torchrl.envs import TransformedEnv
 
-from tests.filters.factories import linear_denkf
 from tests.filters.test_contract import FILTERS, every_filter, readings
-from tests.transforms.envs_for_tests import base_env
 from torch_denkf.baselines import BackpropKF
 from torch_denkf.filters import KalmanFilter
 from torch_denkf.modules import (
@@ -17,14 +14,12 @@ from torch_denkf.modules import (
     FromSensor,
     GaussianAround,
     GaussianPrior,
-    Initial,
     LearnedObservation,
     LearnedTransition,
     LinearObservation,
     LinearTransition,
     MomentPrior,
 )
-from torch_denkf.transforms import DEnKFTransform
 
 
 def memories(*tensors):
@@ -75,16 +70,6 @@ def test_every_way_to_run_a_filter_writes_memory_of_its_own(float64, name, batch
     check_apart(filter, entries(policy, keys), before)
 
 
-def test_a_transform_writes_memory_of_its_own(float64):
-    filter = linear_denkf()
-    env = TransformedEnv(base_env(seed=0), DEnKFTransform(filter))
-    reset = env.reset()
-    check_apart(filter, entries(reset, filter.belief_keys), TensorDict({}))
-    row = env.rand_action(reset)
-    before = row.copy()
-    check_apart(filter, entries(env.step(row)["next"], filter.belief_keys), before)
-
-
 def test_a_belief_that_is_written_to_leaves_the_next_episode_alone():
     one = torch.eye(1)
     filter = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
@@ -98,18 +83,6 @@ def test_a_belief_that_is_written_to_leaves_the_next_episode_alone():
     assert one.item() == 1.0
     step = filter.step(fresh.set("observation", torch.ones(3, 1)))
     assert torch.allclose(step["belief", "mean"], torch.full((3, 1), 2 / 3))  # gain (1 + 1) / (1 + 1 + 1)
-
-
-def test_a_belief_around_a_state_is_not_that_state():
-    state = torch.tensor([1.0, 2.0])
-    belief = GaussianAround([0.5, 0.5])
-    filter = KalmanFilter(
-        torch.eye(2), torch.eye(2), process_noise_cov=torch.eye(2), noise_cov=torch.eye(2), mean=state, cov=torch.eye(2)
-    )
-    filter = filter.with_modules(initial=belief)
-    row = filter.initialise(TensorDict({"state": state}))
-    row["belief", "mean"].add_(1.0)
-    assert row["state"].tolist() == [1.0, 2.0]
 
 
 # ------------------------------------------------------------------------------------------------------- constructors
@@ -159,38 +132,3 @@ def test_constructors_copy_what_they_are_given(name, kind):
     assert before
     for key, value in before.items():
         assert torch.equal(after[key], value), key
-
-
-def test_one_matrix_for_all_is_four_matrices():
-    one = torch.eye(1)
-    filter = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
-    buffers = dict(filter.named_buffers())
-    assert len(memories(*buffers.values())) == len(buffers) == 6
-
-
-def test_a_parameter_that_would_not_be_trained_is_refused():
-    learned = nn.Parameter(torch.eye(2))
-    with pytest.raises(ValueError, match="matrix asks for a gradient and would never be trained"):
-        LinearObservation(learned)
-    transition = LinearTransition(learned, torch.eye(2), trainable=True)
-    assert isinstance(transition.matrix, nn.Parameter)
-    assert transition.matrix is not learned
-
-
-class Foreign(Initial):
-    """An initial belief of a user's own that hands out its constants."""
-
-    def __init__(self):
-        super().__init__(nn.Identity(), [], [("belief", name) for name in ("ensemble", "mean", "var")])
-        self.register_buffer("members", torch.arange(12.0).reshape(6, 2))
-        self.ensemble_size, self.state_dim = 6, 2
-
-    def compute(self, *, batch_size):
-        return tuple(x.expand(*batch_size, *x.shape) for x in (self.members, self.members[0], self.members[1]))
-
-
-def test_an_initial_belief_of_a_users_own_may_hand_out_its_constants():
-    filter = linear_denkf(initial=Foreign())
-    row = filter.initialise(TensorDict({}, []))
-    row["belief", "ensemble"].zero_(), row["belief", "mean"].zero_()
-    assert filter.initial.members.flatten().tolist() == list(range(12))

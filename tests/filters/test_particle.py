@@ -8,40 +8,15 @@ from tensordict import TensorDict
 
 from tests.filters.differences_for_tests import check_largest_gradients
 from tests.filters.factories import (
-    OBS,
     NoisyLinear,
     assert_equal,
     linear_system,
-    make_dyadic,
     random_draws,
-    stepwise,
     toy_frames,
 )
 from tests.filters.particle_for_tests import BELIEF, SCHEMES, E, bootstrap, toy_filter
 from torch_denkf.filters import ParticleFilter
-from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("learned", [False, True])
-@pytest.mark.parametrize(("batch", "masks", "update_at_reset"), [((3, 12), 1, False), ((2, 2, 6), OBS, True)])
-def test_step_equals_sequence_bit_for_bit(float64, scheme, learned, batch, masks, update_at_reset):
-    filter = toy_filter(scheme, learned, update_at_reset=update_at_reset)
-    make_dyadic(filter["sensor"])
-    if not learned:
-        make_dyadic(filter["noise"])
-    frames = toy_frames(batch, masks=masks)
-    frames["measurement"] = (frames["measurement"] * 16).round() / 16
-    assert frames["is_init"][..., 1:, :].any()
-    filter.draw_noise(frames)
-    # Of the sensor, the prior, the motion noise and the stochastic network under it; and of resampling.
-    drawn = {"sensor", "initial.initial", "transition.transition", "transition.transition.transition"}
-    assert set(frames["noise"].keys()) == drawn | ({"transition"} if scheme in ("systematic", "soft") else set())
-    steps, sequence = stepwise(filter, frames), filter.sequence(frames.copy())
-    # Sums over 8 rows of a matrix product may come in another order for another number of rows: 1e-16.
-    assert_equal(steps, sequence, list(dict.fromkeys(filter.out_keys)), atol=1e-12)
-    assert (sequence["belief", "log_weight"].logsumexp(-1).abs() < 1e-12).all()
-    assert not sequence["belief", "mean"][..., 1, :].equal(sequence["belief", "mean"][..., 0, :])
+from torch_denkf.modules import ConstantNoise, GaussianLikelihood, LinearObservation
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -60,15 +35,6 @@ def test_resets_start_from_equal_weights(float64, scheme):
     row, time = (start & (torch.arange(12) > 0)).nonzero()[0].tolist()
     tail = filter.sequence(frames[row : row + 1, time:].copy())
     assert_equal(tail[0], out[row, time:], BELIEF, atol=1e-12)
-
-
-def test_stored_belief_continues(float64):
-    filter = toy_filter()
-    frames = filter.draw_noise(toy_frames((2, 9), resets=False))
-    whole = filter.sequence(frames.copy())
-    tail = filter.sequence(whole[:, 4:].copy().set("noise", frames["noise"][:, 4:]))
-    # The action of the step before is not in the tail; it starts from the belief at 4, with the action at 4.
-    assert_equal(tail, whole[:, 4:], BELIEF, atol=1e-12)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -128,24 +94,6 @@ def test_resampling_heeds_a_mask_of_another_name(float64, scheme):
     for t in (3, 4):
         assert found["forecast", "log_weight"][:, t].equal(found["belief", "log_weight"][:, t - 1]), "not resampled"
     assert found["forecast", "log_weight"][:, 2].std() < found["belief", "log_weight"][:, 2].std()
-
-
-def test_the_default_likelihood_heeds_a_mask_of_another_name(float64):
-    """Without a likelihood of its own the filter makes one: the mask is for that, too."""
-    F, Q, H, R = linear_system()
-    prior = GaussianPrior([1.0, -1.0], [1.0, 1.4], ensemble_size=20)
-    noise = ConstantNoise(R.sqrt(), in_key=("sensor", "ensemble"), out_key=("camera", "r"))
-    parts = (NoisyLinear(F, torch.linalg.cholesky(Q)), None, LinearObservation(H))
-    options = {"initial": prior, "noise": noise, "observation_key": ("sensor", "ensemble")}
-    usual, renamed = (ParticleFilter(*parts, **options, **key) for key in ({}, {"observed_key": "up"}))
-    frames = TensorDict({"sensor": {"ensemble": torch.randn(3, 8, 1, 2)}}, [3, 8])
-    frames["observed"] = torch.rand(3, 8, 2) < 0.6
-    frames = usual.draw_noise(frames)
-    expected = usual.sequence(frames.copy())
-    frames["up"] = frames["observed"]
-    assert_equal(renamed.sequence(frames.copy().exclude("observed")), expected, BELIEF)
-    frames["observed"] = ~frames["observed"]  # somebody else's
-    assert_equal(renamed.sequence(frames.copy()), expected, BELIEF)
 
 
 # ------------------------------------------------------------------------------------------------- gradients

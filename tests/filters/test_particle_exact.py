@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from tests.filters.factories import linear_kalman, linear_system, random_draws
 from tests.filters.particle_for_tests import E, bootstrap, readings
@@ -89,17 +88,6 @@ def test_innovation_and_nis_are_the_kalman_filters(float64):
     assert (out[nis][:, 7] == 0).all()
     assert (out[innovation].masked_select(~td["observed"]) == 0).all()
     assert (out[nis][:, 1:7] > 0).any()
-
-
-@pytest.mark.parametrize("way", ["prediction", "nan"])
-def test_innovation_and_nis_in_other_ways_of_running(float64, way):
-    filter = bootstrap(50)
-    td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
-    if way == "nan":
-        td["observation"], td["observed"] = torch.full((2,), torch.nan), torch.tensor([False])
-    out = filter.predict(td) if way == "prediction" else filter.step(td)
-    assert out["info", "nis"].tolist() == [0.0]
-    assert out["info", "innovation"].tolist() == [0.0, 0.0]
 
 
 def test_the_estimate_of_the_likelihood_is_unbiased(float64):

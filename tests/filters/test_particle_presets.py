@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.factories import OBS, M, NoisyLinear, assert_equal, linear_system, toy_frames
-from tests.filters.particle_for_tests import BELIEF, E, bootstrap, toy_parts
+from tests.filters.particle_for_tests import BELIEF, bootstrap, toy_parts
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation
 from torch_denkf.filters import DPF, MixtureParticleFilter, ParticleFilter
@@ -18,7 +18,6 @@ from torch_denkf.modules import (
     LinearObservation,
     NoisyTransition,
 )
-from torch_denkf.modules.particles import ResampledTransition, with_weights
 
 
 def test_dpf():
@@ -72,26 +71,6 @@ def test_a_raw_reading_is_read_where_the_key_says(float64, preset):
 
     with pytest.raises(ValueError, match="say where the reading is: observation_key="):
         preset(motion, None, LinearObservation(H), noise=noise, **options)
-
-
-def test_a_likelihood_of_ones_own_has_the_key_itself():
-    parts = toy_parts()
-    likelihood = LearnedLikelihood(M, OBS, num_cells=(8,), encoding_key="measurement")
-    with pytest.raises(ValueError, match=r"give them to yours instead, the key as .* encoding_key="):
-        DPF(**parts, likelihood=likelihood, observation_key="measurement")
-
-
-def test_what_is_there_already_is_kept():
-    parts = toy_parts()
-    transition = ResampledTransition(parts.pop("transition"), "transport")
-    initial = with_weights(parts.pop("initial"))
-    filter = ParticleFilter(transition, initial=initial, noise=DiagonalNoise(OBS), **parts)
-    assert filter["transition"] is transition
-    assert filter.initial is initial
-    assert filter.carry_keys == [("belief", "ensemble"), ("belief", "log_weight")]
-    # The number of particles is the prior's: all noise of a sequence can be drawn in bulk.
-    noise = filter.draw_noise(toy_frames((3, 6)))["noise"]
-    assert noise["transition.transition"].shape[:3] == noise["transition.transition.transition"].shape[:3] == (3, 6, E)
 
 
 def test_clones_of_past_velocities_are_resampled_along():

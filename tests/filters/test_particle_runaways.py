@@ -4,19 +4,14 @@ The motion x + 0.2 (x - x^3) has two stable points, -1 and 1, and throws whateve
 some steps; with a prior of standard deviation 2 every tenth particle does.
 """
 
-import warnings
-
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torchrl.envs import TransformedEnv
 
-from tests.filters.composed import ReplayedFrames
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, Select, SubModel
-from torch_denkf.transforms import DEnKFTransform
 
 STEPS, EVERY, Q, R, PRIOR = 48, 6, 0.1, 0.3, 2.0
 WHOLE = 45  # the first step and whole chunks of four: what is left over would be compiled by itself
@@ -107,6 +102,7 @@ def test_particles_that_run_away_leave_the_others_as_they_are(resampling, dtype)
     assert abs(error - np.sqrt(((mean - states[EVERY - 1 :]) ** 2).mean())) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The variance")
 @pytest.mark.parametrize("ceiling", [1e12, pytest.param(None, marks=pytest.mark.slow)])
 def test_a_loop_a_sequence_and_a_compiled_sequence_are_the_same(ceiling):
@@ -128,32 +124,6 @@ def test_a_loop_a_sequence_and_a_compiled_sequence_are_the_same(ceiling):
     torch.testing.assert_close(torch.stack(means, 1)[:, after], sequence[MEAN][:, after], rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(compiled[MEAN][:, after], sequence[MEAN][:, EVERY - 1 : WHOLE], rtol=1e-4, atol=1e-4)
     assert sequence[MEAN][:, after].abs().max() < 2.0
-
-
-@pytest.mark.filterwarnings("ignore:The variance")
-def test_an_environment_takes_them_too():
-    readings, observed, states = drive()
-    replayed = frames(readings, observed, 4)
-    replayed["action"], replayed["is_init"] = torch.zeros(4, STEPS, 1), torch.zeros(4, STEPS, 1, dtype=torch.bool)
-    env = TransformedEnv(ReplayedFrames(replayed), DEnKFTransform(cubic_filter(300)))
-    out = env.rollout(STEPS - 1)["next"]
-    error = (out[MEAN][:, EVERY - 2 :, 0] - torch.tensor(states[EVERY - 1 :])).square().mean().sqrt()
-    mean, _ = numpy_bootstrap(readings, observed)
-    assert abs(error - np.sqrt(((mean - states[EVERY - 1 :]) ** 2).mean())) < 0.03
-
-
-def test_the_warning_says_that_particles_have_run_away_once():
-    readings, observed, _ = drive()
-    for options in ({}, {"backend": "eager"}):
-        filter = cubic_filter(100)
-        if options:
-            filter.compile(chunk=4, **options)
-        with warnings.catch_warnings(record=True) as said, torch.no_grad():
-            warnings.simplefilter("always")
-            filter.sequence(frames(readings, observed)[:WHOLE])
-        (text,) = [str(warning.message) for warning in said if "variance_ceiling" in str(warning.message)]
-        assert "some particles have run away" in text
-        assert "near their weighted median until a reading takes their weight" in text
 
 
 @pytest.mark.filterwarnings("ignore:The variance")

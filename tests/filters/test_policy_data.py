@@ -5,8 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.beliefs_for_tests import close
-from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
-from torch_denkf.imperfect import RejectReadings
+from tests.filters.factories import linear_denkf, linear_kalman
 from torch_denkf.modules import FromSensor
 
 FILTERS = {"DEnKF": linear_denkf, "Kalman": linear_kalman}
@@ -79,14 +78,6 @@ def test_an_element_without_a_belief_before_it_starts_from_the_initial_one(name)
     close(out[:, 3], start, filter.belief_keys)
 
 
-@every_filter
-def test_a_compiled_filter_goes_on_from_the_same_belief(name):
-    filter = FILTERS[name]()
-    data, steps = policy_data(filter, anew=(3,))
-    filter.compile(chunk=2, backend="eager")
-    close(filter.sequence(data.copy()), steps, filter.out_keys)
-
-
 def test_the_action_before_drives_the_step_and_need_not_be_stored_twice():
     control = torch.tensor([[0.5], [-1.0]])
     filter = linear_denkf(control=control)
@@ -98,23 +89,6 @@ def test_the_action_before_drives_the_step_and_need_not_be_stored_twice():
     close(filter.sequence(data.copy()), expected[:, 1:], filter.out_keys)
     rows = [filter(data[:, t].copy().set("action", torch.full((2, 1), 9.0))) for t in range(6)]
     close(torch.stack([row.select(*filter.out_keys) for row in rows], 1), expected[:, 1:], filter.out_keys)
-
-
-def test_a_policy_carries_actions_that_need_not_be_there():
-    """A transition that can do without the action: the primer brings it all the same."""
-
-    class Coasting(NoisyLinear):
-        def __init__(self, matrix, control):
-            super().__init__(matrix, control=control)
-            self.in_keys, self.optional_keys = self.in_keys[:1], ["action"]
-
-    filter = linear_denkf()
-    filter = filter.with_modules(transition=Coasting(linear_system()[0], torch.tensor([[0.5], [-1.0]])))
-    assert ("previous", "action") in filter.make_tensordict_primer().actions.values()
-    td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
-    coasting = filter.predict(td.copy())["belief", "mean"]
-    driven = filter.predict(td.copy().set("action", torch.tensor([2.0])))["belief", "mean"]
-    torch.testing.assert_close(driven - coasting, torch.tensor([1.0, -2.0]))
 
 
 @every_filter
@@ -137,41 +111,9 @@ def test_a_reading_that_a_start_does_not_use_may_be_anything(name, update_at_res
         torch.testing.assert_close(filter(first)["belief", "mean"], filter(row.copy())["belief", "mean"])
 
 
-@every_filter
-@pytest.mark.parametrize("update_at_reset", [False, True])
-def test_so_may_it_in_the_sequence_that_a_loss_filters(name, update_at_reset):
-    """Compares at resets in a policy's data and in a recording; behind RejectReadings with gradients."""
-    filter = FILTERS[name](update_at_reset=update_at_reset)
-    data = policy_data(filter, anew=(0, 3))[0]
-    recording = data.select("observation").set("is_init", torch.arange(7).eq(3).expand(2, 7).unsqueeze(-1))
-    for given in (data, recording):
-        broken = given.copy().set("observation", given["observation"].clone())
-        broken["observation"][:, [0, 3]] = torch.nan
-        out = filter.sequence(broken.copy())
-        if update_at_reset:
-            assert out["belief", "mean"][:, 0].isnan().all(), "a sequence raises nothing"
-            continue
-        close(out, filter.sequence(given.copy()), filter.out_keys)
-        broken["observation"].requires_grad_()
-        out = filter.sequence(RejectReadings({"observation": "observed"})(broken.copy()))
-        (gradient,) = torch.autograd.grad(out["belief", "mean"].square().sum(), broken["observation"])
-        assert gradient.isfinite().all()
-
-
 def test_a_start_that_is_made_of_the_reading_uses_it():
     start = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, observation_key="observation")
     broken = TensorDict({"observation": torch.zeros(2, 3, 2)}, [2, 3])
     broken["observation"][1, 0] = torch.nan
     assert linear_denkf(initial=start).sequence(broken.copy())["belief", "mean"][1].isnan().all()
     assert linear_denkf().sequence(broken.copy())["belief", "mean"].isfinite().all()
-
-
-def test_policy_steps_under_vmap():
-    filter = linear_kalman()
-    row = policy_data(filter)[0][:, 0].select("observation", ("previous", "belief"))
-
-    def step(*values):
-        return filter(TensorDict(dict(zip(keys, values, strict=True)), []))["belief", "mean"]
-
-    keys = list(row.keys(True, True))
-    torch.testing.assert_close(torch.vmap(step)(*(row[key] for key in keys)), filter(row)["belief", "mean"])

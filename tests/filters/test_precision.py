@@ -5,17 +5,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.filters.beliefs_for_tests import COV, MEAN, VAR, close
+from tests.filters.beliefs_for_tests import COV, MEAN, close
 from tests.filters.factories import (
     NoisyLinear,
     linear_system,
-    toy_denkf,
-    toy_frames,
 )
 from tests.filters.gaussian_for_tests import linear_filter
-from torch_denkf.applications.car import UnicycleTransition
-from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter
-from torch_denkf.modules import ConstantNoise, GaussianPrior, LinearObservation, MomentPrior, Select, StochasticMLP
+from torch_denkf.filters import EKF, UKF, KalmanFilter
+from torch_denkf.modules import ConstantNoise, LinearObservation, MomentPrior
 
 
 def test_float64_matrices_beside_float32_are_refused():
@@ -64,49 +61,3 @@ def test_no_process_noise_is_zero(float64, kind, q):
     frames = TensorDict({"observation": torch.randn(3, 6, 2)}, [3, 6])
     # The sigma points' ridge is 10 eps of the correlations.
     close(filter.sequence(frames.copy()), exact.sequence(frames.copy()), [MEAN, COV], atol=1e-10)
-
-
-def test_process_noise_is_a_part_of_an_ensemble_filter(float64):
-    torch.manual_seed(0)
-    F, Q, H, R = linear_system()
-    parts = (None, LinearObservation(H), ConstantNoise(R.sqrt(), in_key="observation"))
-    kalman = KalmanFilter(
-        F, H, process_noise_cov=torch.diag(Q.diagonal()), noise=R.sqrt(), mean=torch.zeros(2), cov=torch.eye(2)
-    )
-    prior = GaussianPrior(torch.zeros(2), torch.ones(2), ensemble_size=20_000)
-    filter = DEnKF(
-        NoisyLinear(F), *parts, initial=prior, observation_key="observation", process_noise=Q.diagonal().sqrt()
-    )
-    frames = TensorDict({"observation": torch.randn(8, 2)}, [8])
-    exact, out = kalman.sequence(frames.copy()), filter.sequence(frames.copy())
-    torch.testing.assert_close(out[MEAN], exact[MEAN], rtol=0, atol=0.05)  # 5 standard errors of 20,000 members
-    torch.testing.assert_close(out[VAR], exact[VAR], rtol=0.06, atol=0)
-    collapsed = DEnKF(NoisyLinear(F), *parts, initial=prior, observation_key="observation").sequence(frames.copy())
-    assert (collapsed[VAR][-1] < 0.3 * exact[VAR][-1]).all()
-
-
-def test_a_replaced_network_draws_its_own_noise():
-    filter, frames = toy_denkf(action=False), toy_frames((2, 5), resets=False)
-    filter.sequence(frames.copy())
-    filter["transition"].module = StochasticMLP(3, 3, (16, 16, 4), rate=0.3)
-    assert filter.draw_noise(frames.copy())["noise", "transition"].shape[-1] == 36
-    assert filter.sequence(frames.copy())[MEAN].isfinite().all()
-    filter = filter.with_modules(observation=Select([0, 1]))
-    out = filter.sequence(frames.copy())
-    assert out["forecast", "observation"][:, 1:].equal(out["forecast", "ensemble"][:, 1:, :, :2])
-
-
-@pytest.mark.parametrize("value", [0.1, torch.tensor(0.1), np.float32(0.1)])
-def test_a_number_in_a_dictionary_is_an_entry_of_one(value):
-    filter = DEnKF(
-        UnicycleTransition(torch.zeros_like, dt="seconds"),
-        None,
-        Select([3, 4]),
-        ConstantNoise([0.3, 0.05], in_key="reading"),
-        initial=GaussianPrior([0.0, 0.0, 0.0, 1.0, 0.0], [0.0] * 5, ensemble_size=4),
-        observation_key="reading",
-    )
-    belief = filter.initialise({}).update({"reading": torch.tensor([1.0, 0.0])})
-    out = filter.predict({"seconds": value, "belief": belief["belief"]})
-    torch.testing.assert_close(out["belief", "mean"], torch.tensor([0.1, 0.0, 0.0, 1.0, 0.0]))
-    assert out["seconds"].shape == (1,)

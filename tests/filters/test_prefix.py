@@ -3,17 +3,14 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torchrl.envs import TransformedEnv
 from torchrl.modules import set_recurrent_mode
 from torchrl.modules.utils import get_env_transforms_from_module
 
 from tests.filters.composed import ReplayedFrames
-from tests.filters.factories import linear_denkf, linear_kalman, random_walk
+from tests.filters.factories import random_walk
 from tests.filters.test_contract import FILTERS, every_filter, readings
-from torch_denkf.monitoring import Gated, InnovationMonitor, Monitored, MonitoredSensor
-from torch_denkf.objectives import DEnKFLoss, GaussianLoss
-from torch_denkf.smoothers import EnRTS, FixedLag, RTSSmoother
 from torch_denkf.transforms import DEnKFTransform
 
 MEAN, VAR = ("belief", "mean"), ("belief", "var")
@@ -94,20 +91,6 @@ def test_two_filters_of_one_environment(float64, way):
             torch.testing.assert_close(again[key], out[key], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("way", ["transforms", "policy"])
-def test_two_filters_of_one_name_are_refused(way):
-    frames = frames_of(torch.randn(2, 6, 1), torch.randn(2, 6, 1))
-    filters = [random_walk(observation_key="first"), random_walk(observation_key="second")]
-    if way == "transforms":
-        env = TransformedEnv(ReplayedFrames(frames), DEnKFTransform(filters[0]))
-        with pytest.raises(ValueError, match=r"emits \('belief', 'mean'\) already.*prefix="):
-            TransformedEnv(env, DEnKFTransform(filters[1])).rollout(3)
-        return
-    policy = TensorDictSequential(*filters, ReplayedFrames(frames).player())
-    with pytest.raises(ValueError, match=r"carries \('previous', 'belief', '\w+'\) already.*prefix="):
-        TransformedEnv(ReplayedFrames(frames), get_env_transforms_from_module(policy)).rollout(3, policy)
-
-
 def test_a_belief_that_another_filter_of_the_policy_wrote_is_told():
     one, two = random_walk(), random_walk()
     row = TensorDict({"observation": torch.ones(1)}, [])
@@ -129,37 +112,3 @@ def test_the_belief_of_one_is_the_reading_of_another(float64):
         inner = by_hand(reading[row].flatten().tolist())
         assert out["inner", "belief", "mean"][row].flatten().tolist() == pytest.approx(inner, abs=1e-12)
         assert out["belief", "mean"][row].flatten().tolist() == pytest.approx(by_hand(inner), abs=1e-12)
-
-
-def test_filters_around_filters_keep_the_prefix(float64):
-    frames = TensorDict({"observation": torch.randn(2, 7, 2)}, [2, 7])
-    monitor = InnovationMonitor({"gps": MonitoredSensor("info", 2)}).double()
-    for build in (lambda f: FixedLag(f, 2), lambda f: Gated(f, 2), lambda f: Monitored(f, monitor)):
-        plain, other = build(linear_kalman()), build(linear_kalman(prefix="imu"))
-        assert other.out_keys == [("imu", *key) for key in plain.out_keys]
-        out, expected = other.sequence(frames.copy()), plain.sequence(frames.copy())
-        for key in plain.out_keys:
-            assert torch.equal(out["imu", *key], expected[key])
-
-
-@pytest.mark.parametrize("make", [lambda **k: RTSSmoother(linear_kalman(**k)), lambda **k: EnRTS(linear_denkf(**k))])
-def test_smoothers_and_losses_of_a_filter_with_a_prefix(float64, make):
-    torch.manual_seed(0)
-    frames = TensorDict({"observation": torch.randn(2, 7, 2), "state": torch.randn(2, 7, 2)}, [2, 7])
-    plain, other = make(), make(prefix="imu")
-    out, expected = other.sequence(frames.copy()), plain.sequence(frames.copy())
-    for name in ("mean", "var"):
-        assert torch.equal(out["imu", "smoothed", name], expected["smoothed", name])
-    loss = GaussianLoss if isinstance(plain, RTSSmoother) else DEnKFLoss
-    named_loss, plain_loss = (loss(smoother.filter, nll=1.0)(frames) for smoother in (other, plain))
-    assert dict(named_loss.items()) == dict(plain_loss.items())
-    assert named_loss["loss_nll"] != 0
-
-
-def test_foreign_modules_read_what_stands_under_a_prefix():
-    filter = random_walk(prefix="imu")
-    double = TensorDictModule(lambda mean: 2 * mean, [("imu", "belief", "mean")], ["doubled"])
-    data = TensorDict({"observation": torch.ones(4, 1)}, [4])
-    with set_recurrent_mode(True):
-        out = TensorDictSequential(filter, double)(data)
-    assert torch.equal(out["doubled"], 2 * out["imu", "belief", "mean"])

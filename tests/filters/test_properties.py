@@ -1,6 +1,5 @@
 """What holds of filters for any batch, precision, scale, order of members and unit."""
 
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -158,22 +157,3 @@ def test_a_step_that_observes_nothing_is_a_forecast(seed, batch, name, width):
     for key in filter.carry_keys:
         assert blind[key].isfinite().all()
         close(blind[key], forecast[key])
-
-
-@FIXED
-@given(SEEDS, GAUSSIAN | ENSEMBLE, st.sampled_from([torch.float32, torch.float64]))
-def test_a_filter_keeps_its_precision(seed, name, dtype):
-    system = System(seed, dtype=dtype)
-    filter = system.gaussian(name) if name[0].isupper() else system.ensemble(name)
-    out = filter.sequence(system.frames(seed, (2,)))
-    kinds = {value.dtype for value in out.values(True, True) if value.is_floating_point()}
-    assert kinds == {dtype}
-
-
-@pytest.mark.parametrize("name", ["KalmanFilter", "EKF", "UKF", "BackpropKF"])
-def test_single_precision_is_near_double(name):
-    results = []
-    for dtype in (torch.float32, torch.float64):
-        system = System(3, dtype=dtype)
-        results.append(system.gaussian(name).sequence(system.frames(5, (4,), 50))["belief", "mean"].double())
-    torch.testing.assert_close(*results, rtol=1e-3, atol=1e-4)

@@ -15,7 +15,7 @@ from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import RejectReadings
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, LinearObservation, SubModel, VectorSensor
-from torch_denkf.monitoring import BlackIsMissing, SignGate
+from torch_denkf.monitoring import BlackIsMissing
 from torch_denkf.running import reads_of, writes
 
 
@@ -53,36 +53,12 @@ class Count(SubModel):
         return count + 1
 
 
-class Counted(FixedEnsemble):
-    """An initial belief with the count at the start of an episode."""
-
-    def __init__(self, members):
-        super().__init__(members)
-        self.out_keys = [*self.out_keys, "count"]
-
-    def compute(self, *, batch_size):
-        return *super().compute(batch_size=batch_size), torch.zeros(*batch_size, 1)
-
-
 def test_a_module_of_a_users_own_that_reads_what_it_writes_is_refused():
     with pytest.raises(ValueError, match=r"'count' \(Count\) writes 'count', which the filter also reads from outside"):
         camera(("count", Count()))
     tally = TensorDictModule(lambda count: count + 1, ["count"], ["count"])
     with pytest.raises(ValueError, match=r"'tally' .*writes 'count'"):
         camera(("tally", TensorDictSequential(tally)))
-
-
-def test_what_the_initial_belief_writes_is_carried():
-    filter = camera(("count", Count()), initial=Counted(torch.linspace(-1, 1, 6).unsqueeze(-1)))
-    frames = TensorDict({"flat": torch.randn(2, 5, 4)}, [2, 5])
-    assert filter.sequence(frames)["count"][..., 0].tolist() == [[0, 1, 2, 3, 4]] * 2
-
-
-@pytest.mark.parametrize("make", [BlackIsMissing, lambda: SignGate(2)])
-def test_a_mask_that_nobody_reads_is_refused(make):
-    with pytest.raises(ValueError, match="marks readings as missing in 'seen', which no module of the filter reads"):
-        camera(("front", make()))
-    assert camera(("front", make()), observed_key="seen").structure.optional
 
 
 def every_class(kind=SubModel):

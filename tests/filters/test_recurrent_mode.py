@@ -4,13 +4,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import TransformedEnv
 from torchrl.modules import set_recurrent_mode
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from tests.filters.factories import linear_denkf, linear_with
-from tests.transforms.envs_for_tests import base_env
-from torch_denkf.transforms import DEnKFTransform
 
 MEAN = ("belief", "mean")
 
@@ -51,15 +48,3 @@ def test_frames_of_a_sequence_are_one_and_steps_are_not(float64, mode):
         row["raw"] = out["observation"][:, t]
         row = filter.step(row)
         torch.testing.assert_close(out[MEAN][:, t], row[MEAN], rtol=0, atol=1e-12)
-
-
-def test_an_environment_takes_single_steps_whatever_the_mode():
-    """A collector inside of torchrl's recurrent mode: the beliefs that it stores are those of steps."""
-    filter, rollouts = linear_with({"transition": linear_denkf()["transition"], "push": Pushed()}), []
-    for mode in (False, True):
-        env = TransformedEnv(base_env(seed=0, batch_size=[2], max_steps=[3, 4]), DEnKFTransform(filter))
-        torch.manual_seed(0)
-        with set_recurrent_mode(mode):
-            rollouts.append(env.rollout(6, break_when_any_done=False))
-    assert rollouts[1][MEAN].equal(rollouts[0][MEAN])
-    assert rollouts[1]["next", *MEAN].equal(rollouts[0]["next", *MEAN])

@@ -13,14 +13,11 @@ from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, li
 from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import PairObservation, with_history
-from torch_denkf.filters import Filter, KalmanFilter
+from torch_denkf.filters import Filter
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
     EnsembleAnalysis,
-    KalmanAnalysis,
-    LinearTransition,
-    MomentPrior,
     Select,
 )
 from torch_denkf.transforms import DEnKFTransform
@@ -89,17 +86,6 @@ def test_analyses_inside_sequences_count_all_or_are_refused(float64):
     close(out, exact, [MEAN, VAR])
     likelihood = sum(out[key] for key in filter.structure.likelihoods)
     torch.testing.assert_close(likelihood[:, 1:], exact["info", "log_likelihood"][:, 1:])
-
-
-def test_a_step_on_entries_sees_a_replaced_module():
-    """Forecast variance 2, reading 1: the mean is 2 / (2 + R)."""
-    one = torch.ones(1, 1)
-    filter = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
-    entries = {MEAN: torch.zeros(1), ("belief", "cov"): one, "observation": torch.ones(1)}
-    before = filter.take_step(dict(entries), torch.Size([]))[MEAN]
-    filter = filter.with_modules(analysis=KalmanAnalysis(one, 2 * one))
-    after = filter.take_step(dict(entries), torch.Size([]))[MEAN]
-    torch.testing.assert_close(torch.cat([before, after]), torch.tensor([2 / 3, 1 / 2]))
 
 
 def test_a_module_replaced_inside_a_sequence_is_sorted_anew(float64):
@@ -185,13 +171,6 @@ def test_marks_of_beginnings_stand_above_those_of_ends(float64):
     close(filter.sequence(data), plain, [ENSEMBLE, MEAN])
 
 
-def test_groups_of_next_and_previous_mark_nothing(float64):
-    filter, (data, _) = linear_denkf(), marked()
-    plain = filter.sequence(data.copy())
-    data["next", "agents", "is_init"] = data["previous", "is_init"] = torch.ones(9, 1, dtype=torch.bool)
-    close(filter.sequence(data), plain, [ENSEMBLE, MEAN])
-
-
 def test_other_modules_make_a_new_filter():
     """The filter itself stays as it is, and the modules of both are the same but for the new one."""
     filter = blocks(named=True)
@@ -207,50 +186,6 @@ def test_other_modules_make_a_new_filter():
     assert other["second"].module[1] is not filter["second"].module[1]
     assert other["second"].module[0] is filter["second"].module[0]
     close(other.sequence(frames.copy()), filter.sequence(frames.copy()), [MEAN])
-
-
-def test_a_new_module_that_would_lose_readings_is_named():
-    """One that passes an earlier update by, or is put in by index, raises."""
-    one = torch.eye(2)
-    with pytest.raises(TypeError, match=r"filter.with_modules\({'analysis': module}\)"):
-        linear_with({})["analysis"] = EnsembleAnalysis("sakov")
-    motion = LinearTransition(one, one)
-    wheels = KalmanAnalysis(one, one, observation_key="wheels", belief_prefix="after_wheels")
-    gps = KalmanAnalysis(one, one, observation_key="gps", forecast_prefix="after_wheels")
-    prior = MomentPrior(torch.zeros(2), one)
-    two = Filter({"transition": motion, "wheels": wheels, "gps": gps}, initial=prior)
-    with pytest.raises(ValueError, match=r"'wheels' \(KalmanAnalysis\) takes in .* the reading would be lost"):
-        two.with_modules(gps=KalmanAnalysis(one, one, observation_key="gps"))
-    assert two["gps"] is gps
-
-
-def test_a_module_of_a_list_is_exchanged_by_its_number():
-    filter = Filter(*linear_denkf()._module_iter(), initial=linear_denkf().initial)
-    last = len(filter) - 1
-    for place in (last, str(last)):
-        new = EnsembleAnalysis("sakov", observation_key="observation")
-        assert filter.with_modules({place: new})[last] is new
-
-
-def test_a_new_filter_has_hooks_and_buffers_of_its_own():
-    filter = linear_denkf()
-    other, calls = filter.with_options(check_finite=False), []
-    other.register_forward_hook(lambda *_: calls.append("other"))
-    other.register_buffer("own", torch.zeros(1))
-    filter(filter.initialise(TensorDict({"observation": torch.zeros(3, 2)}, [3])))
-    assert not calls
-    assert "own" not in dict(filter.named_buffers())
-
-
-def test_other_options_are_checked_like_those_of_the_constructor():
-    filter = linear_denkf()
-    for option in ({"prefx": "imu"}, {"initial": filter.initial}, {"prefix": 3}, {"check_finite": "no"}):
-        with pytest.raises(TypeError, match=next(iter(option))):
-            filter.with_options(**option)
-    with pytest.raises(ValueError, match='prefix="next"'):
-        filter.with_options(prefix="next")
-    assert filter.with_options(forecast_keys=None).options() == filter.options()
-    assert filter.with_options(init_key=("a", ("b",))).init_key == ("a", "b")
 
 
 @pytest.mark.parametrize("left_out", [["y0"], ["y1"], ["y0", "y1"]])

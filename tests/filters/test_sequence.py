@@ -22,8 +22,6 @@ from torch_denkf.filters import DEnKF
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
-    FromSensor,
-    ImageSensor,
     LearnedObservation,
     LinearObservation,
     StochasticMLP,
@@ -39,7 +37,7 @@ BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("layer", ["dropout", "flipout"])
 @pytest.mark.parametrize("update_at_reset", [False, True])
-@pytest.mark.parametrize(("batch", "masks"), [((3, 12), 1), ((3, 12), OBS), ((12,), 1), ((2, 2, 6), OBS)])
+@pytest.mark.parametrize(("batch", "masks"), [((3, 12), OBS), ((12,), 1)])
 def test_step_equals_sequence(float64, scheme, layer, update_at_reset, batch, masks):
     filter = toy_denkf(scheme, layer, update_at_reset=update_at_reset)
     make_dyadic(filter["sensor"]), make_dyadic(filter["noise"])
@@ -56,29 +54,6 @@ def test_step_equals_sequence(float64, scheme, layer, update_at_reset, batch, ma
     assert not sequence["belief", "mean"][..., 1, :].equal(sequence["belief", "mean"][..., 0, :])
 
 
-@pytest.mark.parametrize("layer", ["dropout", "flipout"])
-def test_step_equals_sequence_with_images(float64, layer):
-    filter = toy_denkf(layer=layer)
-    filter = DEnKF(
-        filter["transition"],
-        ImageSensor(OBS, image_shape=(2, 9, 12), ensemble_size=E, num_cells=(8,), layer=layer),
-        filter["observation"],
-        filter["noise"],
-        initial=filter.initial,
-    )
-    frames = toy_frames((2, 8)).set("pixels", torch.rand(2, 8, 2, 9, 12))
-    filter.draw_noise(frames)
-    # Convolutions round differently for different numbers of frames (1e-15), and the recursion may amplify it.
-    assert_equal(stepwise(filter, frames), filter.sequence(frames.copy()), filter.out_keys, atol=1e-12)
-
-
-def test_step_equals_sequence_from_the_sensor(float64):
-    initial = FromSensor([0, 2], mean=[0.0, 1.0, 2.0], std=[1.0, 2.0, 3.0], ensemble_size=E)
-    filter = toy_denkf(initial=initial, update_at_reset=True)
-    frames = filter.draw_noise(toy_frames((3, 9)))
-    assert_equal(stepwise(filter, frames), filter.sequence(frames.copy()), filter.out_keys, atol=1e-12)
-
-
 def test_noise_that_is_given_is_kept_and_the_rest_drawn():
     filter = toy_denkf("perturbed")
     frames = toy_frames((3, 5))
@@ -91,11 +66,6 @@ def test_noise_that_is_given_is_kept_and_the_rest_drawn():
     assert again["noise", "sensor"].equal(
         filter.draw_noise(toy_frames((3, 5)), generator=torch.Generator().manual_seed(3))["noise", "sensor"]
     )
-
-
-def test_sequence_leaves_its_noise_out_of_the_result():
-    frames = toy_frames((3, 5))
-    assert toy_denkf().sequence(frames).get("noise", None) is None
 
 
 # -------------------------------------------------------------------------------------------------- resets
@@ -182,27 +152,7 @@ def test_action_is_read_one_step_earlier(float64):
     torch.testing.assert_close(row["belief", "mean"], td["action"][:, 0], rtol=0, atol=1e-14)
 
 
-def test_control_keys_may_be_empty(float64):
-    filter = adds_up_actions(control_keys=())
-    td = TensorDict({"observation": torch.randn(6, 2), "action": torch.randn(6, 2)}, [6])
-    expected = td["action"].cumsum(0) - td["action"][0]
-    torch.testing.assert_close(filter.sequence(td)["belief", "mean"], expected, rtol=0, atol=1e-14)
-
-
 # ---------------------------------------------------------------------------------------------------- masks
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_all_masked_is_pure_prediction(float64, scheme):
-    filter = toy_denkf(scheme)
-    frames = toy_frames((2, 6), resets=False, masks=0)
-    frames["observed"] = torch.zeros(2, 6, 1, dtype=torch.bool)
-    frames["measurement"][:] = torch.nan
-    out = filter.sequence(frames)
-    assert out["belief", "ensemble"].isfinite().all()
-    assert out["belief", "ensemble"].equal(out["forecast", "ensemble"])
-    assert (out["info", "innovation"] == 0).all()
-    assert (out["info", "log_likelihood"] == 0).all()
 
 
 @pytest.mark.parametrize("scheme", ["etkf", "sakov"])
@@ -251,19 +201,6 @@ def test_detach_every_cuts_exactly_there(float64, cut, resets):
         assert (size[t + 1 :] == 0).all()
         (grad,) = torch.autograd.grad(plain["belief", "mean"][:, t].sum(), frames["measurement"], retain_graph=True)
         assert (grad.abs().sum((0, 2))[1 : t + 1] > 0).all()
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("layer", ["dropout", "flipout"])
-def test_gradients_reach_every_sub_model_through_50_steps(scheme, layer):
-    filter = toy_denkf(scheme, layer, sensor_layer=layer, ensemble_size=8)
-    out = filter.sequence(toy_frames((3, 50), resets=False))
-    out["belief", "mean"][:, -1].square().sum().backward()
-    for name in ("transition", "sensor", "observation", "noise"):
-        grads = [parameter.grad for parameter in filter[name].parameters() if parameter.grad is not None]
-        assert grads, name
-        assert all(grad.isfinite().all() for grad in grads), name
-        assert sum(grad.abs().sum() for grad in grads) > 0, name
 
 
 @pytest.mark.parametrize("layer", ["dropout", "flipout"])

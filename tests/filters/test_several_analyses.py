@@ -10,7 +10,7 @@ from tests.filters.beliefs_for_tests import ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import linear_denkf, linear_system, linear_with
 from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.filters import Filter
-from torch_denkf.modules import SubModel, Update
+from torch_denkf.modules import SubModel
 
 TOTALS = [("info", "nis"), ("info", "log_likelihood")]
 
@@ -59,29 +59,6 @@ def test_analyses_side_by_side_may_be_put_together():
     close(filter.step(td), {ENSEMBLE: (single[0][ENSEMBLE] + single[1][ENSEMBLE]) / 2}, [ENSEMBLE])
 
 
-class Scaled(Update):
-    """An update that cannot do without its reading, and writes diagnostics."""
-
-    def __init__(self):
-        super().__init__(nn.Identity(), [ENSEMBLE, "factor"], [ENSEMBLE, MEAN, ("info", "nis")])
-        self.info_prefix = "info"
-
-    def compute(self, ensemble, factor):
-        scaled = ensemble * factor.unsqueeze(-1)
-        return scaled, scaled.mean(-2), factor.square()
-
-
-def test_a_sum_is_left_out_where_one_of_its_parts_is_missing():
-    plain = linear_denkf()
-    filter = Filter({**dict(plain.module.named_children()), "scale": Scaled()}, initial=plain.initial)
-    td = filter.initialise(readings().set("factor", torch.tensor([2.0])))
-    whole, part, alone = filter.step(td.copy()), filter.step(td.copy(), without=["factor"]), plain.step(td.copy())
-    close(part, alone, [ENSEMBLE, MEAN])
-    close(whole, {ENSEMBLE: 2 * alone[ENSEMBLE], ("info", "nis"): alone["info", "nis"] + 4.0}, [ENSEMBLE, TOTALS[0]])
-    close(part, {("info", "analysis", "nis"): alone["info", "nis"]}, [("info", "analysis", "nis")])
-    assert part.get(("info", "nis"), None) is None
-
-
 def test_a_reading_goes_through_several_sensors():
     """The raw entry is the reading, however many modules are between it and the analysis; all of them are left out."""
     plain, (F, _, _, _) = linear_denkf(), linear_system()
@@ -93,15 +70,3 @@ def test_a_reading_goes_through_several_sensors():
     close(filter.predict(td.copy()), {ENSEMBLE: td[ENSEMBLE] @ F.mT}, [ENSEMBLE])
     out = filter.step(td.copy().set("raw", torch.randn(2)))
     close(out, plain.step(td.copy().set("observation", out["observation"])), [ENSEMBLE])
-
-
-def test_a_mask_that_a_module_writes_need_not_be_given():
-    """Readings far off are masked inside the filter; the mask is no input of it."""
-    plain = linear_denkf()
-    near = TensorDictModule(lambda y: y.abs() < 3, ["observation"], ["observed"])
-    filter = linear_with({"near": near})
-    assert "observed" not in filter.in_keys
-    assert "observed" in plain.in_keys
-    frames = TensorDict({"observation": 3 * torch.randn(3, 6, 2)}, [3, 6])
-    masked = frames.copy().set("observed", frames["observation"].abs() < 3)
-    close(filter.sequence(frames), plain.sequence(masked), [ENSEMBLE, MEAN, VAR])

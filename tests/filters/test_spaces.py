@@ -1,6 +1,5 @@
 """Filters and smoothers whose state is an orientation: against closed forms, other filters, and a turned world."""
 
-import shutil
 from functools import partial
 
 import numpy as np
@@ -8,14 +7,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torchrl.envs import TransformedEnv
 
 from tests.filters.beliefs_for_tests import close
-from tests.filters.composed import ReplayedFrames
-from tests.filters.factories import stepwise
 from torch_denkf.baselines import BackpropKF
-from torch_denkf.deployment import export_step, load_step
-from torch_denkf.diagnosis import check_analysis
 from torch_denkf.filters import EKF, UKF, DEnKF, ParticleFilter
 from torch_denkf.functional.manifolds import SO3, Circle, Euclidean, Opposite, Product
 from torch_denkf.fusion import FusedFilter, FusedSensor
@@ -33,14 +27,12 @@ from torch_denkf.modules import (
 )
 from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
-from torch_denkf.transforms import DEnKFTransform
 
 B, T, E, DT = 3, 12, 24, 0.1
 SPACE = Product(SO3(), Euclidean(3))  # orientation, and a gyro's bias in rad/s
 STD, Q, R = [0.2] * 3 + [0.1] * 3, [0.02] * 3 + [0.01] * 3, [0.1] * 3  # standard deviations of tangents
 MEAN, VAR = ("belief", "mean"), ("belief", "var")
 KINDS = ("EKF", "UKF", "perturbed", "etkf", "significance", "fused", "gated", "particles")
-needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="no C++ compiler")
 
 
 @pytest.fixture(autouse=True)
@@ -261,37 +253,6 @@ def test_small_angles_are_plain_numbers(kind):
     assert (out[VAR] / expected[VAR] - 1).abs().max() < (0.05 if kind == "particles" else 0.01)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_numbers_as_a_space_change_nothing(kind):
-    data = TensorDict({"pose": torch.randn(B, T, 2), "start": torch.randn(B, T, 2)}, [B, T])
-    still = nn.Linear(2, 2, bias=False)
-    still.weight.data = torch.tensor([[1.0, 0.1], [0.0, 0.9]])
-    parts = (LearnedTransition(still, residual=False), None, Select([0, 1]), ConstantNoise([0.3, 0.4], in_key="pose"))
-    filters = []
-    for space in (None, Euclidean(2)):
-        options = {"process_noise": [0.1, 0.2], "observation_key": "pose", "reading_space": space}
-        around = AroundState([0.5, 0.6], ensemble_size=E, state_key="start", space=space)
-        if kind in ("EKF", "UKF"):
-            start = GaussianAround([0.5, 0.6], state_key="start", space=space)
-            filters.append({"EKF": EKF, "UKF": UKF}[kind](*parts, initial=start, **options))
-        elif kind == "particles":
-            filters.append(ParticleFilter(*parts[:3], noise=parts[3], initial=around, **options))
-        elif kind == "fused":
-            sensor = FusedSensor(Select([0, 1]), [0.3, 0.4], reading_space=space, delay=2)
-            filters.append(FusedFilter(parts[0], {"pose": sensor}, initial=around, process_noise=[0.1, 0.2]))
-        else:
-            scheme = kind if kind == "perturbed" else "etkf"
-            more = {"localisation": "significance", "threshold": 1.0} if kind == "significance" else {}
-            spaces = {"space": space, "reading_space": space}
-            analysis = EnsembleAnalysis(scheme, observation_key="pose", inflation=1.1, relaxation=0.2, **more, **spaces)
-            filter = DEnKF(*parts, analysis, initial=around, process_noise=[0.1, 0.2])
-            filters.append(Gated(filter, response="reject", window=1, rate=1e-2) if kind == "gated" else filter)
-    noisy = with_noise(filters[0], data)
-    plain, on_space = (filter.sequence(noisy.clone()) for filter in filters)
-    close(on_space, plain, filters[0].belief_keys, atol=1e-11)
-    close(on_space, plain, [("info", "nis"), ("info", "log_likelihood")], atol=1e-9)
-
-
 def test_a_circle_is_an_angle():
     data = TensorDict({"pose": 3 + torch.randn(B, T, 2), "start": torch.full((B, T, 2), 3.0)}, [B, T])
     parts = (
@@ -386,15 +347,6 @@ def test_a_turned_world_turns_what_is_smoothed(kind):
 # ------------------------------------------------------------------------------------------------------ ways to run it
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_step_and_sequence_agree(kind):
-    filter = make(kind)
-    data = log()
-    data["is_init"] = torch.arange(T).reshape(T, 1).expand(B, T, 1) == 0
-    data = with_noise(filter, data)
-    close(stepwise(filter, data.clone()), filter.sequence(data.clone()), [*filter.belief_keys], atol=1e-10)
-
-
 @pytest.mark.parametrize("kind", [*KINDS, "lagged", "gated EKF"])
 def test_a_reading_that_is_missing_is_one_that_is_hidden(kind):
     filter = FixedLag(make("EKF"), 2) if kind == "lagged" else make(kind.split()[-1])
@@ -404,47 +356,6 @@ def test_a_reading_that_is_missing_is_one_that_is_hidden(kind):
     out = filter.predict(start.exclude("pose", "observed").copy())
     assert out[MEAN].isfinite().all()
     close(out, filter.step(start.copy()), filter.belief_keys, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", ["EKF", "UKF", "etkf", "particles"])
-def test_the_transform_says_what_a_sequence_says(kind):
-    filter, data = make(kind), log()
-    data["is_init"] = torch.zeros(B, T, 1, dtype=torch.bool)
-    frames = data.exclude("state")
-    env = TransformedEnv(ReplayedFrames(frames), DEnKFTransform(filter))
-    torch.manual_seed(3)
-    rolled = env.rollout(T - 1, frames_player(env), auto_reset=True)
-    assert rolled["next", *MEAN].isfinite().all()
-    assert (rolled["next", *MEAN][..., :4].norm(dim=-1) - 1).abs().max() < 1e-12
-    if kind in ("EKF", "UKF"):  # without noise of its own
-        close(rolled["next"], filter.sequence(frames.clone())[:, 1:], [MEAN, VAR], atol=1e-10)
-
-
-def frames_player(env):
-    return env.base_env.player()
-
-
-@pytest.mark.slow  # an EKF's compiled step is that of its package, below
-@pytest.mark.parametrize("kind", ["UKF", "EKF", "etkf", "perturbed", "particles"])
-def test_compiled_is_eager(kind):
-    filter, data = make(kind), log(steps=5)
-    data = with_noise(filter, data)
-    eager = filter.sequence(data.clone())
-    filter.compile(chunk=2, backend="aot_eager")
-    close(filter.sequence(data.clone()), eager, filter.belief_keys, atol=1e-10)
-
-
-@needs_compiler
-@pytest.mark.parametrize("kind", ["EKF", pytest.param("etkf", marks=pytest.mark.slow)])
-def test_packaged_is_eager(kind, tmp_path):
-    filter = make(kind)
-    data = with_noise(filter, log())
-    example = filter.initialise(data[0, 0].clone())
-    step = load_step(export_step(filter, example, tmp_path / "step.pt2", compiled=kind == "EKF"))
-    given = {name: example[tuple(name.split(".")) if "." in name else name] for name in step.inputs}
-    out = step(given)
-    eager = filter.step(example.clone())
-    assert (SPACE.minus(out["belief.mean"], eager[MEAN])).abs().max() < 1e-10
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -459,16 +370,6 @@ def test_gradients_are_finite_also_behind_masks_and_half_a_turn_away(kind):
     loss.backward()
     assert data["start"].grad.isfinite().all()
     assert data["pose"].grad.isfinite().all()
-
-
-@pytest.mark.parametrize("kind", ["EKF", "etkf"])
-def test_a_ceiling_holds_the_tangents(kind):
-    filter, data = make(kind, variance_ceiling=0.01), log()
-    data["observed"][:] = False
-    with pytest.warns(UserWarning, match="variance_ceiling"):
-        out = filter.sequence(with_noise(filter, data))
-    assert out[VAR][:, 1:].max() < 0.01 + 1e-12
-    assert (out[MEAN][..., :4].norm(dim=-1) - 1).abs().max() < 1e-12
 
 
 # -------------------------------------------------------------------------------------------------- what it is good for
@@ -493,11 +394,6 @@ def test_errors_are_as_large_as_they_say_and_smoothers_are_better():
 
 
 # -------------------------------------------------------------------------------------------------------- what is told
-
-
-def test_an_analysis_on_spaces_passes_the_check():
-    analysis = EnsembleAnalysis("etkf", space=Euclidean(3), reading_space=Euclidean(2), covariance=True)
-    assert max(check_analysis(analysis).values()) < 1e-3
 
 
 def test_what_does_not_fit_is_refused():

@@ -3,15 +3,12 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
 
-from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.test_contract import fused
 from torch_denkf.baselines.iterated import IEnKS
 from torch_denkf.smoothers import FixedLag
-from torch_denkf.transforms import DEnKFTransform
 
 FILTERS = {
     "ensemble": lambda: FixedLag(linear_denkf(), 3),
@@ -42,19 +39,6 @@ def test_a_sequence_goes_on_from_the_middle(float64, name, begin, stored):
     for key in filter.belief_keys:
         torch.testing.assert_close(out[key], whole[key][:, begin:], rtol=0, atol=1e-12)
     assert not torch.equal(whole["smoothed", "mean"][:, -1], whole["belief", "mean"][:, -1])
-
-
-@every
-def test_an_environment_starts_from_a_stored_belief(float64, name):
-    filter, frames, whole = run(name)
-    rest = frames[:, 4:].exclude("noise").copy()
-    rest["action"] = torch.zeros(2, 5, 1)
-    rest["is_init"] = torch.zeros(2, 5, 1, dtype=torch.bool)
-    env = TransformedEnv(ReplayedFrames(rest), DEnKFTransform(filter))
-    stored = whole[:, 4].select(*filter.belief_keys).clone()
-    reset = env.reset(stored.clone())
-    for key in filter.belief_keys:
-        torch.testing.assert_close(reset[key], stored[key], rtol=0, atol=1e-12)
 
 
 def test_an_iterated_smoother_goes_on_too(float64):

@@ -2,13 +2,9 @@
 
 import pytest
 import torch
-from torch._subclasses.fake_tensor import FakeTensorMode
 
 from torch_denkf.functional.draws import exact_draws
-from torch_denkf.functional.kernels import small_system
 from torch_denkf.functional.kernels.random_bits import balanced_bytes
-from torch_denkf.functional.kernels.resolvents import sum_of_resolvents
-from torch_denkf.modules import StochasticMLP
 
 
 def correlated(members, dim, batch=(50,), scale=1.0):
@@ -53,14 +49,6 @@ def test_with_few_members_they_are_never_worse_than_random_ones(members, dim, st
     assert (errors[1] <= 1.05 * errors[0] + 1e-6).all()  # of 2,000 rows each sum is known to 3 %
 
 
-def test_each_draw_is_standard_normal_beside_many_members():
-    """A third moment of 0, a fourth of nearly 3, and no correlation from member to member but -1 / (E - 1)."""
-    draws = exact_draws(torch.randn(20_000, 32, 2))
-    assert abs(draws.pow(3).mean()) < 0.01
-    assert abs(draws.pow(4).mean() - 3 * 31 / 33 * (31 / 32) ** 2) < 0.02  # of a coordinate on a sphere
-    assert abs((draws[:, 0] * draws[:, 1]).mean() + 1 / 32) < 0.01
-
-
 def test_members_without_spread_and_draws_without_spread():
     alike = torch.ones(32, 3)
     draws = exact_draws(torch.randn(32, 2), alike)
@@ -81,24 +69,6 @@ def test_gradients_are_finite_whatever_the_spread(spread):
     assert torch.autograd.grad(draws.pow(3).sum(), members)[0].isfinite().all()
 
 
-def test_what_is_no_number_stays_in_its_row():
-    normal, ensemble = torch.randn(3, 16, 2), torch.randn(3, 16, 14)
-    whole, ensemble[1, 3, 2] = exact_draws(normal, ensemble), torch.nan
-    ensemble.requires_grad_()
-    draws = exact_draws(normal, ensemble)
-    assert draws[[0, 2]].equal(whole[[0, 2]])
-    assert draws[1].isnan().all()
-    assert torch.autograd.grad(draws[[0, 2]].sum(), ensemble)[0][[0, 2]].isfinite().all()
-
-
-@pytest.mark.parametrize(("members", "dim", "state"), [(8, 3, 4), (9, 2, 5), (12, 5, 6), (20, 9, 10)])
-def test_the_covariance_is_exact_where_room_is_scarce(members, dim, state):
-    """Draws that keep just as many dimensions as they have are nearly dependent, and their rounding is scaled up."""
-    draws = exact_draws(torch.randn(2000, members, dim), torch.randn(2000, members, state))
-    assert (draws.mT @ draws / (members - 1) - torch.eye(dim)).abs().max() < 0.03
-    assert draws.mean(-2).abs().max() < 2e-6
-
-
 @pytest.mark.parametrize("dim", [6, 9])
 def test_with_more_dimensions_than_members_the_mean_alone_is_exact(dim):
     normal = torch.randn(4, 6, dim)
@@ -115,13 +85,6 @@ def test_units_of_the_members_change_nothing(state, float64):
 def test_the_gradient_is_that_of_finite_differences(float64):
     normal, ensemble = torch.randn(2, 8, 2), torch.randn(2, 8, 3, requires_grad=True)
     assert torch.autograd.gradcheck(lambda members: exact_draws(normal, members), ensemble, atol=1e-5)
-
-
-def test_rows_of_a_batch_do_not_know_of_each_other(float64):
-    normal, ensemble = torch.randn(3, 16, 2), torch.randn(3, 16, 4)
-    whole = exact_draws(normal, ensemble)
-    for row in range(3):
-        torch.testing.assert_close(whole[row], exact_draws(normal[row], ensemble[row]))
 
 
 @pytest.mark.parametrize("members", [2, 5, 16, 30, 32, 64, 100, 512])
@@ -142,39 +105,3 @@ def test_units_are_dropped_independently_of_each_other():
     joint = (dropped.mT @ dropped / 32).mean(0)
     off = joint[~torch.eye(8, dtype=torch.bool)]
     assert (off - 1 / 16).abs().max() < 0.004  # of 4000 x 32 pairs, four standard deviations
-
-
-@pytest.mark.parametrize("members", [5, 12, 30, 100, 300])
-def test_no_two_members_are_dropped_in_turn(members):
-    """At a rate of one half two members that always lie half a turn apart would have opposite masks in each unit."""
-    kept = (balanced_bytes((), members, 20_000) < 128).double() * 2 - 1
-    pairs = (kept @ kept.mT / 20_000)[~torch.eye(members, dtype=torch.bool)]
-    assert pairs.min() > -0.45
-    assert abs(pairs.mean() + 1 / members) < 0.02
-    assert pairs.std() < 0.3
-
-
-def test_neighbours_are_not_dropped_together():
-    dropped = (balanced_bytes((), 32, 20_000) < 64).double()
-    assert (dropped[0] * dropped[1]).mean() < 0.1  # at 1/16, and at 0.22 if all units had one order
-
-
-def test_a_network_draws_balanced_masks_for_members_alone():
-    net = StochasticMLP(1, 1, (500,), rate=0.25)
-    assert (net.draw_noise((3,), 32) < 64).sum(-2).eq(8).all()
-    assert not (net.draw_noise((3, 32)) < 64).sum(-2).eq(8).all()
-    assert not (StochasticMLP(1, 1, (500,), rate=0.25, masks="random").draw_noise((3,), 32) < 64).sum(-2).eq(8).all()
-
-
-def test_masks_of_very_many_members_take_little_memory():
-    assert balanced_bytes((), 100_003, 2).float().mean(0).sub(127.5).abs().max() < 0.5
-
-
-@pytest.mark.parametrize(
-    "use", [lambda: balanced_bytes((), 29, 2), lambda: sum_of_resolvents(torch.eye(2), difference=False)]
-)
-def test_constants_of_tensors_without_memory_are_not_kept(use, monkeypatch):
-    monkeypatch.setattr(small_system, "_MADE", {})
-    with FakeTensorMode():
-        use()
-    assert type(use()) is torch.Tensor

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from tests.functional.checks import Shapes
 from torch_denkf.functional import _ensemble_space, analyse
 from torch_denkf.functional.inflation import random_rotation
 
@@ -82,17 +81,6 @@ def test_perturbations_are_drawn_tile_by_tile(small_tiles):
     torch.testing.assert_close(found.ensemble, expected.ensemble, **EXACT)
 
 
-def test_gradients_take_the_plain_route(small_tiles):
-    arguments = problem("sensor", 6, 300, 300)
-    gradients = []
-    for space in ("ensemble", "observation"):
-        forecast = arguments["forecast"].clone().requires_grad_()
-        analyse(**{**arguments, "forecast": forecast}, space=space).ensemble.square().sum().backward()
-        gradients.append(forecast.grad)
-    assert small_tiles == []
-    torch.testing.assert_close(*gradients, **EXACT)
-
-
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("count", [10, 100, 5000])  # observation space; ensemble space, whole and in tiles
 @pytest.mark.parametrize("noise", [1e-5, 1e-7])
@@ -104,18 +92,3 @@ def test_single_precision_keeps_its_digits(scheme, count, noise):
     expected = analyse(**double, space=space).ensemble - double["forecast"]
     found = analyse(**arguments).ensemble.double() - double["forecast"]
     assert (found - expected).norm() / expected.norm() < 1.5e-6
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("gradient", [False, True])
-def test_nothing_of_the_square_of_the_state_is_formed(scheme, gradient):
-    size, dim = 8, 40_000
-    arguments = problem(scheme, size, dim, dim, dtype=torch.float32)
-    arguments["forecast"].requires_grad_(gradient)
-    with Shapes() as shapes:
-        analyse(**arguments)
-    elements = [shape.numel() for shape in shapes.seen]
-    assert max(elements) == size * dim  # not dim * dim
-    if not gradient:  # the result alone is as large as the ensemble
-        assert sum(count > _ensemble_space.TILE_ELEMENTS for count in elements) == 1
-        assert [shape for shape in shapes.seen if shape.numel() == size * dim] == [(size, dim)]

@@ -7,7 +7,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.functional.checks import assert_refused
 from torch_denkf.filters import EKF, DEnKF
 from torch_denkf.functional.manifolds import (
     SE2,
@@ -29,7 +28,6 @@ from torch_denkf.modules import (
     EnsembleAnalysis,
     GaussianAround,
     KalmanAnalysis,
-    LearnedLikelihood,
     LearnedTransition,
     Select,
     UKFAnalysis,
@@ -169,30 +167,3 @@ def test_a_state_on_lines_and_circles_is_that_of_plain_numbers(kind):
     assert plain["mean"][..., 1].max() > 4 > math.pi > wrapped["mean"].narrow(-1, 1, 1).max()
     torch.testing.assert_close(space.minus(plain["mean"], wrapped["mean"]), torch.zeros(2, 12, 3), rtol=0, atol=1e-12)
     torch.testing.assert_close(wrapped["var"], plain["var"], rtol=0, atol=1e-12)
-
-
-def test_wrong_calls_are_refused():
-    assert_refused(ValueError, "circular .* 3", Flat, 3, [3])
-    assert_refused(ValueError, "circular .* -1", Flat, 3, [-1])
-    assert_refused(TypeError, "interpreted as an integer", Flat, 3, [0.5])
-    assert_refused(TypeError, "space is a Space", check_space, "space", 3)
-    assert_refused(ValueError, "point has shape", MIXED.minus, torch.zeros(4), torch.zeros(4))
-    flat = "reading_space is one of numbers and angles here"
-    assert_refused(ValueError, flat, KalmanAnalysis, torch.eye(4), None, reading_space=SO3())
-    learned = {"observation_key": "y", "reading_space": SO3()}
-    with pytest.raises(ValueError, match=flat):
-        LearnedLikelihood(4, 4, **learned)
-    with pytest.raises(ValueError, match="with a observation_key"):
-        LearnedLikelihood(4, 1, reading_space=Circle())
-
-
-def test_a_space_made_in_a_compiled_function_is_the_one_made_outside():
-    """As where a filter's reading has no space of its own."""
-
-    def turned(x):
-        return Flat(x.shape[-1], circular=[1, 2]).plus(x, Euclidean(x.shape[-1]).plus(x, x))
-
-    x = torch.tensor([1.0, 2.0, -3.0])
-    torch._dynamo.reset()
-    torch.testing.assert_close(torch.compile(turned, fullgraph=True, backend="eager")(x), turned(x))
-    assert Flat(4, circular=[1, 2])._runs == ((False, 1), (True, 2), (False, 1))

@@ -63,15 +63,6 @@ def test_masked_components_are_as_if_absent(diagonal):
     assert all(gradient.isfinite().all() for gradient in gradients)
 
 
-def test_nothing_observed_changes_nothing():
-    mean, cov, observation, matrix = problem((2,))
-    observed = torch.tensor([[False], [True]])
-    result = kalman_update(mean, cov, torch.nan * observation, matrix, torch.ones(2, 3), observed=observed)
-    assert torch.equal(result.mean[0], mean[0])
-    torch.testing.assert_close(result.cov[0], cov[0], rtol=1e-15, atol=0)
-    assert result.nis[0] == result.log_likelihood[0] == 0
-
-
 @pytest.mark.parametrize("batch", BATCHES)
 def test_prediction_moves_the_moments_of_samples_exactly(batch):
     mean, cov, _, _ = problem(batch)

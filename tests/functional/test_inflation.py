@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from tests.functional.checks import assert_refused
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.moments import ensemble_cov
@@ -70,9 +69,3 @@ def test_rotations_are_uniform():
     assert (rotation.mean(0) - 1 / 4).abs().max() < 0.016
     assert (rotation.var(0) - 3 / 16).abs().max() < 0.01
     assert abs((torch.linalg.det(rotation) > 0).double().mean() - 0.5) < 0.02
-
-
-def test_errors():
-    assert_refused(ValueError, "ensemble_size must be at least 2", random_rotation, 1)
-    assert_refused(ValueError, "forecast must be", relax_to_prior_spread, torch.zeros(3, 2), torch.zeros(4, 2), 0.5)
-    assert_refused(ValueError, "ensemble must be", inflate, torch.zeros(3), 1.1)

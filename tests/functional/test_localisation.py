@@ -40,16 +40,6 @@ def test_taper_at_the_knots_and_its_curvature():
     torch.testing.assert_close(1 - gaspari_cohn(small, 3.0), small**2 / 18, rtol=2e-3, atol=0)
 
 
-def test_taper_is_a_correlation():
-    places = torch.arange(60, dtype=torch.float64)
-    matrix = gaspari_cohn((places[:, None] - places).abs(), 4.0)
-    assert torch.linalg.eigvalsh(matrix).min() > -1e-10
-
-
-def test_a_radius_must_be_positive():
-    assert_refused(ValueError, "positive, got 0", gaspari_cohn, torch.ones(1), 0)
-
-
 @pytest.mark.parametrize("batch", [(), (2, 3)])
 @pytest.mark.parametrize("sizes", [(6, 5, 3), (5, 4, 4)])
 @pytest.mark.parametrize("tile", [1, 2, 4096])
@@ -103,12 +93,6 @@ def test_single_precision_follows_double():
     torch.testing.assert_close(single.double(), letkf(*parts, near), rtol=2e-5, atol=2e-5)
 
 
-def test_shapes_that_do_not_fit_are_named():
-    forecast, predicted, observation, noise = problem(4, 3, 2)
-    assert_refused(ValueError, r"near\.index", letkf, forecast, predicted, observation, noise, everywhere(5, 2))
-    assert_refused(ValueError, "noise", letkf, forecast, predicted, observation, noise[:1], everywhere(3, 2))
-
-
 def test_neighbours_of_a_taper_are_its_positive_entries():
     taper = torch.tensor([[0.0, 0.3, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0], [0.2, 0.4, 0.1, 0.0]])
     found = neighbours_of_taper(taper, tile=2)
@@ -134,19 +118,3 @@ def test_neighbours_on_a_plane_are_those_of_all_pairs(monkeypatch, period, tile,
     torch.testing.assert_close(dense, expected, rtol=0, atol=1e-15)
     assert found.index.shape[1] == int((expected > 0).sum(1).max())
     assert int((expected > 0).sum(1).min()) == 0  # some see nothing
-
-
-def test_neighbours_of_a_long_line_compare_few_pairs(monkeypatch):
-    """30,000 components: all pairs would be 900 million; those within reach of a tile are below a hundredth of it."""
-    counts = []
-
-    def counted(distance, radius):
-        counts.append(distance.numel())
-        return gaspari_cohn(distance, radius)
-
-    monkeypatch.setattr("torch_denkf.functional.localisation.gaspari_cohn", counted)
-    places = torch.arange(30_000.0).unsqueeze(-1)
-    found = neighbours(places, places, 4.0, period=torch.tensor([30_000.0]), tile=256)
-    assert sum(counts) < 30_000 * 300
-    assert found.index.shape == (30_000, 29)
-    assert found.index[0].sort().values.tolist() == [*range(15), *range(29_986, 30_000)]

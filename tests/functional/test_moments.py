@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from tests.functional.checks import assert_refused
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.moments import ensemble_anomalies, ensemble_cov
 
@@ -19,13 +18,3 @@ def test_moments_are_numpys(batch):
     np.testing.assert_allclose(ensemble_var(ensemble), array.var(-2, ddof=1), **close)
     for index in np.ndindex(*batch):
         np.testing.assert_allclose(ensemble_cov(ensemble)[index], np.cov(array[index].T), **close)
-
-
-@pytest.mark.parametrize("function", [ensemble_mean, ensemble_anomalies, ensemble_var, ensemble_cov])
-def test_a_vector_is_no_ensemble(function):
-    assert_refused(ValueError, r"ensemble must be \[\*B, E, S\]", function, torch.zeros(3))
-
-
-@pytest.mark.parametrize("function", [ensemble_var, ensemble_cov])
-def test_one_member_has_no_variance(function):
-    assert_refused(ValueError, "at least 2 are needed", function, torch.zeros(1, 3))

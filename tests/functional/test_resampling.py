@@ -7,7 +7,6 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
-from tests.functional.checks import assert_compiled_is_eager, assert_refused
 from torch_denkf.functional import (
     crps_ensemble,
     crps_weighted,
@@ -117,13 +116,6 @@ def test_soft_weights_correct_for_the_proposal(alpha):
     torch.testing.assert_close(weights.exp(), ratio / ratio.sum(-1, keepdim=True))
 
 
-def test_alpha_one_changes_nothing():
-    particles, log_weights = problem((5,))
-    out, weights = soft_resample(particles, log_weights, 0.2 + 0.6 * torch.rand(5, 1), alpha=1.0)
-    assert out.equal(particles)
-    torch.testing.assert_close(weights, log_weights)
-
-
 @pytest.mark.parametrize("width", [1, E])
 @pytest.mark.parametrize("alpha", [None, 0.3])
 def test_weighted_sums_are_kept_in_expectation(width, alpha):
@@ -192,14 +184,6 @@ def test_transport_keeps_the_weighted_mean(iterations):
     assert (weights == -math.log(30)).all()
 
 
-def test_transport_does_not_depend_on_units():
-    particles, log_weights = problem((4,))
-    out, _ = transport_resample(particles, log_weights)
-    units, origin = torch.tensor([1e-3, 1e4]), torch.tensor([5.0, -7.0])
-    moved, _ = transport_resample(particles * units + origin, log_weights)
-    torch.testing.assert_close((moved - origin) / units, out, rtol=0, atol=1e-9)
-
-
 def test_transport_without_regularisation_is_the_linear_programme():
     particles, log_weights = problem(size=5)
     scale = ensemble_var(particles).sqrt()
@@ -237,14 +221,6 @@ def test_gradient_of_transport():
     assert torch.autograd.gradcheck(moved, (particles, log_weights))
 
 
-def test_transport_of_one_point():
-    particles = torch.ones(2, 4, 1, requires_grad=True)
-    out, _ = transport_resample(particles, torch.randn(2, 4).log_softmax(-1))
-    torch.testing.assert_close(out, torch.ones(2, 4, 1))
-    out.sum().backward()
-    assert particles.grad.isfinite().all()
-
-
 def test_transport_of_a_single_likely_particle():
     particles, log_weights = problem(size=8, spread=500.0)
     assert effective_sample_size(log_weights) < 1.001
@@ -256,25 +232,6 @@ def test_transport_of_a_single_likely_particle():
 
 
 # ----------------------------------------------------------------------------------------------------- errors
-
-
-def test_errors():
-    particles, log_weights = problem()
-    with pytest.raises(ValueError, match=r"uniform must be \[\*B, 1\] = \[1\] or \[\*B, E\] = \[6\], got \[2\]"):
-        systematic_resample(particles, log_weights, torch.rand(2))
-    with pytest.raises(ValueError, match=r"log_weights must be \[\*B, E\] = \[6\], got \[3\]"):
-        weighted_mean(particles, log_weights[:3])
-    assert_refused(ValueError, r"between 0 and 1; got 1.5", soft_resample, particles, log_weights, torch.rand(1), 1.5)
-    with pytest.raises(ValueError, match="epsilon and iterations must be positive"):
-        transport_resample(particles, log_weights, epsilon=0.0)
-    assert_refused(ValueError, "at least 2", weighted_var, particles[:1], log_weights[:1])
-
-
-def test_compiled_equals_eager():
-    def everything(x, w, u):
-        return [*systematic_resample(x, w, u), *soft_resample(x, w, u), *transport_resample(x, w, iterations=3)]
-
-    assert_compiled_is_eager(everything, *problem((3,)), torch.rand(3, 1))
 
 
 def test_jitter_moves_the_copies_and_has_the_kernels_covariance():
@@ -290,28 +247,6 @@ def test_jitter_moves_the_copies_and_has_the_kernels_covariance():
     width = 0.7 * size ** (-1 / 6)
     expected = width**2 * torch.cov(particles.T)
     torch.testing.assert_close(torch.cov((moved[1:] - particles[0]).T), expected, rtol=0.02, atol=1e-5)
-
-
-def test_jitter_of_few_effective_particles_is_wide():
-    """Two of four particles have all the weight: N is two; their own variance is 1."""
-    particles = torch.tensor([[0.0], [2.0], [50.0], [-70.0]], dtype=torch.float64)
-    log_weights = torch.tensor([0.5, 0.5, 1e-300, 1e-300], dtype=torch.float64).log()
-    picked, ones = particles[[0, 0, 1, 1]], torch.ones(4, 1, dtype=torch.float64)
-    shift = (1 + particles.var() / 8).sqrt() * 2 ** (-1 / 5)
-    moved = jitter_copies(picked, particles, log_weights, ones, factor=0.5)
-    torch.testing.assert_close(moved - picked, 0.5 * shift * torch.tensor([[0.0], [1.0], [0.0], [1.0]]).double())
-    alone = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).log()
-    moved = jitter_copies(particles[[0, 0, 0, 0]], particles, alone, ones)
-    torch.testing.assert_close(moved[1:], particles.std().expand(3, 1))
-
-
-def test_jitter_is_zero_without_copies_or_factor():
-    particles, log_weights = torch.randn(5, 4, 2), torch.randn(5, 4).log_softmax(-1)
-    normal = torch.randn(5, 4, 2)
-    assert jitter_copies(particles, particles, log_weights, normal).equal(particles)
-    copies = particles[:, :1].expand_as(particles)
-    assert jitter_copies(copies, particles, log_weights, normal, factor=0.0).equal(copies)
-    assert_refused(ValueError, "0 or more", jitter_copies, copies, particles, log_weights, normal, factor=-1.0)
 
 
 def test_gradient_of_jitter_is_that_of_finite_differences():

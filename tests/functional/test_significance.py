@@ -1,7 +1,6 @@
 """Localisation by significance: what chance alone explains moves nothing."""
 
 import math
-from functools import partial
 
 import pytest
 import torch
@@ -211,16 +210,6 @@ def test_the_local_module_weighs_as_its_formula(cases):
         LocalEnsembleAnalysis(near, localisation="significance", threshold=torch.ones(5))
 
 
-def test_the_past_has_the_thresholds_of_the_states_own_components(cases):
-    """Where the analysis sees more than the state, the state comes first."""
-    forecast, *given = cases
-    thresholds = torch.tensor([1.0, 2.0, 1.0, 1.0, 2.5])  # a reading is as strict as those of the state on average
-    kept = [EnsembleAnalysis("etkf", localisation="significance", threshold=thresholds[:n]) for n in (5, 2)]
-    past = forecast[..., :2].unsqueeze(-2).expand(-1, -1, 3, -1)
-    whole, own = (analysis.move_past(past, *given) for analysis in kept)
-    torch.testing.assert_close(whole, own, rtol=0, atol=0)
-
-
 def test_more_numbers_than_fit_at_once_are_believed_as_far(float64, monkeypatch):
     """More readings than members solve in ensemble space, so many states in tiles; with significance neither."""
     forecast, reading = torch.randn(5, 40), torch.randn(6)
@@ -228,42 +217,3 @@ def test_more_numbers_than_fit_at_once_are_believed_as_far(float64, monkeypatch)
     expected = analyse(*given, scheme="etkf", significance=1.5).ensemble
     monkeypatch.setattr("torch_denkf.functional.analysis.columns_in_a_tile", lambda *_: 8)
     torch.testing.assert_close(analyse(*given, scheme="etkf", significance=1.5).ensemble, expected, rtol=0, atol=0)
-
-
-def test_a_threshold_that_is_not_a_number_is_not_silent(cases):
-    forecast, *given = cases
-    assert analyse(forecast, *given, scheme="etkf", significance=torch.tensor(torch.nan)).ensemble.isnan().all()
-
-
-def test_a_tensor_is_a_buffer_of_its_own():
-    threshold = torch.tensor([1.0, 2.0])
-    analysis = EnsembleAnalysis("etkf", localisation="significance", threshold=threshold)
-    threshold += 1
-    assert analysis.state_dict()["threshold"].tolist() == [1, 2]
-    with pytest.raises(TypeError, match=r"threshold is a number or a tensor; got \[1.0, 2.0\]"):
-        EnsembleAnalysis("etkf", localisation="significance", threshold=[1.0, 2.0])
-
-
-@pytest.mark.parametrize("analysis", [EnsembleAnalysis, partial(LocalEnsembleAnalysis, torch.ones(5, 2))])
-def test_a_threshold_is_positive(analysis):
-    with pytest.raises(ValueError, match="threshold"):
-        analysis(localisation="significance", threshold=0.0)
-    with pytest.raises(ValueError, match='localisation is "significance" or None'):
-        analysis(localisation="distance")
-
-
-def test_members_that_cannot_show_a_significant_correlation_are_refused(cases):
-    forecast, predicted, reading, noise = cases
-    with pytest.raises(ValueError, match=r"With 24 members no correlation is 5 standard.*is 4.8.*more than 26"):
-        analyse(forecast, predicted, reading, noise, scheme="etkf", significance=5.0)
-    ten = forecast[:, :10], predicted[:, :10], reading, noise  # the largest is 3
-    near = Neighbours(torch.arange(2).expand(5, 2), torch.ones(5, 2))
-    for call in (partial(analyse, *ten, scheme="etkf"), partial(letkf, *ten, near)):
-        with pytest.raises(ValueError, match="With 10 members"):
-            call(significance=3.0)
-        call(significance=2.9)
-
-
-def test_ensemble_space_cannot(cases):
-    with pytest.raises(ValueError, match="significance needs observation space"):
-        analyse(*cases, scheme="etkf", significance=3.0, space="ensemble")

@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from tests.functional.checks import assert_compiled_is_eager, assert_refused
 from torch_denkf.functional import kalman_update, sigma_points, wrap_angles
 from torch_denkf.functional.manifolds import Circle
 from torch_denkf.functional.unscented import unscented_moments, unscented_update, unscented_weights
@@ -155,24 +154,3 @@ def test_angles_are_averaged_and_compared_across_pi():
     )
     torch.testing.assert_close(update.innovation, 0.2 * one, **EXACT)
     torch.testing.assert_close(update.mean, mean + 0.2 * 0.25 / 1.25, **EXACT)
-
-
-def test_errors_say_what_to_do():
-    assert_refused(ValueError, "Use kappa >= 0", unscented_weights, 3, kappa=-3.0)
-    assert_refused(ValueError, "Use kappa >= 0", sigma_points, torch.zeros(3), torch.eye(3), kappa=-3.0)
-    assert_refused(ValueError, r"5 points .* and 7 weights", unscented_moments, torch.zeros(5, 3), unscented_weights(3))
-    points = torch.zeros(7, 3)
-    with pytest.raises(ValueError, match="noise must be variances"):
-        unscented_update(points, points, torch.zeros(3), torch.ones(2), unscented_weights(3))
-
-
-def test_compiled_equals_eager():
-    def step(mean, root, observation):
-        weights = unscented_weights(3)
-        mean, cov = unscented_moments(sigma_points(mean, root @ root.mT).sin(), weights)
-        points = sigma_points(mean, cov + torch.eye(3))
-        update = unscented_update(points, points[..., :1], observation, torch.ones(2, 1), weights)
-        return update.mean, update.cov, update.log_likelihood
-
-    inputs = torch.randn(2, 3, requires_grad=True), torch.randn(2, 3, 3, requires_grad=True), torch.randn(2, 1)
-    assert_compiled_is_eager(step, *inputs, rtol=1e-5, atol=1e-5, gradients=1e-4)

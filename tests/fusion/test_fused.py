@@ -389,29 +389,6 @@ def test_readings_that_cannot_be_true_count_once_and_change_nothing(float64, kin
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_readings_can_be_left_out(float64, joint):
-    frames = readings()[:, 1]
-    frames.exclude("is_init", inplace=True)
-    filter = fused("Kalman", joint=joint, delay=DELAY)
-    row = filter.initialise(frames)
-    for key in ("first_observed", "second_observed"):
-        row[key][:] = True
-    hidden = row.copy()
-    hidden["second_observed"] = torch.zeros(B, 1, dtype=torch.bool)
-    expected = filter.step(hidden.copy())
-    without = row.clone().exclude("second")
-    if joint:
-        with pytest.raises(ValueError, match="hide them with their masks"):
-            filter.step(without, without=["second"])
-    else:
-        assert_close(filter.step(without, without=["second"])["belief", "mean"], expected["belief", "mean"])
-    predicted = filter.predict(row.clone().exclude("first", "second"))
-    for key in ("first_observed", "second_observed"):
-        hidden[key] = torch.zeros(B, 1, dtype=torch.bool)
-    assert_close(predicted["belief", "mean"], filter.step(hidden)["belief", "mean"])
-
-
-@pytest.mark.parametrize("joint", [False, True])
 @pytest.mark.parametrize("gaussian", [True, False])
 def test_the_gradient_reaches_everything_through_late_readings(float64, gaussian, joint):
     torch.manual_seed(0)
@@ -440,18 +417,6 @@ def test_the_gradient_reaches_everything_through_late_readings(float64, gaussian
         lambda: sum(filter.sequence(frames.copy())["belief", key].square().sum() for key in ("mean", "var")),
         filter.parameters(),
     )
-
-
-@pytest.mark.parametrize("kind", ["ensemble", "Kalman"])
-def test_rows_of_a_batch_do_not_know_each_other(float64, kind):
-    frames = readings()
-    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
-    given = {"members": members, "noisy": False} if kind == "ensemble" else {}
-    filter = fused(kind, delay=DELAY, **given)
-    whole = filter.sequence(frames.copy())
-    for row in range(B):
-        alone = filter.sequence(frames[row].copy())
-        assert_close(alone["belief", "mean"], whole["belief", "mean"][row], rtol=0, atol=1e-12)
 
 
 def test_a_fused_filter_is_what_one_would_compose_by_hand(float64):

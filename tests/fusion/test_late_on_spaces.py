@@ -21,9 +21,8 @@ from tests.filters.test_spaces import (
     turned_beliefs,
 )
 from tests.smoothers.small_angles import PROCESS, SMALL, STARTS, assert_small_differences, linear, readings, rotating
-from tests.smoothers.test_smoothers_on_spaces import numbers
-from torch_denkf.functional.manifolds import SO3, Euclidean
-from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering, SensorAttention
+from torch_denkf.functional.manifolds import SO3
+from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
 from torch_denkf.modules import EKFTransition, GaussianAround, UKFTransition, as_process_noise
 from torch_denkf.monitoring import Gated
 
@@ -62,19 +61,6 @@ def arriving(data, late):
 
 
 LATE = torch.tensor([0, 2] * T)[:T]  # that of t=2 before that of t=1, and so on
-
-
-@pytest.mark.parametrize("kind", TRANSITIONS)
-def test_numbers_as_a_space_change_nothing(kind):
-    data, parts, _ = numbers()
-    data["observed"] = torch.rand(B, T, 1) < 0.8
-    outs = [
-        fused(kind, parts, [0.5, 0.6], [0.1, 0.2], [0.3, 0.4], space=space, reading_space=space, late_key="late")
-        for space in (None, Euclidean(2))
-    ]
-    plain, on_space = (filter.sequence(arriving(data, LATE)) for filter in outs)
-    keys = [MEAN, ("belief", "cov"), ("smoothed", "mean"), ("smoothed", "cov"), ("smoothed", "age")]
-    close(on_space, plain, [*keys, ("info", "nis"), ("info", "log_likelihood")], atol=1e-10)
 
 
 @pytest.mark.parametrize("kind", TRANSITIONS)
@@ -120,15 +106,6 @@ def test_a_turned_world_turns_the_belief_and_nothing_else(kind, turn):
     data, turn = arriving(log(), LATE), SO3().exp(torch.tensor(turn))
     here, there = turned_beliefs(filter, turn, data)
     assert_turned(here, there, turn, 1e-9)
-
-
-def test_weights_of_points_are_refused():
-    parts = {"initial": GaussianAround(STD, state_key="start", space=SPACE), "process_noise": Q}
-    weights = SensorAttention({"pose": 3})
-    for reading in (SO3(), None):
-        sensor = FusedSensor(Orientation(), R, reading_space=reading)
-        with pytest.raises(ValueError, match="leave weights= away"):
-            FusedFilter(Turning(), {"pose": sensor}, weights=weights, **parts)
 
 
 @pytest.mark.slow

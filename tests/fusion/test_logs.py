@@ -130,12 +130,6 @@ def test_a_sensor_that_drives_from_an_hour_off(begin):
     assert message_rows(GPS + covered, driving=["imu"], start=0.0)["imu"].isfinite().all()
 
 
-@pytest.mark.parametrize("dtype", [torch.int64, torch.bool, np.float32, "float32"])
-def test_a_dtype_that_holds_no_step(dtype):
-    with pytest.raises(TypeError, match="dtype must be floating"):
-        message_rows(GPS, dtype=dtype)
-
-
 @pytest.mark.parametrize(
     ("log", "options", "error", "match"),
     [
@@ -157,8 +151,3 @@ def test_a_dtype_that_holds_no_step(dtype):
 def test_what_is_no_log(log, options, error, match):
     with pytest.raises(error, match=match):
         message_rows(log, **options)
-
-
-def test_a_masked_array_without_a_masked_element_is_an_array():
-    rows = message_rows([(0.0, "gps", np.ma.masked_equal([1.0, 2.0], 3.0))])
-    assert rows["gps"][1].tolist() == [1.0, 2.0]

@@ -62,6 +62,7 @@ def test_a_log_gives_what_a_filter_gives_that_goes_from_message_to_message(float
     assert_close(out["belief", "cov"][-1].numpy(), cov, rtol=1e-9, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_compiled(float64):
     rows = message_rows(irregular_log(), start=0.0)
     eager, compiled = (

@@ -351,14 +351,6 @@ def test_residuals_tell_size_and_time(gaps):
     assert white.tolist() == pytest.approx([0.5, 1.0], rel=0.06)
 
 
-def test_errors_that_outlast_the_runs():
-    values = residuals(400, 30, time=(1e6, 1e6))
-    bias, white = FadingBias.from_residuals(values)
-    assert (bias.log_time.exp() > 30).all()
-    assert bias.std.tolist() == pytest.approx([2.0, 0.5], rel=0.15)  # 400 draws: sqrt(1 / 800) = 3.5 %
-    assert white.tolist() == pytest.approx([0.5, 1.0], rel=0.06)
-
-
 def test_errors_of_a_whole_run_beside_those_that_fade():
     """400 draws of a run's error: its standard deviation is known to 3.5 %; the others as above."""
     values = residuals(400, 100) + torch.tensor(np.random.default_rng(1).normal(size=(400, 1, 2)) * [1.5, 1.0])
@@ -370,12 +362,6 @@ def test_errors_of_a_whole_run_beside_those_that_fade():
     assert white.tolist() == pytest.approx([0.5, 1.0], abs=0.15)  # what is left of a covariance of 6.5
     one = FadingBias.from_residuals(values)[0]
     assert (one.log_time.exp() > 20).all()  # one time for both kinds fits neither
-
-
-def test_runs_without_an_error_of_their_own():
-    bias, _ = FadingBias.from_residuals(residuals(400, 100), per_run=True)
-    assert (bias.std[:2] < torch.tensor([0.3, 0.15])).all()
-    assert bias.std[2:].tolist() == pytest.approx([2.0, 0.5], rel=0.06)
 
 
 def test_white_residuals_and_few_are_refused():

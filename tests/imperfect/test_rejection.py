@@ -14,7 +14,7 @@ from torchrl.modules.utils import get_env_transforms_from_module
 from tests.borders.test_readings import from_sensor
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman
-from tests.transforms.envs_for_tests import base_env, forked_env, toy_base_env, toy_filter
+from tests.transforms.envs_for_tests import base_env, toy_base_env, toy_filter
 from torch_denkf import DEnKF, DEnKFTransform, FusedFilter, FusedSensor, RejectReadings
 from torch_denkf.functional.manifolds import SE2, SE3, SO3, Circle, Euclidean, Product
 from torch_denkf.modules import EKFAnalysis, LinearTransition, MomentPrior, Select
@@ -369,21 +369,6 @@ def test_in_an_environment(make, update_at_reset, apart):
     assert silent["next", *COUNT].equal((1 + apart) * missing.long())
 
 
-def test_in_workers():
-    alone = rejecting_env(linear_kalman())
-    env = forked_env(2, lambda: rejecting_env(linear_kalman()))
-    try:
-        out = env.rollout(6, break_when_any_done=False)
-        expected = alone.rollout(6, break_when_any_done=False)
-        assert set(out.keys(True, True)) == set(expected.keys(True, True))
-        assert out.shape == (2, *expected.shape)
-        assert out["next", "belief", "mean"].isfinite().all()
-        assert out["next", *COUNT].equal((~out["next", "observed"]).long())
-        assert out["next", *COUNT].sum() > 0
-    finally:
-        env.close()
-
-
 def test_a_filter_that_reads_another_mask_is_told():
     env = TransformedEnv(toy_base_env(), RejectReadings({"observation": "seen"}))
     with pytest.warns(UserWarning, match="RejectReadings marks where 'observation' is missing in 'seen', which no mod"):
@@ -439,20 +424,6 @@ def test_of_several_bad_numbers_one_that_no_mask_hides_raises():
         RejectReadings({"pose": "seen"}, spaces={"pose": SE2()}, on_bad="raise")(
             of("pose", [0.5, NAN, 2.0], seen=torch.tensor([[True, False, True]]))
         )
-
-
-@pytest.mark.parametrize(
-    "mask", [torch.ones(2, 1), torch.ones(2, 3).bool(), torch.ones(2).bool(), torch.ones(1, 1).bool()]
-)
-def test_a_bad_mask_is_named(mask):
-    td = TensorDict({"x": torch.ones(2, 2)}, [2] if mask.shape[0] == 2 else [])
-    with pytest.raises(ValueError, match="the mask 'seen' must be"):
-        RejectReadings({"x": "seen"}, by_component=["x"])(td.set("seen", mask))
-
-
-def test_a_reading_that_is_not_there_is_named():
-    with pytest.raises(KeyError, match=r"RejectReadings reads 'gps', which is missing. There is x."):
-        RejectReadings({"gps": "seen"})(of("x", [1.0]))
 
 
 @pytest.mark.parametrize(

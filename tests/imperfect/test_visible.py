@@ -169,13 +169,6 @@ SEVERAL = {
 }
 
 
-def weighted_cov(td, prefix):
-    weight = td[prefix, "log_weight"].exp()
-    mean = (weight.unsqueeze(-1) * td[prefix, "ensemble"]).sum(-2)
-    anomalies = td[prefix, "ensemble"] - mean.unsqueeze(-2)
-    return mean, (anomalies * weight.unsqueeze(-1)).mT @ anomalies
-
-
 def moments(td, prefix):
     if td.get((prefix, "cov"), None) is not None and td.get((prefix, "ensemble"), None) is None:
         return td[prefix, "mean"], td[prefix, "cov"]

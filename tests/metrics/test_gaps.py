@@ -66,12 +66,6 @@ def test_a_belief_that_is_nan_is_not_left_out(metric):
     assert METRICS[metric](ensemble, gaps).isnan().tolist() == [True, False]
 
 
-def test_a_variance_that_is_nan_is_no_interval():
-    mean, truth = torch.zeros(4, 2), torch.zeros(4, 2)
-    variance = torch.tensor([[1.0, 1.0]] * 3 + [[torch.nan, 1.0]])
-    assert interval_coverage(mean, variance, truth).nan_to_num(-1).tolist() == [-1.0, 1.0]
-
-
 def test_what_needs_whole_rows_says_so():
     ensemble, truth, gaps, _ = problem()
     assert_refused(ValueError, r"truth is NaN in places.*leave out", nees, ensemble.mean(-2), ensemble.var(-2), gaps)

@@ -70,12 +70,6 @@ def test_angles_and_numbers_are_measured_as_they_were(name):
     torch.testing.assert_close(METRICS[name](found), expected)
 
 
-@pytest.mark.parametrize("name", METRICS | RATIO)
-def test_plain_numbers_are_measured_as_they_were(name):
-    found, metric = belief(Euclidean(3), torch.zeros(3), torch.eye(3)), (METRICS | RATIO)[name]
-    torch.testing.assert_close(metric(found, space=Euclidean(3)), metric(found))
-
-
 @pytest.mark.parametrize("turn", [[0.3, -2.0, 1.1], [0.0, 0.0, math.pi], [0.0, 0.6 * math.pi, 0.8 * math.pi]])
 @pytest.mark.parametrize("space", [SO3(), SE3(), SE23(), Product(SO3(), Euclidean(2))], ids=repr)
 def test_a_turn_of_the_world_changes_nothing(space, turn):
@@ -143,10 +137,3 @@ def test_parts_that_are_not_known_do_not_count():
     torch.testing.assert_close(
         RATIO["ratio"](gaps, space=space)[0], RATIO["ratio"]({k: v[rows[0]] for k, v in found.items()}, space=space)[0]
     )
-
-
-def test_wrong_calls_are_refused():
-    found = belief(SO3(), SO3().neutral(), 0.3 * torch.eye(3))
-    for metric in (METRICS | RATIO).values():
-        assert_refused(ValueError, "point has shape|a point of", metric, found, space=SE3())
-        assert_refused(TypeError, "space is a Space", metric, found, space=3)

@@ -4,7 +4,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.functional.checks import assert_refused
 from torch_denkf.functional import analyse
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.modules import EnsembleAnalysis
@@ -88,31 +87,6 @@ def test_bulk_noise_is_what_a_step_would_use(float64, scheme):
     first = module(td.copy().set(("noise", "self"), noise))["belief", "ensemble"]
     kwargs = {"rotation": noise} if scheme == "etkf" else {"perturbation": noise}
     assert first.equal(expected(td, scheme, **kwargs).ensemble)
-
-
-def test_no_bulk_noise_where_none_is_needed():
-    for scheme in ("sensor", "etkf", "sakov"):
-        assert EnsembleAnalysis(scheme).draw_noise([3], members=E, observation_dim=OBS) is None
-        assert EnsembleAnalysis(scheme).noise_names == ()
-
-
-def test_no_bulk_noise_of_unknown_size():
-    assert EnsembleAnalysis("perturbed").draw_noise([3], members=E) is None
-    assert EnsembleAnalysis("perturbed").draw_noise([3], observation_dim=OBS) is None
-    assert EnsembleAnalysis("etkf", rotate=True).draw_noise([3], observation_dim=OBS) is None
-
-
-def test_a_single_reading(float64):
-    td = inputs()
-    td["sensor", "ensemble"] = td["sensor", "ensemble"].mean(-2)
-    assert_belief(EnsembleAnalysis("sakov")(td), expected(td, "sakov").ensemble)
-
-
-def test_errors():
-    assert_refused(ValueError, "'enkf'", EnsembleAnalysis, "enkf")
-    assert_refused(ValueError, "rotate", EnsembleAnalysis, "sakov", rotate=True)
-    ones = torch.ones(2, 2), torch.ones(2, 2)
-    assert_refused(ValueError, 'taper is for scheme "sensor"', EnsembleAnalysis, "etkf", taper=ones)
 
 
 def test_inflation_multiplies_the_components_that_it_is_told(float64):

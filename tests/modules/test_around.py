@@ -6,7 +6,6 @@ import pickle
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 
 from tests.filters.factories import linear_denkf, linear_system
 from torch_denkf.functional.manifolds import Circle, Euclidean
@@ -88,12 +87,6 @@ def test_what_goes_around_passes_on_all_that_the_update_declares(name):
         assert_equal(other(td.copy()), expected)
 
 
-def test_a_plain_module_inside_has_the_defaults():
-    around = Around(TensorDictModule(lambda x: x + 1, ["x"], ["y"]))
-    assert (around.reading_keys, around.info_prefix) == ((), None)
-    assert around(TensorDict({"x": torch.zeros(2)}))["y"].tolist() == [1.0, 1.0]
-
-
 def test_a_scaled_innovation_is_a_scaled_shift_of_the_mean():
     td = frame()
     analysis = EnsembleAnalysis("etkf")
@@ -149,14 +142,6 @@ def test_a_wrapper_in_a_filter_and_in_its_fixed_lag(float64):
         start = one.initialise(frames[:, 0].copy())
         moved = [filter.predict(start.copy())["belief", "mean"].shape for filter in (one, other)]
         assert moved[0] == moved[1]
-
-
-def test_what_is_passed_on_can_be_traced():
-    update, td = ScaledInnovation(EnsembleAnalysis("etkf"), 0.5), frame()
-    entries, call = dict(td.items(True, True)), Call(torch.Size([3]))
-    traced = torch.compile(lambda entries: update.on_entries(entries, call), backend="eager", fullgraph=True)
-    for key, value in traced(entries).items():
-        torch.testing.assert_close(value, update.on_entries(entries, call)[key])
 
 
 def test_a_sub_model_declares_no_more_than_every_part_needs():

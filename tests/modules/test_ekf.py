@@ -3,7 +3,6 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 
 from tests.filters.factories import NoisyLinear
@@ -109,16 +108,6 @@ def test_the_jacobian_has_a_gradient_unless_it_is_stopped(float64):
     assert not out["forecast", "cov"].requires_grad
     assert (torch.autograd.grad(out["forecast", "mean"].sum(), net.layers[0].weight)[0] != 0).any()
     directional_check(lambda: module(td.copy())["forecast", "cov"].sum(), [net.layers[0].weight], step=1e-6, rtol=1e-6)
-
-
-@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
-def test_jacobians_without_a_graph(float64, mode):
-    module, td = EKFTransition(UnicycleTransition(network(2, 2), 0.2), constant_noise(5)), belief(3)
-    expected = module(td.copy())["forecast", "cov"]
-    with mode():
-        got = module(td.copy())["forecast", "cov"]
-    assert not got.requires_grad
-    torch.testing.assert_close(got, expected, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("Transition", TRANSITIONS)
@@ -245,28 +234,8 @@ def test_angles_are_compared_across_pi(float64, Analysis):
     torch.testing.assert_close(innovation[0, 0], torch.tensor(2 * torch.pi - 6.2), rtol=0, atol=1e-12)
 
 
-def test_a_sequence_of_modules_observes(float64):
-    double = TensorDictModule(lambda x: 2 * x, [("forecast", "ensemble")], [("forecast", "double")])
-    select = Select([1], in_key=("forecast", "double"))
-    td = forecast(2, observations=1)
-    out = EKFAnalysis(TensorDictSequential(double, select))(td.copy())
-    H = torch.tensor([[0.0, 2.0, 0.0]])
-    reading = td["sensor", "ensemble"].mean(-2)
-    update = kalman_update(td["forecast", "mean"], td["forecast", "cov"], reading, H, td["sensor", "noise"])
-    assert_is_update(out, update)
-
-
 def test_an_observation_that_ignores_the_state_corrects_nothing(float64):
     td = forecast(2)
     out = EKFAnalysis(LearnedObservation(lambda x: torch.ones_like(x[..., :2])))(td.copy())
     torch.testing.assert_close(out["belief", "mean"], td["forecast", "mean"], rtol=0, atol=0)
     torch.testing.assert_close(out["info", "innovation"], td["sensor", "ensemble"].mean(-2) - 1, rtol=0, atol=1e-14)
-
-
-def test_errors_say_what_is_wrong():
-    with pytest.raises(ValueError, match="of 3 states gives 1 numbers; 2 are due"):
-        EKFAnalysis(Select([0]))(forecast(2))
-    with pytest.raises(KeyError, match=r"EKFAnalysis reads \('sensor', 'noise'\)"):
-        EKFAnalysis(Select([0]))(forecast(2).exclude(("sensor", "noise")))
-    with pytest.raises(KeyError, match=r"EKFTransition reads \('belief', 'cov'\)"):
-        EKFTransition(UnicycleTransition(network(2, 2), 0.1), constant_noise(5))(belief(2).exclude(("belief", "cov")))

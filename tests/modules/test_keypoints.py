@@ -2,9 +2,8 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 
-from torch_denkf.modules import ImageSensor, KeypointTrunk
+from torch_denkf.modules import KeypointTrunk
 from torch_denkf.modules.keypoints import SpatialSoftArgmax
 
 
@@ -59,11 +58,3 @@ def test_it_learns_a_place_from_few_pictures():
     with torch.no_grad():
         error = (head(trunk(images)) - target).square().mean().sqrt()
     assert error < 0.1  # 0.8 pixels; the targets' standard deviation is 0.58
-
-
-def test_it_serves_an_image_sensor_of_any_size():
-    for size in ((3, 112, 112), (3, 64, 80)):
-        sensor = ImageSensor(10, image_shape=size, trunk=KeypointTrunk(3), ensemble_size=4, num_cells=(64,))
-        out = sensor(TensorDict({"pixels": torch.rand(2, *size)}, [2]))
-        assert out["sensor", "ensemble"].shape == (2, 4, 10)
-    assert 200_000 < sum(p.numel() for p in KeypointTrunk(3).parameters()) < 400_000

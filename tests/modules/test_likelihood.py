@@ -56,12 +56,6 @@ def test_gaussian_likelihood_of_what_is_observed():
     assert (one["forecast", "log_likelihood"][1:] == 0).all()
 
 
-def test_covariance_is_refused():
-    td = reading((4,)).set(("sensor", "noise"), torch.eye(OBS).expand(4, OBS, OBS))
-    with pytest.raises(ValueError, match=r"variances \[\*B, O\].*DiagonalNoise"):
-        GaussianLikelihood()(td)
-
-
 @pytest.mark.parametrize("bound", ["scaled", "clipped"])
 @pytest.mark.parametrize("batch", BATCHES)
 def test_learned_likelihood_by_hand(batch, bound):
@@ -129,11 +123,6 @@ def test_learned_likelihood_sees_the_innovation():
     out = model(td)["forecast", "log_likelihood"]
     torch.testing.assert_close(out[[0, 2, 3]], expected[[0, 2, 3]])
     assert (out[1] == 0).all()
-
-
-def test_learned_likelihood_of_an_innovation_has_no_loc():
-    with pytest.raises(ValueError, match="scale alone"):
-        LearnedLikelihood(F, OBS, loc=[0.0, 0.0], observation_key=("sensor", "ensemble"))
 
 
 SEES_READING = LearnedLikelihood(F, OBS, num_cells=(4,), observation_key=("sensor", "ensemble"))

@@ -121,16 +121,6 @@ def test_only_what_an_observation_reaches_is_inflated_and_rotated(float64):
     torch.testing.assert_close(relaxed[:2], relax_to_prior_spread(plain, forecast, 0.7)[:2])
 
 
-def test_a_mask_of_one_entry_stands_for_all(float64):
-    td = inputs()
-    td["observed"] = torch.tensor([[True], [False], [True]])
-    module = LocalEnsembleAnalysis.around(PLACES, PLACES, 1.0, inflation=1.5)
-    one = module(td.clone())["belief", "ensemble"]
-    each = module(td.clone().set("observed", td["observed"].expand(3, S)))["belief", "ensemble"]
-    assert one.equal(each)
-    assert one[1].equal(td["forecast", "ensemble"][1])
-
-
 def lorenz_filter(variables, members, **noise):
     places = torch.arange(float(variables)).unsqueeze(-1)
     return DEnKF(
@@ -170,21 +160,6 @@ def test_seven_members_follow_forty_variables(float64):
     assert 0.85 < nis < 1.15
 
 
-def test_step_equals_sequence(float64):
-    run, filter = lorenz_run(8, batch=2, steps=4), lorenz_filter(8, members=5)
-    run["is_init"] = torch.tensor([[[True], [False], [False], [False]], [[True], [False], [True], [False]]])
-    run["observed"] = torch.rand(2, 4, 8) < 0.7
-    run["noise", "initial"] = torch.randn(2, 4, 5, 8)
-    frames = filter.draw_noise(run)
-    assert frames["noise", "analysis"].shape == (2, 4, 5, 5)
-    sequence = filter.sequence(frames.copy())
-    row = filter.initialise(frames[:, 0].copy())
-    for time in range(4):
-        row = filter(frames[:, time].copy().update(row.select(*filter.carry_keys)))  # a start starts anew
-        for name in NAMES:
-            torch.testing.assert_close(row["belief", name], sequence["belief", name][:, time], rtol=0, atol=1e-12)
-
-
 def test_gradients_equal_finite_differences(float64):
     """Of the error after three steps with respect to log R, through the module and the dynamics."""
     run, filter = lorenz_run(6, batch=2, steps=3), lorenz_filter(6, members=4, trainable=True)
@@ -195,12 +170,6 @@ def test_gradients_equal_finite_differences(float64):
         return (filter.sequence(run.clone())["belief", "mean"] - run["state"]).square().mean()
 
     directional_check(loss, [filter["noise"].log_variance])
-
-
-def test_errors_name_what_is_wrong():
-    assert_refused(ValueError, r"taper must be \[S, O\]", LocalEnsembleAnalysis, torch.ones(3))
-    assert_refused(ValueError, r"near\.index", LocalEnsembleAnalysis(torch.ones(3, S)), inputs())
-    assert_refused(KeyError, "sensor", LocalEnsembleAnalysis(torch.ones(S, S)), inputs().exclude("sensor"))
 
 
 def test_what_would_never_be_trained_is_refused_by_name(float64):

@@ -57,12 +57,6 @@ def test_gradient_at_the_start(float64, r):
     assert model.module.layers[-1].weight.grad.abs().sum() > 0
 
 
-@pytest.mark.parametrize(("r", "floor"), [(0.0, None), (0.5, 0.25), (0.5, 0.3), (0.5, -0.001)])
-def test_bad_r_or_floor(r, floor):
-    with pytest.raises(ValueError, match=r"(r|floor) of DiagonalNoise.* must be finite and (above|at least) 0; got"):
-        DiagonalNoise(2, r=r, floor=floor)
-
-
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
 def test_constant(float64, batch):
     out = variance(ConstantNoise([0.1, 2.0]), torch.randn(*batch, 8, 2), batch)
@@ -76,19 +70,6 @@ def test_constant_in_the_finer_of_the_two_precisions():
     variance = noise(TensorDict({"reading": torch.zeros(3, 1, dtype=torch.float16)}, [3]))["sensor", "noise"]
     torch.testing.assert_close(variance, torch.full((3, 1), 1e-10), rtol=1e-5, atol=0)
     assert noise.compute(torch.zeros(3, 1, dtype=torch.float64), batch_size=[3]).dtype == torch.float64
-
-
-def test_constant_trains_the_logarithm(float64):
-    model = ConstantNoise([0.1, 2.0], trainable=True)
-    variance(model, torch.zeros(2)).sum().backward()
-    torch.testing.assert_close(model.log_variance.grad, torch.tensor([0.01, 4.0]), rtol=1e-14, atol=0)
-
-
-@pytest.mark.parametrize("r", [0.1, [0.1, -1e-9], [-1.0], [float("nan")]])
-@pytest.mark.parametrize("trainable", [True, False])
-def test_constant_bad_r(r, trainable):
-    with pytest.raises(ValueError, match=r"r(, a standard deviation,)? must be .*; got (\[\]|-|nan)"):
-        ConstantNoise(r, trainable=trainable)
 
 
 def test_constant_without_noise_in_some_dimensions(float64):
@@ -138,9 +119,3 @@ def test_scaled_noise_keeps_the_gain_and_scales_the_covariance(float64):
 
     for one, other, ratio in zip(analysis(1.0), analysis(3.0), (1.0, 9.0), strict=True):
         torch.testing.assert_close(other, ratio * one)
-
-
-def test_a_scale_is_in_no_state_dict_and_not_negative():
-    assert list(ScaledNoise(DiagonalNoise(2)).state_dict()) == [f"module.{k}" for k in DiagonalNoise(2).state_dict()]
-    with pytest.raises(ValueError, match="factor must be finite and at least 0; got -1"):
-        ScaledNoise(ConstantNoise([1.0]), -1.0)

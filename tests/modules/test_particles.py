@@ -6,16 +6,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
 from torch_denkf.functional.manifolds import Circle
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules import (
-    AroundState,
     ConstantNoise,
     DiagonalNoise,
-    FromSensor,
     GaussianLikelihood,
     GaussianPrior,
     LearnedTransition,
@@ -52,12 +49,6 @@ def test_initial_weights_are_equal(batch):
     torch.testing.assert_close(out["belief", "mean"], weighted_mean(particles, weights))
     torch.testing.assert_close(out["belief", "var"], weighted_var(particles, weights))
     assert (start.ensemble_size, start.state_dim) == (E, S)
-
-
-def test_initial_weights_keep_what_the_belief_reads():
-    assert with_weights(AroundState(torch.zeros(S), state_key="truth")).in_keys == ["truth"]
-    assert with_weights(FromSensor([0, 1], torch.zeros(S), torch.ones(S))).input_dim == 2
-    assert with_weights(AroundState(torch.zeros(S))).input_dim is None
 
 
 # ------------------------------------------------------------------------------------------------ motion noise
@@ -145,11 +136,6 @@ def test_noise_model_reads_the_weighted_mean(weights):
     assert model.module.layers[0].weight.grad.abs().sum() > 0
 
 
-def test_noise_of_the_wrong_size():
-    noisy = NoisyTransition(shift(), ConstantNoise([1.0, 1.0], in_key=("belief", "ensemble")), [1])
-    assert_refused(ValueError, r"writes 2 variances .* for 1 dims", noisy, belief())
-
-
 # -------------------------------------------------------------------------------------------------- resampling
 
 
@@ -174,15 +160,6 @@ def test_resampling_before_the_motion(scheme, batch):
     assert module.out_keys == [("forecast", "ensemble"), ("forecast", "log_weight")]
 
 
-def test_uniforms_are_drawn_where_none_are_given():
-    module = ResampledTransition(shift())
-    assert module.draw_noise([3, 4]).shape == (3, 4, 1)
-    assert ResampledTransition(shift(), "transport").draw_noise([3]) is None
-    td = belief((100,))
-    first, second = (module(td.copy())["forecast", "ensemble"] for _ in range(2))
-    assert not first.equal(second)
-
-
 @pytest.mark.parametrize("width", [1, OBS])
 def test_no_resampling_in_front_of_a_missing_frame(width):
     td = belief((4,)).set("observed", torch.tensor([[True], [False], [True], [False]]).expand(4, width).clone())
@@ -204,10 +181,6 @@ def test_a_mask_does_not_overrule_the_threshold():
     assert (out["forecast", "log_weight"][0] == -math.log(E)).all(), "observed, and few are effective"
     assert out["forecast", "log_weight"][1:].equal(td["belief", "log_weight"][1:])
     assert out["forecast", "ensemble"][1:].equal(td["belief", "ensemble"][1:] + 1)
-
-
-def test_unknown_scheme():
-    assert_refused(ValueError, "'multinomial'", ResampledTransition, shift(), "multinomial")
 
 
 # ----------------------------------------------------------------------------------------------------- update
@@ -247,12 +220,6 @@ def test_analysis_without_an_observation_keeps_the_weights():
     assert out["belief", "log_weight"][1:].equal(td["forecast", "log_weight"][1:])
     assert (out["info", "log_likelihood"][1:] == 0).all()
     torch.testing.assert_close(out["info", "log_likelihood"][0], torch.ones(1))
-
-
-@pytest.mark.parametrize("key", [("forecast", "log_weight"), ("forecast", "log_likelihood")])
-def test_missing_entries_name_themselves(key):
-    td = TensorDict({"forecast": belief()["belief"].set("log_likelihood", torch.zeros(E))})
-    assert_refused(KeyError, f"ParticleAnalysis reads .*{key[1]}", ParticleAnalysis(), td.exclude(key))
 
 
 def test_a_tempered_likelihood_is_that_of_more_noise(float64):

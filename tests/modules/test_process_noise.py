@@ -6,7 +6,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import UnicycleNoise, UnicycleTransition
 from torch_denkf.modules import CholeskyNoise, ConstantNoise, MappedNoise
 
@@ -104,12 +103,3 @@ def test_unicycle_noise_is_the_effect_of_the_new_velocities(float64, clones):
     torch.testing.assert_close(cov[:, :5, :5], G @ Q @ G.mT, rtol=1e-11, atol=1e-12)
     assert (cov[:, 5:] == 0).all()
     assert (cov[:, :, 5:] == 0).all()
-
-
-def test_errors_say_what_is_wrong():
-    assert_refused(ValueError, r"(r|floor) of CholeskyNoise.* must be finite and above 0", CholeskyNoise, 2, r=0.0)
-    with pytest.raises(ValueError, match=r"(r|floor) of CholeskyNoise.* must be finite and above 0"):
-        CholeskyNoise(2, r=0.1, floor=0.02)
-    with pytest.raises(ValueError, match="maps noise of 2 dimensions to 3; ConstantNoise writes"):
-        MappedNoise(ConstantNoise([1.0], **FORECAST), torch.ones(3, 2))(belief())
-    assert_refused(KeyError, "CholeskyNoise reads", CholeskyNoise(2), TensorDict({}))

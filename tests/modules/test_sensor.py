@@ -72,12 +72,6 @@ def test_uint8_is_divided_by_255():
     assert outputs[0].equal(outputs[1])
 
 
-def test_deterministic_head_gives_equal_members():
-    out = image_sensor(layer="none")(TensorDict({"pixels": torch.rand(*SHAPE)}))["sensor", "ensemble"]
-    assert out.shape == (5, 2)
-    assert out.equal(out[:1].expand(5, 2))
-
-
 @pytest.mark.parametrize("columns", [1, 2])
 def test_unobserved_nan_frame_has_finite_output_and_gradients(columns):
     sensor = image_sensor()
@@ -99,20 +93,6 @@ def test_unobserved_nan_frame_has_finite_output_and_gradients(columns):
     assert out.isfinite().all()
     assert out.equal(expected)
     assert all(g.isfinite().all() and g.equal(e) for g, e in zip(grads, expected_grads, strict=True))
-
-
-def test_partly_observed_frame_is_read():
-    sensor = image_sensor(layer="none")
-    td = TensorDict({"pixels": torch.rand(*SHAPE)})
-    plain = sensor(td.copy())["sensor", "ensemble"]
-    td["observed"] = torch.tensor([False, True])
-    assert sensor(td)["sensor", "ensemble"].equal(plain)
-
-
-@pytest.mark.parametrize("shape", [(2, 9, 13), (9, 12, 2), (9, 12)])
-def test_wrong_image_shape_names_the_key(shape):
-    with pytest.raises(ValueError, match=r"'camera'.*image_shape"):
-        image_sensor(in_key="camera")(TensorDict({"camera": torch.zeros(shape)}))
 
 
 @pytest.mark.parametrize("layer", LAYERS)
@@ -148,15 +128,6 @@ def test_vector_sensor(float64, layer, batch):
     expected = torch.tensor([1.0, 2.0]) + torch.tensor([3.0, 4.0]) * expected
     torch.testing.assert_close(out, expected, rtol=0, atol=1e-13)
     assert not out[..., 0, :].equal(out[..., 1, :])  # members differ
-
-
-def test_vector_sensor_unobserved_nan():
-    sensor = VectorSensor(4, 2, ensemble_size=5)
-    td = TensorDict({"measurement": torch.full((4,), torch.nan), "observed": torch.tensor([False])})
-    out = sensor(td)["sensor", "ensemble"]
-    assert out.isfinite().all()
-    grads = torch.autograd.grad(out.sum(), list(sensor.parameters()))
-    assert all(grad.isfinite().all() for grad in grads)
 
 
 def test_pixels_are_standardised_channel_by_channel():

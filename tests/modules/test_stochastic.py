@@ -194,13 +194,6 @@ class TestBothKinds:
         assert [net.sample for net in outer] == [True, False]
 
 
-def test_no_noise_without_stochastic_layers():
-    net, x = StochasticMLP(3, 2, (4,), layer="none"), torch.randn(5, 3)
-    assert net.draw_noise([5]) is None
-    first, last = net.layers
-    assert net(x).equal(last(F.relu(first(x))))
-
-
 def test_output_gain():
     torch.manual_seed(1)
     plain = StochasticMLP(3, 2, layer="none")
@@ -209,8 +202,3 @@ def test_output_gain():
     x = torch.randn(5, 3)
     torch.testing.assert_close(small(x), 0.125 * plain(x))
     assert (StochasticMLP(3, 2, output_gain=0.0)(x) == 0).all()
-
-
-def test_unknown_layer():
-    with pytest.raises(ValueError, match="bernoulli"):
-        StochasticMLP(3, 2, layer="bernoulli")

@@ -114,10 +114,6 @@ def test_unicycle_gradients(float64):
     assert torch.autograd.gradcheck(step, inputs)
 
 
-def test_unicycle_needs_five_dimensions():
-    assert_refused(ValueError, "4 state dimensions", forecast, UnicycleTransition(still, 0.1), torch.zeros(2, 4))
-
-
 @pytest.mark.parametrize("batch", BATCHES)
 def test_motion_takes_the_velocities_of_the_analysis_and_the_pose_of_the_last_belief(float64, batch):
     before, analysis = torch.randn(*batch, 6, 5), torch.randn(*batch, 6, 5)
@@ -190,8 +186,3 @@ def test_dt_may_be_an_entry_that_varies_over_rows(float64, name, key):
         torch.testing.assert_close(out[entry], torch.stack(rows)[entry], rtol=0, atol=1e-13)
     words = f"{type(module).__name__} reads {key!r}, which is missing"
     assert_refused(KeyError, re.escape(words), module, td)
-
-
-def test_motion_with_a_history_needs_steps_of_one_length():
-    words = "steps of one length; got dt='dt'"
-    assert_refused(ValueError, words, UnicycleMotion, "dt", history_key=("belief", "history"))

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from torch_denkf.modules import ImageSensor, convolutional_trunk
+from torch_denkf.modules import ImageSensor
 from torch_denkf.modules._trunk import activation_bytes
 
 SHAPE = (2, 9, 12)
@@ -83,13 +83,6 @@ def test_recomputation_keeps_the_frames_and_features_alone():
     assert sum(kept[False].values()) > FRAMES * frame_bytes() / 2 - parameters
 
 
-def test_what_a_frame_takes_is_counted():
-    """Table I at 150x50: each convolution's result and its ReLU's, and the features in the order of a vector."""
-    results = 64 * 25 * 75 + 32 * 13 * 38 + 16 * 7 * 19
-    trunk = convolutional_trunk(6).to(memory_format=torch.channels_last)
-    assert activation_bytes(trunk, torch.zeros(1, 6, 50, 150)) == 4 * (2 * results + 2128)
-
-
 def test_bfloat16_is_used_and_is_close():
     frames = torch.rand(FRAMES, *SHAPE)
     plain, half = image_sensor(), image_sensor(trunk_dtype=torch.bfloat16)
@@ -106,13 +99,6 @@ def test_bfloat16_is_used_and_is_close():
         assert (found - wanted).norm() <= 0.05 * wanted.norm() + 1e-6
 
 
-def test_by_default_a_trunk_takes_what_a_processor_keeps():
-    calls = trunk_calls(sensor := ImageSensor(2, ensemble_size=2, num_cells=(8,)))  # 1.1 MB a frame
-    with torch.no_grad():
-        sensor(TensorDict({"pixels": torch.zeros(32, 6, 50, 150)}, [32]))
-    assert calls == [30, 2]
-
-
 def test_a_batch_norm_sees_all_frames():
     trunk = nn.Sequential(nn.Conv2d(2, 4, 3), nn.BatchNorm2d(4), nn.Flatten())
     sensor = image_sensor(trunk=trunk)
@@ -121,8 +107,3 @@ def test_a_batch_norm_sees_all_frames():
     with torch.no_grad():
         sensor(TensorDict({"pixels": frames}, [10_000]))
     assert calls == [10_000]
-
-
-def test_a_budget_is_positive():
-    with pytest.raises(ValueError, match="trunk_memory must be a whole number, at least 1; got 0"):
-        image_sensor(trunk_memory=0)

@@ -1,6 +1,5 @@
 """Black pictures are missing; dark ones, and those of one bright pixel, are not."""
 
-import pytest
 import torch
 from tensordict import TensorDict
 
@@ -27,20 +26,3 @@ def test_the_threshold_is_a_share_of_white_in_both_kinds_of_pictures():
         for pixels in (whole, whole / 255):
             assert BlackIsMissing(0.02)(TensorDict({"pixels": pixels}, [2]))["seen"].tolist() == [[seen]] * 2
     assert not BlackIsMissing(0.6)(TensorDict({"pixels": pictures()}, [3]))["seen"].any()
-
-
-def test_other_keys_and_batches():
-    td = TensorDict({"top": {"rgb": pictures()[[0, 2]].expand(5, 2, 3, 4, 4)}}, [5, 2])
-    check = BlackIsMissing(image_key=("top", "rgb"), out_key=("top", "seen"))
-    assert check(td)["top", "seen"].shape == (5, 2, 1)
-    assert td["top", "seen"][:, :, 0].tolist() == [[False, True]] * 5
-
-
-def test_the_threshold_is_a_share():
-    with pytest.raises(ValueError, match="threshold"):
-        BlackIsMissing(1.5)
-
-
-def test_one_mask_is_not_read_and_written():
-    with pytest.raises(ValueError, match="one black picture would hide all that follow"):
-        BlackIsMissing(out_key="observed")

@@ -15,9 +15,7 @@ from torch_denkf.filters import KalmanFilter
 from torch_denkf.imperfect import Visible
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, KalmanAnalysis, LinearObservation
 from torch_denkf.monitoring import Gated, GatedAnalysis, InnovationMonitor, Monitored, MonitoredSensor
-from torch_denkf.monitoring._calibration import chi_square_table
 from torch_denkf.monitoring.chi_square import chi_square_quantile
-from torch_denkf.monitoring.gating import adapt, disbelief
 
 FILTERS = {
     "etkf": lambda: linear_denkf("etkf", noisy=True),
@@ -52,18 +50,6 @@ def test_an_inert_gate_is_the_filter_bit_for_bit(name, response):
         assert torch.equal(plain[key], gated[key]), key
 
 
-@pytest.mark.parametrize("name", FILTERS)
-@pytest.mark.parametrize("response", RESPONSES)
-def test_a_limit_of_infinity_is_inert_too(name, response):
-    """Here the gate does run the analysis again, with factors of one."""
-    plain, filter = run(FILTERS[name](), data()), FILTERS[name]()
-    gated = Gated(filter, DIM, response=response)
-    gated.gates[0].limits.fill_(torch.inf)
-    out = run(gated, data())
-    for key in filter.out_keys:
-        assert torch.equal(plain[key], out[key]), key
-
-
 def still(variance=1.0, noise=1.0, **kwargs):
     """A state that does not move, in one dimension: the update is a weighted mean."""
     one = torch.eye(1, dtype=torch.float64)
@@ -91,19 +77,6 @@ def test_responses_are_their_closed_forms(value):
         assert out["gate", "factor"].item() == pytest.approx(factor, rel=1e-5), response  # the limits are float32's
         assert out["belief", "mean"].item() == pytest.approx(value / (1 + factor), rel=1e-5), response
         assert out["gate", "nis"].item() == pytest.approx(q)
-
-
-def test_the_pull_of_an_outlier():
-    """Student's falls with distance, Huber's stays, that of a rejected reading is none."""
-    pull = {
-        response: [
-            one_reading(still(1e-3, response=response, window=1), value)["belief", "mean"].item() for value in (20, 200)
-        ]
-        for response in RESPONSES
-    }
-    assert pull["student"][1] < 0.2 * pull["student"][0]
-    assert pull["huber"][1] == pytest.approx(pull["huber"][0], rel=0.02)
-    assert pull["reject"] == [0.0, 0.0]
 
 
 def test_several_steps_decide():
@@ -297,16 +270,6 @@ def test_nothing_behind_the_mask_counts(response):
             assert torch.equal(out["gate", key][:, 4], out["gate", key][:, 7]), (name, key)
 
 
-@pytest.mark.parametrize("name", FILTERS)
-def test_steps_without_a_reading_keep_the_state(name):
-    gated = Gated(FILTERS[name](), DIM)
-    td = run(gated, data())[:, -1]
-    before = td["gate", "terms"].clone()
-    after = gated.predict(td.clone())
-    assert torch.equal(after["gate", "terms"], before)
-    assert (after["gate", "factor"] == 1).all()
-
-
 @pytest.mark.parametrize("response", RESPONSES)
 def test_steps_sequences_and_environments_agree(response):
     F = torch.tensor([[1.0, 0.1], [-0.1, 0.9]])
@@ -467,25 +430,6 @@ def test_with_an_adapted_spread_a_hidden_or_rejected_reading_is_as_good_as_none(
         for key in ("mean", "var"):
             torch.testing.assert_close(outs[kind]["belief", key], outs["none"]["belief", key])
     assert response != "reject" or outs["rejected"]["gate", "factor"].isinf().all()
-
-
-@pytest.mark.parametrize("response", RESPONSES)
-def test_gates_are_open_while_they_are_calibrated(response):
-    """The oracle is the filter without a gate: its innovations are what is calibrated to."""
-    clean = data(runs=20, steps=60, dtype=torch.float32)
-    plain = run(linear_kalman(), clean)["info", "nis"].flatten().double()
-    gated = Gated(linear_kalman(), response=response, window=1, rate=0.2)  # it would act in every fifth step
-    assert (run(gated, clean)["gate", "factor"] > 1).any()
-    gated.calibrate([clean])
-    expected = chi_square_table(plain[plain > 0], DIM).to(gated.gates[0].tables.dtype)
-    torch.testing.assert_close(gated.gates[0].tables[0], expected)
-    assert gated.gates[0].rate == 0.2
-
-
-def test_functions_refuse_and_hold():
-    with pytest.raises(ValueError, match="reject, student, huber"):
-        disbelief(torch.ones(1), torch.ones(1), "tukey")
-    assert torch.equal(adapt(torch.ones(2), torch.ones(2), torch.zeros(2), 0.1), torch.ones(2))
 
 
 def test_wrong_arguments_are_named():

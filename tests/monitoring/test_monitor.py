@@ -71,12 +71,6 @@ def test_false_alarms_of_windows_come_at_their_rate():
             assert 0.005 < share < 0.03, name
 
 
-def test_long_windows_make_the_whiteness_normal():
-    out = Monitored(kalman(), monitor(window=60)).sequence(simulate(4000, 64))
-    p = out["monitor", "gps", "whiteness"][:, -1]
-    assert within_binomial_error((p < 0.05).double().mean().item(), 0.05, len(p))
-
-
 @pytest.mark.parametrize(("whiteness", "noise", "tests"), [(False, False, 4), (True, False, 6), (True, True, 7)])
 def test_all_tests_of_all_sensors_share_the_false_alarms_equally(whiteness, noise, tests):
     """Window and sum of two sensors; whiteness, where it may raise the alarm; a noise that one of them claims."""
@@ -88,14 +82,6 @@ def test_all_tests_of_all_sensors_share_the_false_alarms_equally(whiteness, nois
     for limit in (watch.p_limit, watch.whiteness_limit):
         assert limit.tolist() == pytest.approx([rate / tests] * 2)
     assert watch.cusum_limit.tolist() == pytest.approx([cusum_threshold(tests / rate)] * 2)
-
-
-def test_with_whiteness_alarms_of_single_steps_come_at_their_rate_too():
-    """Of a window of two steps: the sum of both is exact, the correlation of two has wider tails than a normal."""
-    rate = 0.03
-    watch = monitor(window=2, false_alarm_rate=rate, whiteness=True)
-    p = Monitored(kalman(), watch).sequence(simulate(4000, 21))["monitor", "gps", "p_value"][:, 2::2]
-    assert within_binomial_error((p < watch.p_limit).double().mean().item(), rate / 3, p.numel())
 
 
 @pytest.mark.slow
@@ -204,13 +190,6 @@ def test_single_components_count_as_many_degrees_as_are_observed():
     assert within_binomial_error((p < 0.05).double().mean().item(), 0.05, 20_000)
 
 
-def test_the_belief_is_that_of_the_filter():
-    data = simulate(3, 20)
-    plain, watched = kalman().sequence(data.clone()), Monitored(kalman(), monitor()).sequence(data.clone())
-    for key in (("belief", "mean"), ("belief", "cov"), ("info", "nis")):
-        assert torch.equal(plain[key], watched[key])
-
-
 def test_steps_sequences_and_environments_agree():
     runs, steps = 3, 25
     env = LinearGaussianEnv(F, torch.eye(2), [0.2, 0.2], R.sqrt().tolist(), batch_size=[runs], seed=0)
@@ -244,15 +223,6 @@ def test_a_marked_beginning_forgets():
         assert torch.equal(out[key][:, 15:], alone[key]), key
     replayed = watched.monitor.replay(watched.sequence(data.clone()))["monitor"]
     assert torch.allclose(replayed["gps", "cusum"][:, 16:], alone["gps", "cusum"][:, 1:], atol=1e-5)
-
-
-@pytest.mark.slow
-def test_compiled_steps_give_the_same():
-    data = simulate(2, 9)
-    eager = Monitored(kalman(), monitor(window=3)).sequence(data.clone())
-    compiled = Monitored(kalman(), monitor(window=3)).compile(chunk=2, backend="aot_eager").sequence(data.clone())
-    for key in (("gps", "p_value"), ("gps", "cusum"), "alarm"):
-        assert torch.allclose(eager["monitor", key].double(), compiled["monitor", key].double(), atol=1e-6)
 
 
 def test_a_claimed_noise_that_jumps_raises_the_alarm():

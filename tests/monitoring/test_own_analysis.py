@@ -1,17 +1,14 @@
 """An analysis of a user's own is lagged, delayed, gated, rejected and left out like ours of the same formula."""
 
-from functools import partial
-
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
-from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
+from tests.filters.factories import linear_denkf
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
-from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import RejectReadings
-from torch_denkf.modules import EnsembleAnalysis, LinearObservation, Update
+from torch_denkf.modules import EnsembleAnalysis, Update
 from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import EnRTS, FixedLag
 
@@ -37,16 +34,6 @@ class Own(Update):
     def compute(self, forecast, predicted, reading, variance, observed=None):
         ensemble, *scores = analyse(forecast, predicted, reading, variance, scheme="etkf", observed=observed)
         return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), *scores
-
-
-def late(analysis):
-    F, _, H, R = linear_system()
-    return FusedFilter(
-        NoisyLinear(F, None, None),
-        {"observation": FusedSensor(LinearObservation(H), R.sqrt(), delay=2, analysis=analysis)},
-        initial=linear_denkf(ensemble_size=8).initial,
-        process_noise=[0.0, 0.0],
-    )
 
 
 REJECT = RejectReadings({"observation": "observed"})
@@ -79,14 +66,6 @@ def test_it_gives_what_ours_gives(data, way):
     assert set(keys) <= set(out.keys(True, True))
     for key in keys:
         torch.testing.assert_close(out[key], expected[key], rtol=0, atol=1e-10, equal_nan=True, msg=str(key))
-
-
-def test_behind_a_sensor_that_is_late(data):
-    data = TensorDict({"observation": data["observation"], "observation_observed": data["observed"]}, data.batch_size)
-    expected = late(partial(EnsembleAnalysis, "etkf")).sequence(data.clone())
-    out = late(Own).sequence(data.clone())
-    for key in (("belief", "ensemble"), ("smoothed", "mean")):
-        torch.testing.assert_close(out[key], expected[key], rtol=0, atol=1e-10)
 
 
 def both():

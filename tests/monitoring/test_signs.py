@@ -33,30 +33,6 @@ def test_floor_margin_and_what_is_not_known():
     assert gate(TensorDict({"signs": signs}, [4]))["seen"].flatten().tolist() == [True, False, False, True]
 
 
-def test_what_was_not_observed_stays_so():
-    gate = SignGate(1, observed_key=("camera", "given"), out_key=("camera", "seen"), sign_key="heat").calibrate(
-        [clean(60, 1).rename_key_("signs", "heat")]
-    )
-    seen = torch.tensor([[True, False], [True, True]])
-    td = TensorDict({"heat": torch.tensor([[0.0], [1e6]]), "camera": {"given": seen}}, [2])
-    assert gate(td)["camera", "seen"].tolist() == [[True, False], [False, False]]
-
-
-def test_before_calibration_nothing_is_large():
-    assert SignGate(3)(clean(5))["seen"].all()
-
-
-def test_wrong_arguments_are_named():
-    with pytest.raises(ValueError, match="floor is one number, or one for each of the 2"):
-        SignGate(2, floor=(0.1,))
-    with pytest.raises(ValueError, match="rate"):
-        SignGate(2, rate=0.0)
-    with pytest.raises(ValueError, match="out_key must differ from observed_key"):
-        SignGate(2, observed_key="seen")
-    with pytest.raises(ValueError, match="signs of 'camera'"):
-        InnovationMonitor({"camera": MonitoredSensor("info", 1, sign_key="signs")})
-
-
 def watched(runs, steps, seed):
     generator = torch.Generator().manual_seed(seed)
     innovation = torch.randn(runs, steps, 1, generator=generator)

@@ -3,7 +3,6 @@
 import torch
 from torch.testing import assert_close
 
-from tests.functional.checks import assert_compiled_is_eager
 from torch_denkf.motions.discretisation import discretise
 
 DRIFT = [[0.0, 1.0], [0.0, 0.0]]
@@ -26,10 +25,3 @@ def test_two_steps_are_one(float64):
     (first, first_noise), (second, second_noise), (whole, whole_noise) = parts
     assert_close(second @ first, whole, rtol=0, atol=1e-10)
     assert_close(second @ first_noise @ second.mT + second_noise, whole_noise, rtol=0, atol=1e-10)
-
-
-def test_gradients_and_compilation(float64):
-    drift, root, dt = torch.randn(2, 2), torch.randn(2, 2), torch.rand(3, 1)
-    inputs = [value.requires_grad_() for value in (drift, root, dt)]
-    assert torch.autograd.gradcheck(lambda a, b, t: discretise(a, b @ b.mT, t), inputs)
-    assert_compiled_is_eager(discretise, drift.detach(), torch.eye(2), dt.detach())

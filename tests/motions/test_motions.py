@@ -28,18 +28,6 @@ def test_each_element_moves_by_itself_and_each_member_too(float64, make, batch):
 
 
 @every_motion
-def test_single_precision_agrees_with_double(make):
-    for size in (1e-6, 1e-3, 0.3, 3.0):  # of a step's turn: series and formulas
-        motion = make(size)
-        state, entries = random_points(motion.space, 50, 4), frame(motion, 50)
-        moved = step(motion, state, **entries)
-        assert moved.dtype == torch.float32
-        exact = step(motion, state.double(), **{key: value.double() for key, value in entries.items()})
-        error = motion.space.minus(moved.double(), exact)
-        assert_close(error, torch.zeros_like(error), rtol=0, atol=2e-5 * max(1, size**2))
-
-
-@every_motion
 def test_a_step_of_an_entry_is_that_of_a_number(float64, make):
     state, entries = random_points(make().space, 2, 4), frame(make(), 2)
     seconds = torch.tensor([[0.1], [0.3]])
@@ -88,33 +76,6 @@ def test_the_jacobian_is_that_of_differences(float64, make, still):
     assert jacobian.isfinite().all()
     columns = [(error(h * unit) - error(-h * unit)) / (2 * h) for unit in torch.eye(dim)]
     assert_close(jacobian, torch.stack(columns, -1), rtol=0, atol=1e-8)
-
-
-@every_motion
-def test_one_graph_forward_and_backward(make):
-    motion = make()
-    state, entries = random_points(motion.space, 3, 4).requires_grad_(), list(frame(motion, 3).values())
-    results = []
-    for compute in (motion.compute, torch.compile(motion.compute, fullgraph=True, backend="aot_eager")):
-        moved = compute(state, *entries)
-        (gradient,) = torch.autograd.grad(moved.square().sum(), state)
-        results.append((moved, gradient))
-    assert_close(results[1], results[0], rtol=1e-5, atol=1e-5)
-
-
-@every_motion
-def test_wrong_shapes_are_named(make):
-    motion = make()
-    state, entries = random_points(motion.space, 3, 4), frame(motion, 3)
-    with pytest.raises(ValueError, match=r"point has shape .* a point of Product.* is \[\*, \d+\]"):
-        step(motion, state[..., 1:], **entries)
-    for key, value in entries.items():
-        with pytest.raises(ValueError, match=rf"'{key}' of \w+ is \[\*B, \d\]; got \[3, \d\]"):
-            step(motion, state, **{**entries, key: value[..., 1:]})
-        with pytest.raises(KeyError, match=f"reads '{key}', which is missing"):
-            step(motion, state)
-    with pytest.raises(ValueError, match=r"'dt' of \w+ is \[\*B, 1\]; got \[3, 2\]"):
-        step(make("dt"), state, **entries, dt=torch.ones(3, 2))
 
 
 @pytest.mark.parametrize(

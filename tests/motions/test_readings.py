@@ -86,26 +86,6 @@ def test_a_magnetometer_of_mujoco(float64):
 
 
 @every_reading
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_each_member_is_read_by_itself(float64, make, batch):
-    reading = make()
-    state = random_points(reading.space, *batch, 4)
-    read = observe(reading, state)
-    assert read.shape == (*batch, 4, reading.reading_space.point_dim)
-    rows = torch.stack([reading.compute(row.unsqueeze(0))[0] for row in state.flatten(0, -2)])
-    assert_close(read.flatten(0, -2), rows, rtol=0, atol=1e-13)
-
-
-@every_reading
-def test_single_precision_agrees_with_double(make):
-    reading = make()
-    state = random_points(reading.space, 50, 4)
-    single = observe(reading, state)
-    assert single.dtype == torch.float32
-    assert_close(single.double(), observe(reading.double(), state.double()), rtol=1e-5, atol=2e-5)
-
-
-@every_reading
 def test_the_jacobian_is_that_of_differences(float64, make):
     reading, h = make(), 1e-6
     space, state = reading.space, random_points(reading.space)
@@ -116,25 +96,6 @@ def test_the_jacobian_is_that_of_differences(float64, make):
     units = torch.eye(space.tangent_dim)
     columns = [(read(h * unit) - read(-h * unit)) / (2 * h) for unit in units]
     assert_close(torch.func.jacrev(read)(torch.zeros(len(units))), torch.stack(columns, -1), rtol=0, atol=1e-7)
-
-
-@every_reading
-def test_one_graph_forward_and_backward(make):
-    reading = make()
-    state = random_points(reading.space, 3, 4).requires_grad_()
-    results = []
-    for compute in (reading.compute, torch.compile(reading.compute, fullgraph=True, backend="aot_eager")):
-        read = compute(state)
-        (gradient,) = torch.autograd.grad(read.square().sum(), state)
-        results.append((read, gradient))
-    assert_close(results[1], results[0], rtol=1e-5, atol=1e-5)
-
-
-@every_reading
-def test_states_of_another_size_are_refused(make):
-    reading = make()
-    with pytest.raises(ValueError, match=r"point has shape .* a point of Product.* is \[\*, \d+\]"):
-        observe(reading, random_points(reading.space, 3, 4)[..., 1:])
 
 
 @pytest.mark.parametrize(

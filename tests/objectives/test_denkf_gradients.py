@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from tests.filters.differences_for_tests import central_difference
-from tests.filters.factories import S, toy_denkf
+from tests.filters.factories import toy_denkf
 from tests.objectives.denkf_for_tests import ONLY_STATE
-from tests.objectives.problem_for_tests import problem, train
+from tests.objectives.problem_for_tests import problem
 from torch_denkf.objectives import DEnKFLoss
 
 
@@ -47,12 +47,3 @@ def test_detach_every_reaches_the_filter(float64):
     (full, full_grad), (cut, cut_grad) = gradient(None), gradient(2)
     assert full.equal(cut)
     assert not full_grad.allclose(cut_grad)
-
-
-def test_training_lowers_the_loss(float64):
-    filter = toy_denkf(sensor_layer="none")
-    frames, _ = problem(filter, resets=False)
-    frames["state"] = frames["measurement"][..., :S].cumsum(1)
-    loss = DEnKFLoss(filter, **ONLY_STATE)
-    values = train(loss, frames, 1e-2)
-    assert values[-1] < 0.8 * values[0]

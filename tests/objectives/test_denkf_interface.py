@@ -2,9 +2,8 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 
-from tests.filters.factories import A, M, S, toy_denkf
+from tests.filters.factories import toy_denkf
 from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, score_by_hand
 from tests.objectives.problem_for_tests import problem, stepped
 from torch_denkf.objectives import DEnKFLoss, MixtureLoss, SensorLoss, TransitionLoss
@@ -56,37 +55,3 @@ def test_a_filter_with_a_prefix_has_the_same_terms(float64, loss):
         losses.append(loss(filter)(frames))
     assert list(losses[0].keys()) == list(losses[1].keys())
     assert all(losses[0][key].equal(losses[1][key]) for key in losses[0].keys())  # noqa: SIM118
-
-
-def test_arguments_by_keyword(float64):
-    # tensordict takes the leading sizes that all entries share for the batch: [2, 6], because the last ones differ.
-    filter = toy_denkf(sensor_layer="none", layer="none")
-    filter.initial.std.zero_()  # nothing is random
-    loss = DEnKFLoss(filter, **ONLY_STATE, score="mse")
-    assert loss.in_keys == ["measurement", "action", "state"]
-    entries = {"measurement": torch.randn(2, 6, M), "action": torch.randn(2, 6, A), "state": torch.randn(2, 6, S)}
-    expected = loss(TensorDict(entries, [2, 6]))["loss_state"]
-    torch.testing.assert_close(loss(**entries), expected, **CLOSE)
-
-
-def test_the_tensordict_is_left_as_it_is():
-    filter = toy_denkf()
-    frames, _ = problem(filter)
-    before = frames.clone()
-    DEnKFLoss(filter)(frames)
-    assert set(frames.keys(True, True)) == set(before.keys(True, True))
-    assert (frames == before).all()
-
-
-def test_parameters_and_state_are_the_filters():
-    filter = toy_denkf()
-    loss = DEnKFLoss(filter, state_scale=[1.0, 2.0, 3.0])
-    assert {id(p) for p in loss.parameters()} == {id(p) for p in filter.parameters()}
-    assert {name for name, _ in loss.named_parameters()} == {f"filter.{name}" for name, _ in filter.named_parameters()}
-    assert "state_scale" in loss.state_dict()
-
-
-def test_a_misspelt_entry_is_named_beside_those_that_exist():
-    loss = DEnKFLoss(toy_denkf())
-    with pytest.raises(ValueError, match=r"^DEnKFLoss reads no 'sensr'; set_keys takes state, [a-z_, ]+$"):
-        loss.set_keys(sensr="x")

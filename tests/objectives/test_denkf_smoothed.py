@@ -36,16 +36,3 @@ def test_gradient_is_that_of_finite_differences(float64):
     frames, _ = problem(filter)
     loss = DEnKFLoss(filter, **only(TERMS, "none"), smoothed=1.0, smoother=EnRTS)
     directional_check(lambda: loss(frames)["loss_smoothed"], filter.parameters(), step=1e-7, rtol=1e-4)
-
-
-def test_it_has_the_parameters_of_the_filter_alone():
-    filter = toy_denkf("perturbed")
-    loss = DEnKFLoss(filter, smoothed=1.0, smoother=EnRTS)
-    assert set(loss.parameters()) == set(filter.parameters())
-    assert loss.state_dict().keys() == DEnKFLoss(filter).state_dict().keys()
-    assert "loss_smoothed" in loss.out_keys
-
-
-def test_without_a_smoother_it_says_what_to_give():
-    with pytest.raises(ValueError, match="smoother=EnRTS"):
-        DEnKFLoss(toy_denkf(), smoothed=1.0)

@@ -137,13 +137,6 @@ def test_a_rollout_is_one_sequence(ended):
         torch.testing.assert_close(loss(flags[None])["loss_state"], expected)
 
 
-def test_truncated_ends_a_slice_like_done():
-    loss = objective()
-    rows = TensorDict({"observation": torch.randn(12, 2), "state": torch.randn(12, 2)}, [12])
-    cut = rows.copy().set(("next", "truncated"), (torch.arange(12) % 6 == 5).unsqueeze(-1))
-    torch.testing.assert_close(loss(cut)["loss_state"], loss(rows.reshape(2, 6))["loss_state"])
-
-
 def test_an_episode_that_is_done_needs_a_mark_after_it():
     rows = TensorDict({"observation": torch.randn(12, 2), "state": torch.randn(12, 2)}, [12])
     rows["is_init"] = torch.arange(12).unsqueeze(-1) == 0
@@ -185,34 +178,6 @@ def test_a_clock_may_leap_within_slices_that_are_marked():
     accepted(batch.set("is_init", torch.arange(12) % 6 == 0), rows.reshape(2, 6))
     batch["step"][10] = 0  # back, that is another one all the same
     refused(batch, r"'step' does not go on.* at 10")
-
-
-def test_one_step_left_out_is_a_leap():
-    rows = rows_of()
-    refused(rows.copy().set("step", torch.tensor([0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12])), "at 6")
-    uneven = torch.tensor([0.0, 0.1, 0.2, 0.34, 0.44, 0.54, 0.64, 0.74, 0.84, 0.94, 1.04, 1.14])
-    accepted(rows.copy().set("time", uneven), rows)
-
-
-def test_an_entry_that_never_changes_does_not_hide_a_break():
-    rows = rows_of().set("goal", torch.ones(12, 3))
-    batch = with_next(rows, breaks_at=6)
-    batch["next", "goal"] = torch.ones(12, 3)
-    refused(batch, r"what was next is not what follows at 6")
-    whole = with_next(rows)
-    whole["next", "goal"] = torch.ones(12, 3)
-    accepted(whole, rows)
-    still = rows_of(1).expand(12).clone()
-    accepted(with_next(still), still)  # a robot that stands still goes on
-
-
-def test_readings_that_are_no_numbers_go_on():
-    rows = rows_of()
-    rows["camera"] = torch.randn(12, 2)
-    rows["camera"][4:6] = torch.nan
-    batch = with_next(rows)
-    batch["next"] = TensorDict({"camera": torch.roll(rows["camera"], -1, 0), "done": batch["next", "done"]}, [12])
-    accepted(batch, rows)
 
 
 def test_the_numbers_of_the_next_step_are_one_ahead():

@@ -98,17 +98,3 @@ def test_a_belief_without_spread_has_a_finite_gradient(float64):
     torch.testing.assert_close(value, error, rtol=0, atol=1e-6)
     (gradient,) = torch.autograd.grad(value, filter["transition"].matrix)
     assert gradient.isfinite().all()
-
-
-@pytest.mark.parametrize("name", ["EKF", "UKF", "BackpropKF"])
-@pytest.mark.parametrize("score", ["crps", "nll", "mse"])
-def test_all_terms_train_all_parts(name, score):
-    frames = learned_frames(4, 8).set("state", torch.randn(4, 8, 3)).set("target_observation", torch.randn(4, 8, 2))
-    filter = learned_filter(name)
-    loss = GaussianLoss(filter, score=score, nll=0.1, detach_every=4)
-    terms = loss(frames)
-    assert set(terms.keys()) == {"loss_state", "loss_transition", "loss_sensor", "loss_nll"}
-    sum(terms.values()).backward()
-    for parameter_name, parameter in filter.named_parameters():
-        assert parameter.grad is not None, parameter_name
-        assert parameter.grad.isfinite().all(), parameter_name

@@ -17,7 +17,6 @@ from torch_denkf.filters import DEnKF, KalmanFilter, ParticleFilter
 from torch_denkf.functional.manifolds import Circle, Flat
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianLikelihood, LinearObservation, Select
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
-from torch_denkf.objectives._labels import Targets
 
 NAN = math.nan
 
@@ -343,17 +342,6 @@ def test_the_masks_of_renamed_labels_are_those_that_data_sets_write():
     loss.set_keys(state_observed="mine")
     again = loss(renamed.exclude("state"))
     assert all(again[key].equal(expected[key]) for key in expected.keys())  # noqa: SIM118
-
-
-@pytest.mark.parametrize("name", ["members-crps", "members-energy", "moments-nll", "particles-mixture"])
-def test_scores_of_labels_with_gaps_compile_without_a_break(name):
-    _, frames, out, loss = case(name, terms=["state"], state_scale=SCALE, dims=[0, 1, 2], space=Flat(3, circular=[1]))
-    frames = hidden(frames, gaps()[1], "NaN")
-    term = lambda: loss.terms[0](out, Targets(loss, frames, out))  # noqa: E731
-    expected, rows = term()
-    compiled = torch.compile(term, fullgraph=True, backend="eager")()
-    assert compiled[0].equal(expected)
-    assert compiled[1].equal(rows)
 
 
 def test_gaussian_oracle_is_that_of_gaussian_loss():

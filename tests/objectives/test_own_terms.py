@@ -105,15 +105,3 @@ def test_the_true_state_is_asked_for_where_a_term_needs_it():
         loss(renamed)
     loss.set_keys(state=("truth", "x"))
     assert loss(renamed)["loss_absolute"].equal(FilterLoss(filter, [Absolute()])(frames)["loss_absolute"])
-
-
-def test_what_is_no_term():
-    filter = toy_denkf()
-    with pytest.raises(TypeError, match="Term"):
-        FilterLoss(filter, [lambda out, truth: 0.0])
-    with pytest.raises(TypeError, match="Term"):
-        DEnKFLoss(filter, terms=[Absolute])
-    with pytest.raises(ValueError, match="'absolute'"):
-        FilterLoss(filter, [Absolute(), Absolute(2.0)])
-    with pytest.raises(ValueError, match="absolute must be finite and at least 0"):
-        Absolute(-1.0)

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torch.distributions import MultivariateNormal, Normal
 
 from tests.filters.differences_for_tests import central_difference
-from tests.filters.factories import OBS, A, E, S, linear_denkf, linear_kalman, linear_system, toy_denkf
+from tests.filters.factories import OBS, E, S, linear_denkf, linear_kalman, linear_system, toy_denkf
 from tests.filters.gaussian_for_tests import learned_filter, learned_frames
 from tests.filters.particle_for_tests import toy_filter
 from tests.objectives.denkf_for_tests import CLOSE, TERMS, score_by_hand
@@ -188,16 +188,6 @@ def test_what_starts_and_what_is_padding_does_not_count():
     assert before.equal(after)
     after.backward()
     assert all(p.grad.isfinite().all() for p in mean.parameters())
-
-
-def test_a_stored_belief_does_not_make_the_first_element_count():
-    filter = toy_denkf(layer="none")
-    frames, out = problem(filter, resets=False)
-    loss = TransitionLoss(filter, score="mse")
-    expected = loss(frames)["loss_transition"]
-    frames["previous", "belief", "ensemble"] = out["belief", "ensemble"].detach()
-    frames["previous", "action"] = torch.cat([torch.randn(2, 1, A), frames["action"][:, :-1]], 1)
-    torch.testing.assert_close(loss(frames)["loss_transition"], expected)
 
 
 def test_a_spread_around_the_truth_of_a_linear_ensemble_is_the_gaussian():

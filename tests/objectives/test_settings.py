@@ -8,21 +8,15 @@ from tensordict import TensorDict
 from torch import nn
 
 from tests.filters.factories import (
-    OBS,
     NoisyLinear,
-    S,
-    linear_denkf,
-    linear_kalman,
     toy_denkf,
-    toy_frames,
 )
-from tests.filters.particle_for_tests import toy_filter
-from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, TERMS, score_by_hand
-from tests.objectives.problem_for_tests import only, problem, stepped
+from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, score_by_hand
+from tests.objectives.problem_for_tests import problem, stepped
 from torch_denkf.filters import Filter
 from torch_denkf.functional.manifolds import Flat
 from torch_denkf.modules import Initial, SubModel
-from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
+from torch_denkf.objectives import DEnKFLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 
 SCORES = ["crps", "energy", "mse"]
 
@@ -91,47 +85,7 @@ def test_a_loaded_scale_counts_other_dimensions():
     assert second(frames)["loss_state"].equal(first(frames)["loss_state"])
 
 
-@pytest.mark.parametrize("scale", [[1.0, 0.0, 1.0], [1.0, -1.0, 1.0], [math.inf] * 3, [1.0, math.nan, 1.0]])
-def test_scales_that_are_none(scale):
-    for loss in (DEnKFLoss, MixtureLoss, TransitionLoss):
-        with pytest.raises(ValueError, match="state_scale is positive"):
-            loss(toy_denkf(), state_scale=scale)
-    with pytest.raises(ValueError, match="observation_scale is positive"):
-        SensorLoss(toy_denkf(), observation_scale=scale)
-
-
 # ------------------------------------------------------------------------------------- filters without a sensor
-
-
-@pytest.mark.parametrize(("loss", "make"), [(DEnKFLoss, linear_denkf), (GaussianLoss, linear_kalman)])
-def test_a_filter_without_a_sensor_has_no_term_of_one(loss, make):
-    filter = make()
-    frames = TensorDict({"observation": torch.randn(2, 5, 2), "state": torch.randn(2, 5, 2)}, [2, 5])
-    default, zero = loss(filter), loss(filter, sensor=0.0)
-    assert default.out_keys == zero.out_keys == ["loss_state", "loss_transition"]
-    assert all(default(frames)[key].equal(zero(frames)[key]) for key in default.out_keys)
-    with pytest.raises(KeyError, match=r"\('sensor', 'ensemble'\), which is missing.*sensor=0\.0"):
-        loss(filter, sensor=1.0)(frames)
-    # Samples that lie in the data, once they are named.
-    frames["samples"] = torch.randn(2, 5, 4, 2)
-    frames["target_observation"] = torch.randn(2, 5, 2)
-    default.set_keys(sensor="samples")
-    assert default.out_keys == ["loss_state", "loss_transition", "loss_sensor"]
-    expected = score_by_hand("crps", frames["samples"], frames["target_observation"]).mean()
-    torch.testing.assert_close(default(frames)["loss_sensor"], expected, **CLOSE)
-
-
-def test_a_missing_target_names_the_cures():
-    filter = toy_denkf()
-    frames, _ = problem(filter)
-    assert DEnKFLoss(filter).weights["sensor"] == 1.0
-    for loss in (DEnKFLoss(filter), SensorLoss(filter)):
-        with pytest.raises(KeyError, match=r"target_observation.*Add the entry.*sensor=0\.0"):
-            loss(frames.exclude("target_observation"))
-    loss = SensorLoss(filter, noise=1.0)
-    loss.set_keys(noise=("forecast", "noise"))
-    with pytest.raises(KeyError, match="R must follow from frames alone"):
-        loss(frames)
 
 
 # --------------------------------------------------------------------------------------------------- one member
@@ -177,17 +131,3 @@ def test_one_member_is_a_point(score):
     step = TransitionLoss(filter, score="crps")(frames)["loss_transition"]
     moved = frames["state"][:, :-1] @ move.matrix.mT - frames["state"][:, 1:]
     torch.testing.assert_close(step, moved.abs().mean(), **CLOSE)
-
-
-@pytest.mark.parametrize("make", [DEnKFLoss, MixtureLoss, SensorLoss])
-def test_one_sample_of_the_sensor_is_a_point(make):
-    filter = toy_filter()
-    filter["sensor"].ensemble_size = 1
-    frames = toy_frames((2, 7))
-    frames["state"], frames["target_observation"] = torch.randn(2, 7, S), torch.randn(2, 7, OBS)
-    filter.draw_noise(frames)
-    out = filter.sequence(frames.copy())
-    assert out["sensor", "ensemble"].shape == (2, 7, 1, OBS)
-    error = (out["sensor", "ensemble"].squeeze(-2) - frames["target_observation"])[frames["observed"].all(-1)]
-    weights = {} if make is SensorLoss else only(TERMS if make is DEnKFLoss else ["state", "sensor"], "sensor")
-    torch.testing.assert_close(make(filter, **weights)(frames)["loss_sensor"], error.abs().mean(), **CLOSE)

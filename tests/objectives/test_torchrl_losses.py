@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torch import nn
 from torch.distributions import Independent, Normal
@@ -12,7 +11,6 @@ from torchrl.modules.utils import get_env_transforms_from_module
 from torchrl.objectives import ClipPPOLoss, DDPGLoss, SACLoss
 
 from tests.filters.composed import A, B, ReplayedFrames, S, T, compose, frames_for
-from tests.filters.factories import toy_denkf, toy_frames
 
 MEAN = ("belief", "mean")
 
@@ -299,23 +297,3 @@ def test_sac_with_the_filter_in_the_critic_too(float64, vmap):
     target = data["next", "reward"] + 0.9 * ~data["next", "terminated"] * worth
     seen = [q_by_hand(number, roots, data["action"]) for number in (0, 1)]
     torch.testing.assert_close(found[0].mean(), sum((q - target.detach()).square().mean() for q in seen))
-
-
-@pytest.mark.filterwarnings("ignore:There is a performance drop")
-@pytest.mark.parametrize("randomness", ["different", "same"])
-def test_a_filter_with_dropout_runs_under_vmap(float64, randomness):
-    """An ensemble of filters, as torchrl runs an ensemble of critics: each draws its own masks, or all the same."""
-    filter = toy_denkf()
-    frames = toy_frames((2, 5), resets=False)
-    weights = TensorDict.from_module(filter).expand(3).clone()
-
-    def mean(weights):
-        with weights.to_module(filter, preserve_module_state=False), set_recurrent_mode(True):
-            return filter(frames.copy())[MEAN]
-
-    means = torch.vmap(mean, randomness=randomness)(weights)
-    apart = (means[1:] - means[:1]).abs().amax((1, 2, 3))
-    assert (apart > 1e-3).all() if randomness == "different" else (apart == 0).all()
-    one = torch.stack([filter.sequence(frames.copy())[MEAN] for _ in range(50)])
-    error = (means - one.mean(0)).abs().amax() / one.std(0).amax()
-    assert error < 5, "draws of the same distribution"

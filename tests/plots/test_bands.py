@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
 from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import DT, ensemble_run, kalman_runs
@@ -82,20 +81,6 @@ def test_readings_are_dots_where_they_were_observed():
     assert labels == ["not observed", "90 % of the belief", "truth", "belief", "readings"]
 
 
-@pytest.mark.parametrize("width", [0, 1, 2])
-def test_what_was_not_observed_is_shaded(width):
-    run = ensemble_run()
-    seen = run["observed"][:, 0].clone()
-    run["observed"] = seen if width == 0 else seen.unsqueeze(-1).repeat(1, width)
-    if width == 2:
-        run["observed"][20, 0] = False  # one of two readings is there
-    for axes in plot_bands(run, dims=[0, 1], time=DT):
-        spans = [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in axes.patches]
-        np.testing.assert_allclose(spans, [(0.95, 1.45), (2.95, 3.05)])
-        assert "not observed" in axes.get_legend_handles_labels()[1]
-    assert not plot_bands(run, dims=[0], observed=torch.ones(40, 1, dtype=torch.bool))[0].patches
-
-
 def test_each_component_is_shaded_by_its_own_sensors_mask():
     run = ensemble_run()
     gps = torch.ones(40, 1, dtype=torch.bool)
@@ -132,39 +117,6 @@ def test_angles_stay_beside_the_mean():
     assert (high - low).max() < 0.8
 
 
-def test_times_means_and_axes_may_be_passed():
-    seconds = torch.tensor([0.0, 1.0, 4.0])
-    given = Figure().subplots(2, 1)
-    panels = plot_bands(torch.ones(3, 2), torch.zeros(3, 2), time=seconds, ax=given, legend=False)
-    assert panels == list(given)
-    np.testing.assert_array_equal(line(panels[0], "belief")[0], seconds)
-    assert panels[0].get_xlim() == (-0.5, 5.5)
-    assert not panels[0].collections
-    assert panels[1].get_legend() is None
-    assert plot_bands(torch.ones(3, 1))[0].get_xlabel() == "step"
-
-
-def test_errors_say_what_to_do():
-    run = ensemble_run()
-    with pytest.raises(ValueError, match="2 Axes are needed, one a component; got 1"):
-        plot_bands(run, dims=[0, 1], ax=Figure().add_subplot())
-    with pytest.raises(ValueError, match="names needs one entry a drawn component, 3; got 1"):
-        plot_bands(run, names=["x"])
-    with pytest.raises(ValueError, match=r"readings of \[2\] belong to no drawn component"):
-        plot_bands(run, dims=[0], readings={2: torch.zeros(40)})
-    with pytest.raises(ValueError, match=r"must be \[40\]; got 39"):
-        plot_bands(run, readings={2: torch.zeros(39)})
-    with pytest.raises(ValueError, match="40 increasing seconds"):
-        plot_bands(run, time=torch.zeros(40))
-    points = TensorDict({"belief": {"mean": torch.zeros(40, 4), "var": torch.ones(40, 3)}}, [40])
-    with pytest.raises(ValueError, match="pass space="):
-        plot_bands(points)
-    with pytest.raises(ValueError, match='pass band="variance"'):
-        plot_bands(kalman_runs()[0], band="ensemble")
-    with pytest.raises(ValueError, match=r"in \(0, 1\); got 90"):
-        plot_bands(run, level=90)
-
-
 def spans(axes) -> list[tuple[float, float]]:
     return [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in axes.patches]
 
@@ -177,23 +129,7 @@ def slow_sensor(lost: int) -> TensorDict:
     return sequence
 
 
-def test_a_slow_sensor_is_shaded_where_it_lost_a_reading_alone():
-    (axes,) = plot_bands(slow_sensor(lost=2), time=0.01)
-    assert spans(axes) == [pytest.approx((1.505, 3.495))]  # from behind the reading at 1.5 s to the one at 3.5 s
-
-
 @pytest.mark.parametrize(("gap", "count"), [(2.0, 0), (1.99, 1), (0.99, 3), (0.0, 5)])
 def test_gap_is_the_longest_time_between_two_readings_that_is_no_outage(gap, count):
     (axes,) = plot_bands(slow_sensor(lost=2), time=0.01, gap=gap)
     assert len(spans(axes)) == count  # 2 s once, twice 1 s, and half a second at both ends
-
-
-def test_without_any_reading_all_is_shaded():
-    sequence = TensorDict({"belief": {"mean": torch.zeros(4, 1)}, "observed": torch.zeros(4, 1, dtype=torch.bool)}, [4])
-    (axes,) = plot_bands(sequence)
-    assert spans(axes) == [(-0.5, 3.5)]
-
-
-def test_a_gap_below_zero_is_refused():
-    with pytest.raises(ValueError, match="gap is the longest time between two readings"):
-        plot_bands(slow_sensor(lost=2), gap=-1)

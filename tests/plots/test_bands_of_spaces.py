@@ -6,7 +6,6 @@ import torch
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
-from tests.functional.checks import assert_refused
 from tests.plots.test_bands import band, line
 from torch_denkf.functional.manifolds import SE2, SE3, SO3, Circle, Euclidean, Product
 from torch_denkf.plots import plot_bands
@@ -104,31 +103,8 @@ def test_variances_of_tangents_become_those_of_angles(space, form):
         np.testing.assert_allclose(high - low, upper - lower, rtol=0.03)
 
 
-def test_a_mean_follows_from_members_and_variances_from_tangents():
-    run = turning_run()
-    less = TensorDict({"belief": {"ensemble": run["belief", "ensemble"]}, "state": run["state"][:, :4]}, [STEPS])
-    for axes, other in zip(
-        plot_bands(less, space=SPACE, dims=[0, 2], band="variance"),
-        plot_bands(run, space=SPACE, dims=[0, 2], band="variance"),
-        strict=True,
-    ):
-        for name in ("truth", "belief"):
-            np.testing.assert_allclose(line(axes, name)[1], line(other, name)[1], atol=1e-6)
-        np.testing.assert_allclose(band(axes)[1], band(other)[1], atol=1e-6)
-    # The truth's other parts are not known.
-    axes = plot_bands(less, space=SPACE, dims=[4])[0]
-    assert np.isnan(line(axes, "truth")[1]).all()
-
-
 def test_readings_of_angles_are_in_radians_beside_the_mean():
     run = turning_run()
     yaw = torch.from_numpy(np.deg2rad(euler(run["state"][:, :4])[:, 2]))
     axes = plot_bands(run, space=SPACE, dims=[2], readings={2: yaw})[0]
     np.testing.assert_allclose(line(axes, "readings")[1], line(axes, "truth")[1], atol=1e-9)
-
-
-def test_wrong_calls_are_refused():
-    run = turning_run()
-    assert_refused(ValueError, "mean has shape", plot_bands, run, space=SO3())
-    with pytest.raises(IndexError, match="dimension 5 of a state of 5"):
-        plot_bands(run, space=SPACE, dims=[5])

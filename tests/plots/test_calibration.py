@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import ensemble_run, kalman_runs
-from torch_denkf.metrics import pit
-from torch_denkf.plots import plot_calibration, plot_spread_error
+from torch_denkf.plots import plot_calibration
 from torch_denkf.plots.histograms import histogram_band, rank_histogram
 
 
@@ -37,16 +34,6 @@ def test_a_filter_that_trusts_itself_is_high_at_both_ends():
     (axes,) = plot_calibration(runs, dims=[1], every=20)
     assert bars(axes)[[0, -1]].min() > band(axes)[1]
     assert bars(axes)[3:7].max() < 10
-
-
-def test_bars_are_the_counts_of_the_values():
-    runs = kalman_runs()
-    values = pit(runs["belief", "mean"], runs["belief", "var"], runs["state"])[:, ::3, 2].flatten()
-    expected = np.histogram(values, bins=7, range=(0, 1))[0] / values.numel() * 100
-    (axes,) = plot_calibration(runs, dims=[2], names=["vx"], bins=7, every=3)
-    np.testing.assert_allclose(bars(axes), expected, atol=100 * 1.5 / values.numel())
-    np.testing.assert_allclose([bar.get_x() for bar in axes.containers[0]], np.arange(7) / 7)
-    assert axes.get_ylabel() == "vx\nshare of steps, %"
 
 
 def test_ranks_are_laid_on_bins_in_equal_parts():
@@ -86,45 +73,3 @@ def test_particles_count_with_their_weights():
         for axes, other in zip(panels, wanted, strict=True):
             np.testing.assert_allclose(bars(axes), bars(other), atol=1e-9)
             assert axes.get_legend_handles_labels()[1] == other.get_legend_handles_labels()[1]
-
-
-def test_weighted_particles_of_a_posterior_are_flat():
-    rng = torch.Generator().manual_seed(0)
-    truth = torch.randn(4000, 1, generator=rng)
-    reading = truth + 0.7 * torch.randn(4000, 1, generator=rng)
-    # Draws of the prior: enough that tens of them share the weight. Where few do, the outer bars are higher.
-    particles = torch.randn(4000, 256, 1, generator=rng)
-    weight = (-((reading.unsqueeze(1) - particles) ** 2) / 0.98).squeeze(-1).log_softmax(-1)
-    belief = TensorDict({"ensemble": particles, "log_weight": weight, "truth": truth}, [4000])[reading[:, 0] > 0.5]
-    (axes,) = plot_calibration(belief, "truth")
-    assert ((bars(axes) >= band(axes)[0]) & (bars(axes) <= band(axes)[1])).all()
-    (axes,) = plot_calibration(belief.exclude("log_weight"), "truth")
-    assert bars(axes)[-1] > 2 * band(axes)[1]
-
-
-def test_three_stand_side_by_side():
-    figure = Figure(figsize=(9, 3), layout="constrained")
-    row = figure.subplots(1, 3)
-    plot_calibration(ensemble_run(), dims=[0], names=["x"], ax=row[0])
-    plot_calibration(kalman_runs(), dims=[2], names=["vx"], ax=row[1])
-    plot_spread_error(kalman_runs(), dims=[0, 2], names=["x, m", "vx, m/s"], ax=row[2])
-    FigureCanvasAgg(figure).draw()
-    boxes = [axes.get_tightbbox() for axes in row]
-    assert boxes[0].x1 < boxes[1].x0
-    assert boxes[1].x1 < boxes[2].x0
-    assert figure.bbox.x1 >= boxes[2].x1
-    assert row[0].get_xlabel() == "rank of the truth, 0 to 1"
-    assert [
-        axes.get_xlabel() for axes in plot_calibration(kalman_runs(), dims=[0, 1, 2], ax=Figure().subplots(1, 3))
-    ] == ["probability below the truth"] * 3
-
-
-def test_errors_say_what_to_do():
-    with pytest.raises(ValueError, match='pass kind="pit"'):
-        plot_calibration(kalman_runs(), kind="rank")
-    with pytest.raises(ValueError, match="19 members have 20 ranks, too few for 21 bins"):
-        plot_calibration(ensemble_run(), bins=21)
-    with pytest.raises(ValueError, match="every must be at least 1"):
-        plot_calibration(ensemble_run(), every=0)
-    with pytest.raises(ValueError, match="the truth is missing"):
-        plot_calibration(ensemble_run().exclude("state"))

@@ -7,7 +7,6 @@ from tensordict import TensorDict
 
 from tests.functional.checks import assert_refused
 from tests.plots.test_bands_of_spaces import SPACE
-from torch_denkf.functional.manifolds import SO3, Euclidean
 from torch_denkf.metrics import pit
 from torch_denkf.plots import plot_calibration, plot_spread_error
 from torch_denkf.plots.histograms import rank_histogram, spread_error
@@ -74,15 +73,6 @@ def test_ranks_and_probabilities_are_those_of_the_metrics():
     np.testing.assert_allclose(drawn, 100 * counts.numpy() / RUNS, rtol=1e-12)
 
 
-def test_numbers_as_a_space_are_drawn_alike():
-    run = beliefs(Euclidean(2))
-    outs = [plot_spread_error(run, space=space, names=["a", "b"]) for space in (None, Euclidean(2))]
-    for label, values in lines(outs[0]).items():
-        np.testing.assert_allclose(lines(outs[1])[label], values, rtol=1e-12)
-    outs = [heights(plot_calibration(run, space=space)) for space in (None, Euclidean(2))]
-    np.testing.assert_allclose(*outs, atol=1e-12)
-
-
 def test_the_truth_of_a_leading_part_and_of_some_rows():
     run = beliefs()
     whole = lines(plot_spread_error(run, space=SPACE, dims=[0, 2]))
@@ -96,8 +86,3 @@ def test_the_truth_of_a_leading_part_and_of_some_rows():
     expected = spread_error(run["belief", "mean"], run["belief", "var"], torn, ensemble_size=E, space=SPACE)
     drawn = lines(plot_spread_error(run, torn, space=SPACE))
     np.testing.assert_allclose(drawn["about y, deg"][1], expected.error[1].numpy() * 180 / np.pi, rtol=1e-12)
-
-
-def test_what_is_no_space_is_refused():
-    for plot in (plot_spread_error, plot_calibration):
-        assert_refused(ValueError, r"a point of SO3\(\)", plot, beliefs(), space=SO3())

@@ -19,15 +19,3 @@ def test_what_is_missing_is_named_with_its_extra(monkeypatch, tmp_path):
             with pytest.raises(ImportError, match=rf'pip install "torch_denkf\[{extra}\]"'):
                 call()
     assert not list(tmp_path.iterdir())
-
-
-def test_pyplot_knows_nothing_of_the_figures(tmp_path):
-    import matplotlib.pyplot as plt
-
-    before, backend = plt.get_fignums(), plt.get_backend()
-    walk = torch.randn(5, 2).cumsum(0)
-    plots.plot_path(walk)
-    plots.plot_bands(walk)
-    plots.belief_video(tmp_path / "a.gif", walk, path={}, bands={}, size=(3, 2))
-    assert plt.get_fignums() == before
-    assert plt.get_backend() == backend

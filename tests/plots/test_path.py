@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
 from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import ensemble_run, kalman_runs
@@ -31,15 +30,6 @@ def test_lines_are_the_paths():
     assert axes.get_aspect() == 1
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
     assert labels == ["members", "truth", "dead reckoning", "belief"]
-
-
-def test_a_cars_path_drives_up():
-    run = ensemble_run()
-    drawn = lines(plot_path(run, forward_up=True))
-    np.testing.assert_allclose(drawn["truth"][:, 0], -run["state"][:, 1], rtol=1e-6)
-    np.testing.assert_allclose(drawn["truth"][:, 1], run["state"][:, 0], rtol=1e-6)
-    axes = plot_path(run, forward_up=True, unit="cm")
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("right, cm", "forward, cm")
 
 
 @pytest.mark.parametrize("forward_up", [False, True])
@@ -83,69 +73,3 @@ def test_particles_are_summed_up_with_their_weights():
     axes = plot_path(TensorDict({"ensemble": particles, "log_weight": log_weight}, [1]))
     np.testing.assert_allclose(lines(axes)["belief"], [[1.0, 0.0]])
     np.testing.assert_allclose([axes.patches[0].width, axes.patches[0].height], [2 * 2.1460, 0], atol=1e-3)
-
-
-def test_ellipses_of_an_ensemble_are_those_of_its_covariance():
-    run = ensemble_run()
-    for patch in plot_path(run, spread="ellipses").patches:
-        step = int(patch.get_gid().removeprefix("step "))
-        squares = np.linalg.eigvalsh(np.cov(run["belief", "ensemble"][step, :, :2].double().numpy().T))
-        wanted = 2 * math.sqrt(-2 * math.log(0.1)) * np.sqrt(squares)
-        np.testing.assert_allclose([patch.height, patch.width], wanted, rtol=1e-5)
-
-
-def test_space_has_one_span():
-    axes = plot_path(ensemble_run(), dims=[0, 1, 2])
-    (truth,) = [line for line in axes.get_lines() if line.get_label() == "truth"]
-    np.testing.assert_allclose(np.stack(truth.get_data_3d(), -1), ensemble_run()["state"], rtol=1e-6)
-    spans = [np.ptp(limits) for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
-    np.testing.assert_allclose(spans, spans[0])
-    assert axes.get_zlabel() == "z, m"
-
-
-def test_any_belief_and_any_axes():
-    run = ensemble_run()
-    given = Figure().add_subplot()
-    forecast = TensorDict({"forecast": {"ensemble": run["belief", "ensemble"]}, "truth": run["state"]}, [40])
-    axes = plot_path(forecast["forecast"], forecast["truth"], legend=False, ax=given)
-    assert axes is given
-    assert axes.get_legend() is None
-    np.testing.assert_allclose(lines(axes)["belief"], run["belief", "mean"][:, :2], rtol=1e-5)
-    assert set(lines(plot_path(run["belief", "mean"]))) == {"belief"}
-    assert "truth" in lines(plot_path(run.exclude("state").set("pose", run["state"]), "pose"))
-
-
-def test_errors_say_what_to_do():
-    run = ensemble_run()
-    with pytest.raises(KeyError, match=r"no \(\"belief\", \"mean\"\)"):
-        plot_path(run.select("state"))
-    with pytest.raises(KeyError, match="no 'pose' among"):
-        plot_path(run, "pose")
-    with pytest.raises(ValueError, match="one sequence"):
-        plot_path(kalman_runs())
-    with pytest.raises(ValueError, match=r'pass spread="ellipses"'):
-        plot_path(kalman_runs()[0], spread="ensemble")
-    with pytest.raises(ValueError, match="variance or a covariance"):
-        plot_path(run["belief", "mean"], spread="ellipses")
-    with pytest.raises(ValueError, match="two dimensions, or three"):
-        plot_path(run, dims=[0])
-    with pytest.raises(ValueError, match="three need projection"):
-        plot_path(run, dims=[0, 1, 2], ax=Figure().add_subplot())
-    with pytest.raises(IndexError, match="dimension 3 of a state of 3"):
-        plot_path(run, dims=[0, 3])
-    with pytest.raises(ValueError, match="truth must be"):
-        plot_path(run, run["state"][:5])
-
-
-@pytest.mark.parametrize("forward_up", [False, True])
-def test_readings_are_dots_where_they_were_read(forward_up):
-    readings = torch.tensor([[1.0, 2.0], [float("nan"), 3.0], [4.0, 5.0]])
-    axes = plot_path(torch.zeros(3, 4), readings=readings, dims=(2, 3), forward_up=forward_up)
-    (dots,) = [line for line in axes.get_lines() if line.get_label() == "readings"]
-    x, y = (dots.get_xdata().tolist(), dots.get_ydata().tolist())
-    assert (x, y) == (([-2.0, -5.0], [1.0, 4.0]) if forward_up else ([1.0, 4.0], [2.0, 5.0]))
-
-
-def test_readings_of_other_dimensions_are_refused():
-    with pytest.raises(ValueError, match=r"readings must be \[T, 2\], a column for each of dims; got \[3, 4\]"):
-        plot_path(torch.zeros(3, 4), readings=torch.zeros(3, 4))

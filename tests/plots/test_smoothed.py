@@ -1,13 +1,12 @@
 """Oracles: the rows that a smoother wrote, moved by hand to the steps of the states that they speak of."""
 
 import numpy as np
-import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.plots.runs_for_tests import ensemble_run, kalman_runs
+from tests.plots.runs_for_tests import kalman_runs
 from torch_denkf.functional.manifolds import Circle
-from torch_denkf.plots import belief_video, plot_bands, plot_calibration, plot_path, plot_spread_error
+from torch_denkf.plots import plot_bands, plot_calibration, plot_path
 
 LAG = 6
 
@@ -19,19 +18,6 @@ def drawn(axes, label):
 
 def heights(axes):
     return [bar.get_height() for bar in axes.containers[0]]
-
-
-def test_what_a_smoother_of_recordings_wrote_is_drawn():
-    run = ensemble_run()
-    run["smoothed"] = run["belief"].apply(lambda part: part + 1)
-    (axes,) = plot_bands(run, belief="smoothed", dims=[1])
-    np.testing.assert_allclose(drawn(axes, "smoothed belief")[:, 1], run["belief", "mean"][:, 1] + 1, rtol=1e-6)
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert labels == ["not observed", "90 % of the smoothed belief", "truth", "smoothed belief"]
-    axes = plot_path(run, belief="smoothed")
-    np.testing.assert_allclose(drawn(axes, "members"), run["belief", "ensemble"][:, 0, :2] + 1, rtol=1e-6)
-    with pytest.raises(KeyError, match=r'no \("forecast", "mean"\)'):
-        plot_path(run, belief="forecast")
 
 
 def test_a_belief_of_long_ago_is_drawn_where_the_robot_was_then():
@@ -50,21 +36,6 @@ def test_a_belief_of_long_ago_is_drawn_where_the_robot_was_then():
     np.testing.assert_allclose([patch.center for patch in axes.patches], known[steps, :2], rtol=1e-6)
 
 
-def test_calibration_and_spread_take_the_truth_of_then():
-    runs = kalman_runs(lag=LAG)
-    by_hand = TensorDict(
-        {"belief": runs["smoothed"][:, LAG:].exclude("age"), "state": runs["state"][:, :-LAG]}, [60, 74]
-    )
-    for ours, wanted in zip(
-        plot_calibration(runs, belief="smoothed", every=20), plot_calibration(by_hand, every=20), strict=True
-    ):
-        assert heights(ours) == heights(wanted)
-        low = next(patch for patch in ours.patches if patch.get_gid() == "band").get_y()
-        assert min(heights(ours)) >= low  # a Kalman smoother is calibrated
-    ours, wanted = plot_spread_error(runs, belief="smoothed", dims=[2]), plot_spread_error(by_hand, dims=[2])
-    np.testing.assert_allclose(drawn(ours, "state 2"), drawn(wanted, "state 2"))
-
-
 def test_each_state_is_taken_from_the_latest_row_of_its_episode():
     age = torch.tensor([3, 3, 0, 1, 2, 3, 3, 0, 1])  # cut out of an episode; a new one at 2, and one at 7
     mean = torch.arange(9.0).unsqueeze(-1)
@@ -76,26 +47,3 @@ def test_each_state_is_taken_from_the_latest_row_of_its_episode():
     np.testing.assert_allclose(drawn(axes, "smoothed belief")[:, 1], wanted, rtol=1e-6)
     (axes,) = plot_calibration(run, torch.zeros(9, 1), belief="smoothed", bins=2)
     assert heights(axes) == [100, 0]  # of three states, each below its mean
-
-
-def test_particles_of_long_ago_weigh_what_they_weigh_now():
-    age, weight = torch.tensor([[0], [1], [1]]), torch.tensor([[0.5, 0.5], [0.9, 0.1], [0.2, 0.8]])
-    ensemble = torch.tensor([[[0.0], [1.0]], [[0.0], [1.0]], [[0.0], [1.0]]])
-    run = TensorDict({"belief": {"log_weight": weight.log()}, "smoothed": {"ensemble": ensemble, "age": age}}, [3])
-    (axes,) = plot_bands(run, belief="smoothed")
-    np.testing.assert_allclose(drawn(axes, "smoothed belief")[:, 1], [0.1, 0.8, np.nan], rtol=1e-6)
-
-
-def test_a_video_shows_it(tmp_path, monkeypatch):
-    names = []
-    for name, plot in (("plot_bands", plot_bands), ("plot_path", plot_path)):
-
-        def note(*given, plot=plot, **settings):
-            axes = plot(*given, **settings)
-            names.extend(line.get_label() for line in np.ravel(axes)[0].get_lines() if line.get_gid() != "member")
-            return axes
-
-        monkeypatch.setattr(f"torch_denkf.plots.video.{name}", note)
-    run = kalman_runs(lag=LAG)[0][:12]
-    belief_video(tmp_path / "a.gif", run, belief="smoothed", path={}, bands={"dims": [0]}, size=(6, 4), every=4)
-    assert names.count("smoothed belief") == 2

@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.plots.runs_for_tests import ensemble_run, kalman_runs
+from tests.plots.runs_for_tests import kalman_runs
 from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.plots import plot_spread_error
 
@@ -50,26 +50,9 @@ def test_few_members_are_expected_to_err_more_than_they_spread():
     assert spread[0] == pytest.approx(error[0], abs=0.02)
 
 
-def test_the_axes_say_each_unit():
-    axes = plot_spread_error(kalman_runs(), names=["x, m", "y, m", "vx, m/s", "vy, m/s"])
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("predicted spread, m or m/s", "RMS error, m or m/s")
-
-
 def test_angles_are_wrapped():
     belief = TensorDict({"mean": torch.tensor([[0.0, 3.1]]), "var": torch.ones(1, 2)}, [1])
     axes = plot_spread_error(
         belief, torch.tensor([[0.0, -3.1]]), dims=[1], space=Euclidean(1) * Circle(), factors=[1.0], bins=1
     )
     assert data(axes)["heading, deg"][1, 0] == pytest.approx(2 * np.pi - 6.2, abs=1e-6)
-
-
-def test_errors_say_what_to_do():
-    run = ensemble_run()
-    with pytest.raises(ValueError, match="the truth is missing"):
-        plot_spread_error(run.exclude("state"))
-    with pytest.raises(ValueError, match="the spread is missing"):
-        plot_spread_error(run["belief"].select("mean"), run["state"])
-    with pytest.raises(ValueError, match=r"the truth has 2 dimensions, but \[0, 1, 2\]"):
-        plot_spread_error(run, run["state"][:, :2])
-    with pytest.raises(ValueError, match="41 bins need at least one state each; got 40"):
-        plot_spread_error(run, bins=41)

@@ -1,7 +1,5 @@
 """Oracles: the frames that were written, decoded by OpenCV and pillow."""
 
-import weakref
-
 import cv2
 import numpy as np
 import pytest
@@ -9,8 +7,7 @@ import torch
 from PIL import Image
 
 from tests.plots.runs_for_tests import ensemble_run
-from torch_denkf.plots import belief_video, plot_bands, plot_path, write_video
-from torch_denkf.plots._scene import Scene
+from torch_denkf.plots import belief_video, write_video
 
 
 def smooth_frames(count=6, height=48, width=64):
@@ -53,59 +50,6 @@ def test_frames_come_back(tmp_path, ending):
         assert np.argmin([np.abs(frame - other).mean() for other in frames]) == number
 
 
-@pytest.mark.parametrize(
-    "frame",
-    [
-        torch.full((1, 20, 30), 0.5),
-        torch.full((20, 30), 128, dtype=torch.uint8),
-        torch.full((6, 20, 30), 0.5),  # a frame and its difference
-        torch.full((2, 20, 30), 0.5),
-        np.full((20, 30, 3), 0.5),
-        np.full((20, 30, 4), 128, dtype=np.uint8),
-    ],
-)
-def test_layouts_of_a_frame(tmp_path, frame):
-    got, _ = decoded(write_video(tmp_path / "a.gif", [frame], 10))
-    assert got.shape == (1, 20, 30, 3)
-    assert np.abs(got.astype(int) - 128).max() <= 1
-
-
-def test_a_gif_repeats_and_keeps_time_to_a_hundredth(tmp_path):
-    with Image.open(write_video(tmp_path / "a.gif", smooth_frames(30, 8, 8), 30)) as gif:
-        assert gif.info["loop"] == 0
-        times = []
-        for number in range(gif.n_frames):
-            gif.seek(number)
-            times.append(gif.info["duration"])
-    assert set(times) == {30, 40}
-    assert sum(times) == 1000
-
-
-def test_odd_sizes_grow_by_one(tmp_path):
-    got, _ = decoded(write_video(tmp_path / "a.mp4", [torch.full((3, 21, 31), 0.5)] * 2, 10))
-    assert got.shape == (2, 22, 32, 3)
-
-
-class Frame(np.ndarray):
-    """An array that can be counted."""
-
-
-@pytest.mark.parametrize("ending", ["mp4", "gif"])
-def test_one_frame_is_held_at_a_time(tmp_path, ending):
-    references, most = [], 0
-
-    def frames():
-        nonlocal most
-        for t in range(40):
-            frame = np.full((16, 16, 3), 6 * t, dtype=np.uint8).view(Frame)
-            references.append(weakref.ref(frame))
-            most = max(most, sum(reference() is not None for reference in references))
-            yield frame
-
-    write_video(tmp_path / f"a.{ending}", frames(), 10)
-    assert most <= 3
-
-
 def blue(frame):
     """Where a band or a line of the belief is."""
     return frame[..., 2].astype(int) - frame[..., 0] > 30
@@ -141,81 +85,5 @@ def test_the_belief_grows_beside_the_camera(tmp_path, ending):
     assert (np.diff(path) > 0).sum() >= 8
 
 
-def test_the_last_frame_is_the_whole_picture(tmp_path):
-    run, name = ensemble_run(steps=20), "the angle of the right shoulder's yaw joint, rad"
-    run["pixels"] = torch.full((20, 3, 8, 16), 0.5)
-    scene = Scene((8, 5), 100, None, run["pixels"], path=True, bands=2)
-    plot_path(run, ax=scene.path)
-    plot_bands(run, dims=[0, 1], names=[name, "y"], ax=scene.bands)
-    scene.freeze(run["observed"].any(-1), np.arange(20))
-    middle, last = scene.frame(9), scene.frame(19)
-    boxes = [axes.get_window_extent() for axes in scene.bands]
-    label = scene.bands[0].yaxis.label.get_window_extent()
-    assert label.height <= 1.01 * boxes[0].height
-    # What the bands hide until then is what there is when all is drawn at once, artist by artist.
-    for part in [part for axes in scene.bands for part in (*axes.lines, *axes.collections, *axes.patches)]:
-        part.set_visible(True)
-    for _, part in scene.moving:
-        part.set_animated(False)
-    scene.canvas.draw()
-    assert np.abs(scene._buffer().astype(int) - last).max() <= 2
-    for box in boxes:
-        rows = slice(round(500 - box.y1), round(500 - box.y0))
-        half = round((box.x0 + box.x1) / 2)
-        assert (middle[rows, : half - 1] == last[rows, : half - 1])[:, round(box.x0) :].all()
-        assert not blue(middle[rows, half + 1 : round(box.x1)]).any()
-
-
 def vermilion(frame):
     return (np.abs(frame.astype(int) - (213, 94, 0)).max(-1) <= 60).sum()
-
-
-@pytest.mark.parametrize("bands", [None, {"dims": [0]}])
-def test_the_belief_lies_on_the_picture(tmp_path, bands):
-    at = torch.stack([4.0 + 2 * torch.arange(12), 3 + torch.arange(12)], -1)  # columns and rows, in pixels
-    pixels = torch.zeros(12, 3, 20, 32)
-    pixels[:, 1] = 0.6
-    settings = {"bands": bands, "path": {"spread": "none"}, "size": (8, 4)}
-    got, _ = decoded(belief_video(tmp_path / "a.gif", at, pixels, on_picture=True, **settings))
-    places = np.argwhere((np.abs(got[0].astype(int) - (0, 153, 0)) < 12).all(-1))
-    (top, left), (bottom, right) = places.min(0), places.max(0) + 1
-    assert (right - left) / (bottom - top) == pytest.approx(32 / 20, rel=0.02)  # pixels are squares
-    for frame, (column, row) in zip(got, at.tolist(), strict=True):
-        marked = np.argwhere(blue(frame[top:bottom, left:right]))
-        down, across = marked.max(0)  # the dot is the last mark to the right, and the lowest
-        assert across - 3.5 == pytest.approx((column + 0.5) / 32 * (right - left), abs=2)
-        assert down - 3.5 == pytest.approx((row + 0.5) / 20 * (bottom - top), abs=2)
-
-
-def test_parts_may_be_left_out(tmp_path):
-    run = ensemble_run(steps=4)
-    for name, given in {
-        "bands": {"bands": {"dims": [0]}},
-        "path": {"path": {}},
-        "camera": {"pixels": np.full((4, 8, 8, 3), 200, dtype=np.uint8)},
-    }.items():
-        got, fps = decoded(belief_video(tmp_path / f"{name}.gif", run, size=(4, 3), **given))
-        assert got.shape == (4, 300, 400, 3)
-        assert fps == pytest.approx(10)
-
-
-def test_errors_say_what_to_do(tmp_path):
-    run = ensemble_run(steps=4)
-    with pytest.raises(ValueError, match=r"ends with \.mp4 or \.gif; got 'a\.avi'"):
-        write_video(tmp_path / "a.avi", smooth_frames(), 10)
-    with pytest.raises(ValueError, match="at most 50 for a GIF"):
-        write_video(tmp_path / "a.gif", smooth_frames(), 60)
-    for ending in ("mp4", "gif"):
-        with pytest.raises(ValueError, match="needs frames"):
-            write_video(tmp_path / f"a.{ending}", [], 10)
-        with pytest.raises(ValueError, match="frame 1 has shape"):
-            write_video(tmp_path / f"a.{ending}", [np.zeros((8, 8)), np.zeros((8, 9))], 10)
-    with pytest.raises(ValueError, match="nothing to draw"):
-        belief_video(tmp_path / "a.gif", run)
-    for given in ({}, {"pixels": torch.zeros(4, 3, 8, 8), "path": {"forward_up": True}}):
-        with pytest.raises(ValueError, match="on_picture needs pixels, and a path of two dims without forward_up"):
-            belief_video(tmp_path / "a.gif", run, on_picture=True, **given)
-    with pytest.raises(KeyError, match="no 'image' among"):
-        belief_video(tmp_path / "a.gif", run, "image")
-    with pytest.raises(ValueError, match="a picture a step, 4; got 3"):
-        belief_video(tmp_path / "a.gif", run, torch.zeros(3, 3, 8, 8))

@@ -4,14 +4,12 @@ from functools import partial
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch.testing import assert_close
 
 from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf, toy_frames
 from tests.filters.gaussian_for_tests import directional_check
 from tests.functional.checks import assert_refused
 from tests.smoothers.joint import drive, joint_beliefs
-from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.baselines import LSTMFilter
 from torch_denkf.functional.smoothing.ensemble import enrts_step
 from torch_denkf.modules import GaussianPrior
@@ -32,14 +30,6 @@ def means(smoother, frames):
 
 def noisy(smoother, frames):
     return getattr(smoother, "filter", smoother).draw_noise(frames)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_rows_of_a_batch_do_not_know_each_other(float64, kind):
-    smoother = KINDS[kind](toy_denkf())
-    frames = noisy(smoother, toy_frames([3, 8]))
-    alone = torch.stack([means(smoother, row) for row in frames])
-    assert_close(means(smoother, frames), alone, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("at_reset", [False, True])
@@ -110,20 +100,6 @@ def test_gradients_with_gaps_and_new_episodes(float64, kind):
     frames = noisy(smoother, frames)
     weights = torch.linspace(-1, 1, 36).reshape(2, 6, 3)
     directional_check(lambda: (means(smoother, frames) * weights).sum(), list(filter.parameters()), rtol=1e-4)
-
-
-def test_the_path_of_a_car_online_is_that_of_the_recording():
-    """The analysis sees more than the state: the velocities of past steps; its taper is then cut for the past."""
-    car = car_filter(ensemble_size=8).eval()
-    frames = {
-        "flow": torch.randn(2, 8, 3, 25, 79),
-        "road": torch.randn(2, 8, 13, 69),
-        "start": torch.randn(2, 8, 5),
-        "observed": torch.rand(2, 8, 1) < 0.7,
-    }
-    frames = car.draw_noise(TensorDict(frames, [2, 8]))
-    whole, online = means(EnKS(car, 3), frames), means(FixedLag(car, 3), frames)
-    assert_close(whole[:, :-3], online[:, 3:], rtol=1e-4, atol=1e-4)
 
 
 def test_what_is_no_lag_and_what_no_filter():

@@ -14,7 +14,7 @@ from tests.filters.factories import (
     toy_denkf,
     toy_frames,
 )
-from tests.functional.checks import assert_compiled_is_eager, assert_refused
+from tests.functional.checks import assert_refused
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional.moments import ensemble_cov
@@ -25,7 +25,6 @@ from torch_denkf.modules import (
     EnsembleAnalysis,
     GaussianPrior,
     LinearObservation,
-    LocalEnsembleAnalysis,
 )
 from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
@@ -146,15 +145,6 @@ def test_several_analyses_each_correct_the_past(float64):
     assert_close(serial["smoothed", "var"], joint["smoothed", "var"], rtol=0, atol=1e-9)
 
 
-def test_a_local_analysis_of_everything_is_the_global_one(float64):
-    frames, plain = drive(2, 6, resets=False), linear_denkf("etkf")
-    analysis = LocalEnsembleAnalysis(torch.ones(2, 2), observation_key="observation")
-    parts = [plain["transition"], None, plain["observation"], plain["noise"], analysis]
-    filters = plain, DEnKF(*parts, initial=plain.initial)
-    globally, locally = (EnKS(filter, 3)(frames.copy()) for filter in filters)
-    assert_close(locally["smoothed", "ensemble"], globally["smoothed", "ensemble"], rtol=0, atol=1e-9)
-
-
 def test_inflation_leaves_the_past_alone(float64):
     filter = linear_denkf("etkf")
     out = FixedLag(filter, 2).sequence(drive(2, 3, resets=False, missing=0.0))
@@ -226,14 +216,6 @@ def test_gradients_of_a_step_are_those_of_finite_differences(float64, size):
         return enrts_step(before, forecast, forecast + weights @ (forecast - forecast.mean(-2, keepdim=True)))
 
     assert torch.autograd.gradcheck(smooth, inputs)
-
-
-def test_compiled_functions_are_the_eager_ones():
-    ensemble, forecast = torch.randn(2, 3, 6, 3), torch.randn(2, 3, 6, 3)
-    follows = torch.tensor([[False, True, False], [False, True, True]])
-    for lag in (None, 1):
-        options = {"follows": follows, "lag": lag}
-        assert_compiled_is_eager(enrts_smooth, ensemble, forecast, **options, rtol=1e-3, atol=1e-3)
 
 
 def test_what_cannot_be_smoothed_says_so():

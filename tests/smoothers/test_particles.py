@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
 from tests.filters.gaussian_for_tests import known_process_noise
-from tests.functional.checks import assert_compiled_is_eager, assert_refused
+from tests.functional.checks import assert_refused
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.functional.gaussian import gaussian_log_prob
@@ -116,12 +116,6 @@ def test_noise_that_depends_on_the_mean_reads_that_of_the_weighted_particles(flo
 def test_gradients_are_those_of_finite_differences(float64):
     inputs = [torch.randn(2, 4).log_softmax(-1), torch.randn(2, 4, 4), torch.randn(2, 4).log_softmax(-1)]
     assert torch.autograd.gradcheck(backward_weights, [value.requires_grad_() for value in inputs])
-
-
-def test_compiled_is_eager():
-    weights, moves = torch.randn(3, 3, 4).log_softmax(-1), torch.randn(3, 3, 4, 4)
-    for lag in (None, 1):
-        assert_compiled_is_eager(backward_smooth, weights, moves, lag=lag, rtol=1e-5, atol=1e-5)
 
 
 def test_densities_of_pairs(float64):

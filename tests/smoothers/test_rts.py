@@ -9,7 +9,6 @@ from torch.testing import assert_close
 
 from tests.filters.factories import NoisyLinear, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check, learned_filter, learned_frames, linear_filter
-from tests.functional.checks import assert_compiled_is_eager
 from tests.smoothers.joint import drive, joint_beliefs
 from torch_denkf import EKF, UKF, KalmanFilter
 from torch_denkf.functional.manifolds import SE2
@@ -92,25 +91,6 @@ def test_a_learned_filter_learns_from_what_it_looks_back_at(float64, name):
             ),
             filter.parameters(),
         )
-
-
-def test_compiled_functions_are_the_eager_ones():
-    frames = RTSSmoother(linear_kalman())(drive(2, 5))[:, :3]
-    values = [frames["belief", "mean"], frames["belief", "cov"], frames["forecast", "mean"], frames["forecast", "cov"]]
-    values.append(frames["belief", "cov"])
-    for lag in (None, 1):
-        assert_compiled_is_eager(rts_smooth, *values, lag=lag, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("batch", [(), (2, 3)])
-def test_any_batch_and_precision(batch):
-    frames = drive(1, 5, resets=False)[0].expand(*batch, 5).clone()
-    out = RTSSmoother(linear_kalman())(frames.copy())
-    assert out["smoothed", "mean"].dtype == torch.float32
-    frames["observation"] = frames["observation"].double()
-    exact = RTSSmoother(linear_kalman().double())(frames)
-    assert_close(out["smoothed", "mean"].double(), exact["smoothed", "mean"], rtol=0, atol=1e-5)
-    assert_close(out["smoothed", "cov"].double(), exact["smoothed", "cov"], rtol=0, atol=1e-5)
 
 
 def unsure(name, dtype):

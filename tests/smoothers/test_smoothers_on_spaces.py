@@ -2,11 +2,9 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import nn
 
 from tests.filters.beliefs_for_tests import close
-from tests.filters.factories import stepwise
 from tests.filters.test_spaces import (
     DT,
     SPACE,
@@ -26,8 +24,8 @@ from tests.smoothers.small_angles import PROCESS, STARTS, assert_small_differenc
 from torch_denkf.baselines import IEnKS
 from torch_denkf.filters import EKF, UKF, ParticleFilter
 from torch_denkf.functional.gaussian import gaussian_log_prob
-from torch_denkf.functional.manifolds import SO3, Euclidean
-from torch_denkf.modules import AroundState, ConstantNoise, GaussianAround, LearnedTransition, Select, SubModel
+from torch_denkf.functional.manifolds import SO3
+from torch_denkf.modules import AroundState, ConstantNoise, GaussianAround, SubModel
 from torch_denkf.smoothers import FixedLag, ParticleSmoother, RTSSmoother
 from torch_denkf.smoothers.particles import log_density_of_pairs
 
@@ -38,27 +36,6 @@ SMOOTHED = [("smoothed", "mean"), ("smoothed", "var")]
 @pytest.fixture(autouse=True)
 def _double(float64):
     return
-
-
-def numbers():
-    """Data, and a motion, sensor, observation and noise of plain numbers, which bend."""
-    torch.manual_seed(0)
-    data = TensorDict({"pose": torch.randn(B, T, 2), "start": torch.randn(B, T, 2)}, [B, T])
-    move = nn.Linear(2, 2, bias=False)
-    move.weight.data = torch.tensor([[1.0, 0.4], [-0.3, 0.9]])
-    motion = LearnedTransition(nn.Sequential(move, nn.Tanh()), residual=False)
-    return data, (motion, None, Select([0, 1])), ConstantNoise([0.3, 0.4], in_key="pose")
-
-
-@pytest.mark.parametrize("kind", ["EKF", "UKF"])
-def test_numbers_as_a_space_change_nothing(kind):
-    data, parts, own = numbers()
-    outs = []
-    for space in (None, Euclidean(2)):
-        start = GaussianAround([0.5, 0.6], state_key="start", space=space)
-        options = {"process_noise": [0.1, 0.2], "observation_key": "pose", "reading_space": space}
-        outs.append(FixedLag(GAUSSIAN[kind](*parts, own, initial=start, **options), 3).sequence(data.clone()))
-    close(*outs, [*SMOOTHED, ("smoothed", "cov"), ("smoothed", "age"), ("belief", "cov")], atol=1e-11)
 
 
 @pytest.mark.parametrize("kind", ["EKF", "UKF"])
@@ -85,17 +62,6 @@ def test_online_lag_is_the_smoother(kind):
         assert (online["smoothed", "age"][:, lag:] == lag).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["EKF", "UKF"])
-def test_steps_and_compiled_steps_are_the_sequence(kind):
-    filter, data = FixedLag(make(kind), 3), log()
-    data["is_init"] = (torch.arange(T) % 8 == 0).reshape(1, T, 1).expand(B, T, 1).clone()
-    out = filter.sequence(data.clone())
-    close(stepwise(filter, data.clone()), out, filter.belief_keys, atol=1e-10)
-    filter.compile(chunk=2, backend="aot_eager")
-    close(filter.sequence(data.clone()), out, [*filter.belief_keys, *SMOOTHED], atol=1e-10)
-
-
 class GyroTurn(SubModel):
     """Turns by what a gyro reads."""
 
@@ -110,16 +76,6 @@ def particles(parts, own, std, q, size, space=None, reading_space=None, **option
     start = AroundState(std, ensemble_size=size, state_key="start", space=space)
     known = {"process_noise": q, "observation_key": "pose", "reading_space": reading_space}
     return ParticleFilter(*parts, noise=own, initial=start, **known, **options)
-
-
-def test_particles_of_numbers_as_a_space_are_plain_ones():
-    data, parts, own = numbers()
-    outs = []
-    for space in (None, Euclidean(2)):
-        filter = particles(parts, own, [0.5, 0.6], [0.1, 0.2], 40, space=space, reading_space=space)
-        data = data if outs else filter.draw_noise(data)
-        outs.append(ParticleSmoother(filter, 3)(data.clone()))
-    close(*outs, [*SMOOTHED, ("smoothed", "log_weight"), ("smoothed", "ensemble")], atol=1e-10)
 
 
 def test_particles_of_small_angles_are_plain_ones():
@@ -170,17 +126,6 @@ def iterated(parts, own, std, q, space=None, reading_space=None, size=8, key="po
     return IEnKS(*parts, own, process_noise=q, **known, **options)
 
 
-def test_the_iterated_smoother_of_numbers_as_a_space_is_the_plain_one():
-    data, parts, own = numbers()
-    outs = []
-    for space in (None, Euclidean(2)):
-        filter = iterated(parts, own, [0.5, 0.6], [0.1, 0.2], space, space, inflation=1.1, rotate=True)
-        data = data if outs else filter.draw_noise(data)
-        outs.append(filter.sequence(data.clone()))
-    infos = [("info", name) for name in ("nis", "log_likelihood", "innovation")]
-    close(*outs, [*SMOOTHED, ("smoothed", "ensemble"), ("belief", "ensemble"), ("belief", "var"), *infos], atol=1e-9)
-
-
 @pytest.mark.parametrize("iterations", [1, 5])
 def test_the_iterated_smoother_of_small_angles_is_the_plain_one(iterations):
     data, flat = readings()
@@ -218,18 +163,6 @@ def test_a_turned_world_turns_the_iterated_smoother_and_nothing_else(turn):
     here, there = turned_beliefs(filter, turn, data)
     assert_turned(here, there, turn, 1e-8)
     close(there["info"], here["info"], ["nis", "log_likelihood"], atol=1e-7)
-
-
-def test_iterated_steps_are_the_sequence_and_gradients_are_finite():
-    filter, data = orientations_iterated(), log()
-    data["is_init"] = (torch.arange(T) % 8 == 0).reshape(1, T, 1).expand(B, T, 1).clone()
-    data = filter.draw_noise(data)
-    data["pose"][0, 6] = SO3().plus(data["pose"][0, 5], torch.tensor([torch.pi, 0.0, 0.0]))
-    data["start"].requires_grad_()
-    out = filter.sequence(data.clone())
-    close(stepwise(filter, data.clone().detach()), out.detach(), filter.belief_keys, atol=1e-9)
-    (out["smoothed", "var"].sum() + SPACE.minus(out["belief", "mean"], data["state"]).square().sum()).backward()
-    assert data["start"].grad.isfinite().all()
 
 
 def test_the_iterated_smoother_takes_the_mean_of_samples_that_are_points():

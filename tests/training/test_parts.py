@@ -1,16 +1,13 @@
 """A part that is trained alone: its file, what a second call does, and which parameters a stage leaves out."""
 
-from collections import OrderedDict
-
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 
 from torch_denkf.training import Stage
 from torch_denkf.training.checkpoint import read_checkpoint
-from torch_denkf.training.parts import parameters_without, train_part
+from torch_denkf.training.parts import train_part
 
 
 def line_stage(net, updates=150):
@@ -63,14 +60,3 @@ def test_a_training_that_was_broken_off_ends_as_an_unbroken_one(tmp_path):
             net.weight.data.zero_()  # as a fresh process would not know it
         results[name] = train_part(net, stage, **settings).weight.clone()
     assert torch.equal(results["whole"], results["broken"])
-
-
-def test_modules_that_are_left_out_keep_their_parameters():
-    model = TensorDictSequential(
-        OrderedDict((name, TensorDictModule(nn.Linear(1, 1), ["x"], ["x"])) for name in ("sensor", "noise", "analysis"))
-    )
-    found = parameters_without(model, ["noise"])
-    expected = [*model.module["sensor"].parameters(), *model.module["analysis"].parameters()]
-    assert [id(p) for p in found] == [id(p) for p in expected]
-    with pytest.raises(KeyError, match=r"no module \['noises'\]; it has \['sensor', 'noise', 'analysis'\]"):
-        parameters_without(model, ["noises"])

@@ -100,24 +100,6 @@ def test_a_finished_training_is_not_trained_again(tmp_path):
     assert_same(dict(trainer.model.state_dict()), dict(torch.load(first["end_to_end"]["path"])["model"]))
 
 
-def test_anew_on_request(tmp_path):
-    make_trainer(tmp_path, updates=2).fit()
-    logs = csv_files(tmp_path)
-    (tmp_path / "logs" / "notes.csv").write_text("not ours")
-    make_trainer(tmp_path, updates=2, seed=1).fit(resume=False)
-    again = csv_files(tmp_path)
-    assert again.keys() == logs.keys()
-    assert again["scalars/filter/loss.csv"] != logs["scalars/filter/loss.csv"]
-    assert again["scalars/filter/loss.csv"].count(b"\n") == 1
-    assert (tmp_path / "logs" / "notes.csv").read_text() == "not ours"
-
-
-def test_another_training_is_refused(tmp_path):
-    make_trainer(tmp_path, updates=2).fit()
-    with pytest.raises(ValueError, match=r"last\.pt is of another training: seed \(0, now 3\), stages\[0\].updates"):
-        make_trainer(tmp_path, updates=3, seed=3).fit()
-
-
 def test_another_model_is_refused(tmp_path):
     def trainer(width):
         net = torch.nn.Linear(width, 1)
@@ -128,14 +110,6 @@ def test_another_model_is_refused(tmp_path):
     write_checkpoint(tmp_path / "last.pt", state)
     with pytest.raises(ValueError, match=r"(?s)last\.pt does not fit the model.*size mismatch for weight"):
         trainer(2).fit()
-
-
-def test_stages_may_be_added_after_the_end(tmp_path):
-    two = make_trainer(tmp_path, updates=2, stages=("sensor", "filter")).fit()
-    three = make_trainer(tmp_path, updates=2).fit()
-    assert list(three) == ["sensor", "filter", "end_to_end"]
-    assert {name: three[name] for name in two} == two
-    assert three["end_to_end"]["metrics"]["mse"] <= two["filter"]["metrics"]["mse"]
 
 
 WAITS = """
@@ -175,15 +149,3 @@ def test_what_cannot_be_made_again_is_moved_and_not_deleted(tmp_path, resume, ca
     assert {file.name: file.read_bytes() for file in (tmp_path / "earlier-1").glob("best_*.pt")} == before
     assert csv_files(tmp_path / "earlier-1") == logs
     assert len(before) == len(list((tmp_path / "earlier-2").glob("best_*.pt"))) == 3
-
-
-def test_a_finished_training_that_is_started_again_says_so(tmp_path, caplog):
-    make_trainer(tmp_path).fit()
-    assert not caplog.messages
-    make_trainer(tmp_path).fit()
-    (message,) = caplog.messages
-    assert str(tmp_path) in message
-    assert "fit(resume=False)" in message
-    caplog.clear()
-    make_trainer(tmp_path).fit(resume=False)
-    assert not caplog.messages

@@ -85,11 +85,3 @@ def test_only_trainable_restores_what_was():
 def test_mistakes(change, message):
     with pytest.raises(ValueError, match=message):
         Stage(**{"name": "fit", "loss": None, "sample": None, "updates": 1, **change})
-
-
-def test_parameters_that_no_checkpoint_would_hold():
-    net = nn.Linear(1, 1)
-    with pytest.raises(ValueError, match="trains 2 parameters that the trainer's model does not hold"):
-        Stage("fit", nn.Linear(1, 1), None, 1).groups(net)
-    with pytest.raises(ValueError, match="no parameters to train"):
-        Stage("fit", nn.Identity(), None, 1).groups(net)

@@ -1,7 +1,5 @@
 """Oracles: a training loop written out by hand, the maximum of a closed-form likelihood, scripted validations."""
 
-import sys
-
 import pytest
 import torch
 from scipy.optimize import minimize_scalar
@@ -151,16 +149,6 @@ def test_updates_with_readings_that_are_not_finite_are_left_out_and_said_once(tm
         assert updates.step(stage.sample(seed_update(0, 0, update), None))
     for one, other in zip(filter.parameters(), twin.parameters(), strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=0)
-
-
-def test_too_many_such_updates_in_a_row_end_it_with_the_key(tmp_path):
-    filter = small_filter()
-    trainer = FilterTrainer(
-        filter, [filter_stage(filter, range(2, 20), 20)], out=tmp_path, device="cpu", save_every=1, max_skipped=3
-    )
-    with pytest.raises(FloatingPointError, match=r"update 6: .* in 4 updates in a row.*\['observation'\]"):
-        trainer.fit()
-    assert read_checkpoint(tmp_path / "last.pt")["updates"]["in_a_row"] == 3
 
 
 def test_the_likelihood_reaches_its_maximum(tmp_path, float64):
@@ -325,29 +313,6 @@ def test_hooks_of_torchrl(tmp_path, capfd):
         tmp_path / "logs/csv/scalars/fit/loss.csv"
     ).read_text()
     assert capfd.readouterr() == ("", "")  # no bar where no terminal is
-
-
-def test_the_bar_shows_terms_and_errors(tmp_path, monkeypatch):
-    shown = []
-
-    class Bar:
-        def __init__(self, **kwargs):
-            shown.append({key: kwargs[key] for key in ("total", "initial", "desc", "unit", "disable")})
-
-        __enter__ = lambda self: self  # noqa: E731
-        __exit__ = update = lambda self, *_: None
-
-        def set_postfix(self, values, refresh):
-            shown.append(sorted(values))
-
-    monkeypatch.setattr(sys.modules["torch_denkf.deployment.progress"], "tqdm", Bar)
-    net = nn.Linear(2, 1)
-    trainer = FilterTrainer(net, [line_stage(net)], out=tmp_path, device="cpu", validate=lambda: {"error": 1.0})
-    trainer.fit()
-    assert shown == [
-        {"total": 6, "initial": 0, "desc": "fit", "unit": "it", "disable": False},
-        ["error", "loss", "loss_bias", "loss_square"],
-    ]
 
 
 def test_mistakes(tmp_path):

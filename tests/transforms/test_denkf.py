@@ -5,7 +5,6 @@
 """
 
 import pickle
-from copy import deepcopy
 from functools import partial
 
 import pytest
@@ -20,7 +19,6 @@ from torchrl.envs import (
     InitTracker,
     ParallelEnv,
     SerialEnv,
-    StepCounter,
     TransformedEnv,
     check_env_specs,
 )
@@ -35,7 +33,6 @@ from tests.transforms.envs_for_tests import (
     fixed_filter,
     forked_env,
     half_known_filter,
-    known_start_filter,
     random_filter,
     random_rollout,
     seeded_env,
@@ -68,14 +65,6 @@ def env(request):
     env.first = env.reset()["belief", "ensemble"]  # before anything was seeded
     yield env
     env.close()
-
-
-def test_specs(env):
-    check_env_specs(env)
-    shape = (*env.batch_size, 6, 2)
-    for spec in (env.full_observation_spec, env.full_state_spec):
-        assert spec["belief", "ensemble"].shape == shape
-    assert ("belief", "mean") in env.full_observation_spec.keys(True, True)
 
 
 def test_partial_resets(env):
@@ -152,31 +141,6 @@ def test_collector_replay_buffer_loss_gradients():
         assert any((grad != 0).any() for grad in grads), name
 
 
-@pytest.mark.parametrize("copy", [lambda t: pickle.loads(pickle.dumps(t)), deepcopy, lambda t: t.clone()])
-def test_copies_compute_the_same(copy):
-    transform = DEnKFTransform(toy_filter())
-    rollouts = []
-    for part in (transform, copy(transform)):
-        torch.manual_seed(1)
-        rollouts.append(random_rollout(TransformedEnv(toy_base_env(batch_size=[3], max_steps=5), part)))
-    assert_equal(*rollouts, BELIEF)
-
-
-def test_state_dict():
-    first, second = (DEnKFTransform(toy_filter()) for _ in range(2))
-    env, other = (TransformedEnv(toy_base_env(batch_size=[3]), part) for part in (first, second))
-
-    def run(env):
-        torch.manual_seed(1)
-        env.set_seed(1)
-        return random_rollout(env)
-
-    assert not run(env)["next", "belief", "mean"].equal(run(other)["next", "belief", "mean"])
-    second.load_state_dict(first.state_dict())
-    assert_equal(run(env), run(other), BELIEF)
-    assert set(first.state_dict()) == {f"filter.{name}" for name in first.filter.state_dict()}
-
-
 def test_kalman_filter_in_the_transform(float64):
     kf = linear_kalman()
     env = filtered_env(lambda: kf, batch_size=[3], max_steps=[4, 7, 50], missing=0.2)
@@ -184,17 +148,6 @@ def test_kalman_filter_in_the_transform(float64):
     rollout = random_rollout(TransformedEnv(env, InitTracker()))
     expected = kf.sequence(rollout.select("observation", "observed", "is_init"))
     assert_equal(rollout, expected, [("belief", "mean"), ("belief", "cov"), ("belief", "var")], atol=1e-13)
-
-
-def test_same_seed_same_rollout(env):
-    def run(seed):
-        torch.manual_seed(seed)  # of the filter, where it runs in this process
-        env.set_seed(seed)
-        return random_rollout(env, 6)
-
-    first, again, other = run(1), run(1), run(2)
-    assert_equal(first, again, [*BELIEF, "observation", "action"])
-    assert not first["next", "belief", "mean"].equal(other["next", "belief", "mean"])
 
 
 @pytest.mark.parametrize("env", KINDS[1:], indirect=True, scope="module")
@@ -225,15 +178,3 @@ def test_nothing_on_self():
     other = TransformedEnv(base_env(batch_size=[2]), transform.clone())
     assert other.rollout(3).shape == (2, 3)
     assert env.rollout(3).shape == (3, 3)
-
-
-def test_spec_cache_is_cleared_on_append():
-    env = TransformedEnv(base_env(batch_size=[3]))
-    assert "belief" not in env.full_observation_spec
-    assert "belief" not in env.full_state_spec
-    env.append_transform(DEnKFTransform(known_start_filter()))
-    for spec in (env.full_observation_spec, env.full_state_spec):
-        assert ("belief", "ensemble") in spec.keys(True, True)
-    check_env_specs(env)
-    env.append_transform(StepCounter())
-    check_env_specs(env)

@@ -2,22 +2,18 @@
 
 import pytest
 import torch
-from tensordict.nn import TensorDictSequential
-from torch import nn
 from torchrl.envs import (
     Compose,
     DoubleToFloat,
     TransformedEnv,
 )
 
-from tests.filters.factories import assert_equal, linear_denkf, linear_kalman
+from tests.filters.factories import assert_equal, linear_denkf
 from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import (
     BELIEF,
     Changed,
     base_env,
-    filtered_env,
-    fixed_filter,
     random_filter,
     toy_base_env,
     toy_filter,
@@ -71,32 +67,7 @@ def test_observed_nan_raises_and_names_the_key(make_base, make_filter):
     assert_equal(make(reject).rollout(8)["next"], make(honest=True).rollout(8)["next"], BELIEF)
 
 
-def test_nan_at_reset_with_an_update_there():
-    broken = Changed(lambda td: td.set("observation", torch.full_like(td["observation"], torch.nan)))
-    env = TransformedEnv(base_env(), Compose(broken, DEnKFTransform(fixed_filter(update_at_reset=True))))
-    assert_refused(ValueError, r"NaN or infinity in \['observation', \('belief', 'ensemble'\)\]", env.reset)
-
-
-def test_divergence_is_told_apart():
-    filter = linear_denkf()
-    filter["transition"].matrix.mul_(1e30)
-    assert_refused(ValueError, "the filter diverged", TransformedEnv(base_env(), DEnKFTransform(filter)).rollout, 5)
-
-
 # ------------------------------------------------------------------------------------------------------ errors
-
-
-def test_missing_key_names_key_and_environment():
-    filter = linear_kalman(observation_key="gps")
-    assert_refused(KeyError, r"'gps'.*LinearGaussianEnv", TransformedEnv(base_env(), DEnKFTransform(filter)).reset)
-    with pytest.raises(KeyError, match=r"'gps'.*LinearGaussianEnv"):
-        _ = TransformedEnv(base_env(), DEnKFTransform(filter)).observation_spec
-
-
-def test_lost_belief_is_an_error():
-    env = filtered_env()
-    td = env.rand_action(env.reset()).exclude("belief")
-    assert_refused(KeyError, r"carries the belief in \('belief', 'ensemble'\)", env.step, td)
 
 
 def test_float64_environment_and_float32_filter():
@@ -112,11 +83,3 @@ def test_float64_environment_and_float32_filter():
         Compose(DoubleToFloat(in_keys=["observation"], in_keys_inv=["action"]), DEnKFTransform(linear_denkf())),
     )
     assert mended.rollout(3)["next", "belief", "mean"].dtype == torch.float32
-
-
-def test_constructor_errors():
-    assert_refused(TypeError, "together with its initial belief", DEnKFTransform, TensorDictSequential(*fixed_filter()))
-    assert_refused(TypeError, "Linear", DEnKFTransform, nn.Linear(1, 1))
-    with pytest.raises(TypeError, match="has its initial belief already"):
-        DEnKFTransform(fixed_filter(), initial=fixed_filter().initial)
-    assert_refused(KeyError, "'info', 'gain'", DEnKFTransform, fixed_filter(), diagnostics=[("info", "gain")])

@@ -1,10 +1,7 @@
 """The belief of t - lag beside that of t, in environments: specs, workers, resets, and the smoother as the oracle."""
 
-from functools import partial
-
 import pytest
 import torch
-from torchrl.collectors import Collector
 from torchrl.envs import InitTracker, TransformedEnv, check_env_specs
 
 from tests.filters.factories import assert_equal, linear_kalman, linear_system
@@ -43,23 +40,6 @@ def test_a_rollout_is_the_recording_smoothed(float64, name):
                     now, then = rollout["smoothed", key][row, t], whole["smoothed", key][row, t - LAG]
                     torch.testing.assert_close(now, then, rtol=0, atol=1e-9)
     assert (age == LAG).sum() > 5
-
-
-def test_in_a_collector():
-    collector = Collector(partial(lagged_env, "ensemble", max_steps=4), frames_per_batch=8, total_frames=8)
-    for data in collector:
-        assert data["next", "smoothed", "mean"].isfinite().all()
-        assert data["smoothed", "age"].flatten().tolist() == [0, 1, 2, 2, 0, 1, 2, 2]
-    collector.shutdown()
-
-
-def test_what_is_stored_without_the_ensemble():
-    transform = DEnKFTransform(FixedLag(envs.fixed_filter(), LAG), store_ensemble=False)
-    env = TransformedEnv(envs.base_env(batch_size=[2], max_steps=4), transform)
-    check_env_specs(env)
-    rollout = envs.random_rollout(env)
-    assert set(rollout["smoothed"].keys()) == {"mean", "var", "age"}
-    assert set(rollout["belief"].keys()) == {"mean", "var"}
 
 
 def controlled_env(**kwargs):

@@ -1,13 +1,8 @@
 """The transform's options: what is stored, gradients, priors and masks given to resets, diagnostics, buffers."""
 
-from functools import partial
-
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictSequential
-from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import (
     ClipTransform,
     Compose,
@@ -24,56 +19,7 @@ from torchrl.envs import (
 from tests.filters.factories import assert_equal, linear_kalman, linear_system
 from tests.transforms import envs_for_tests as envs
 from torch_denkf.envs import LinearGaussianEnv
-from torch_denkf.filters import KalmanFilter
 from torch_denkf.transforms import DEnKFTransform
-
-
-def test_plain_sequential_with_its_initial_belief():
-    filter = envs.fixed_filter()
-    plain = TensorDictSequential(*filter)
-    rollouts = [
-        envs.random_rollout(TransformedEnv(envs.base_env(batch_size=[3], max_steps=[3, 5, 9]), transform))
-        for transform in (DEnKFTransform(filter), DEnKFTransform(plain, initial=filter.initial))
-    ]
-    assert_equal(rollouts[0]["next"], rollouts[1]["next"], envs.BELIEF)
-
-
-def test_store_ensemble_false_outside_of_a_batched_environment():
-    plain = SerialEnv(2, [partial(envs.seeded_env, n, max_steps=n) for n in envs.STEPS])
-    env = TransformedEnv(plain, DEnKFTransform(envs.known_start_filter(), store_ensemble=False))
-    check_env_specs(env)
-    rollout = envs.random_rollout(env)
-    assert set(rollout["next", "belief"].keys()) == {"mean", "var"}
-    assert (rollout["belief", "mean"][0, [0, 3, 6, 9]] == torch.tensor(envs.PRIOR_MEAN)).all()
-    assert (rollout["belief", "mean"][0, [1, 2, 4, 5]] != torch.tensor(envs.PRIOR_MEAN)).all()
-
-
-@pytest.mark.parametrize("use_buffers", [False, True])
-def test_store_ensemble_false_in_a_collector(use_buffers):
-    def collect(store):
-        env = envs.filtered_env(
-            envs.random_filter, transform={"store_ensemble": store}, batch_size=[2], max_steps=[3, 5]
-        )
-        check_env_specs(env)
-        torch.manual_seed(1)
-        collector = Collector(env, None, frames_per_batch=16, total_frames=32, use_buffers=use_buffers)
-        data = [batch.clone() for batch in collector]
-        collector.shutdown()
-        return torch.cat(data, -1)
-
-    full, small = collect(True), collect(False)
-    # A collector's buffers hold what env.reset() gives: an ensemble there would be data, of zeros.
-    assert set(small["belief"].keys()) == set(small["next", "belief"].keys()) == {"mean", "var"}
-    assert full["belief", "ensemble"].shape[-2:] == (6, 2)
-    for key in envs.BELIEF[1:]:
-        assert small["next", key].equal(full["next", key])
-        assert small[key].equal(full[key])
-
-
-def test_store_ensemble_false_inside_of_workers_raises():
-    make = partial(envs.filtered_env, transform={"store_ensemble": False})
-    with pytest.raises(RuntimeError, match="cannot live inside a SerialEnv or ParallelEnv"):
-        SerialEnv(2, make).reset()
 
 
 @pytest.mark.parametrize("no_grad", [True, False])
@@ -146,26 +92,6 @@ def test_reset_mask_of_the_transform_alone(float64, shape):
     torch.testing.assert_close(out["belief", "var"], expected.var(-2), rtol=0, atol=1e-15)
 
 
-def test_nested_reset_key(float64):
-    # done and _reset inside of a group, as in multi-agent environments: the mask is agent-wise.
-    env = TransformedEnv(
-        envs.base_env(batch_size=[3], max_steps=[3, 5, 30]),
-        Compose(
-            RenameTransform(
-                in_keys=["done", "terminated", "truncated"],
-                out_keys=[("group", "done"), ("group", "terminated"), ("group", "truncated")],
-                create_copy=True,
-            ),
-            DEnKFTransform(envs.known_start_filter()),
-        ),
-    )
-    rollout = envs.random_rollout(env)
-    start = torch.cat([torch.ones(3, 1, dtype=torch.bool), rollout["next", "done"][:, :-1].squeeze(-1)], 1)
-    ensemble = rollout["belief", "ensemble"]
-    assert (ensemble[start] == torch.tensor(envs.PRIOR_MEAN)).all()
-    assert ensemble[:, 1:][~start[:, 1:]].equal(rollout["next", "belief", "ensemble"][:, :-1][~start[:, 1:]])
-
-
 @pytest.mark.parametrize("resetting", [[], ["one"], ["two"], ["one", "two"]])
 def test_the_belief_starts_anew_where_any_group_does(float64, resetting):
     done = ["done", "terminated", "truncated"]
@@ -200,81 +126,6 @@ def test_diagnostics(float64, update_at_reset):
         assert rollout["forecast", "ensemble"][:, 0].equal(rollout["belief", "ensemble"][:, 0])
 
 
-def test_randomness_does_not_depend_on_the_mode():
-    transform = DEnKFTransform(envs.toy_filter())
-    env, rollouts = TransformedEnv(envs.toy_base_env(batch_size=[3]), transform), []
-    assert not transform.training
-    for mode in (True, False):
-        transform.train(mode)
-        torch.manual_seed(1)
-        env.set_seed(1)
-        rollouts.append(env.rollout(4))
-    assert_equal(*rollouts, envs.BELIEF)
-    assert (rollouts[0]["next", "belief", "var"] > 0).all()
-
-
-def test_specs_use_up_no_random_numbers():
-    env = envs.filtered_env(envs.random_filter)
-    state = torch.get_rng_state()
-    _ = env.observation_spec, env.state_spec
-    assert torch.get_rng_state().equal(state)
-
-
-def test_gradient_mode_in_a_replay_buffer():
-    filter = envs.toy_filter()
-    frames = TensorDict({"observation": torch.randn(2, 5, 4), "action": torch.randn(2, 5, 2)}, [2, 5])
-    assert not DEnKFTransform(filter)(frames.copy())["belief", "mean"].requires_grad
-    assert DEnKFTransform(filter, no_grad=False)(frames.copy())["belief", "mean"].requires_grad
-
-
-def test_in_a_replay_buffer(float64):
-    filter = envs.fixed_filter()
-    buffer = ReplayBuffer(storage=LazyTensorStorage(4), transform=DEnKFTransform(filter), batch_size=3)
-    frames = TensorDict(
-        {"observation": torch.randn(4, 7, 2), "number": torch.arange(4).unsqueeze(-1).expand(4, 7)}, [4, 7]
-    )
-    buffer.extend(frames)
-    sample = buffer.sample()
-    expected = filter.sequence(frames[sample["number"][:, 0]].clone())
-    assert_equal(sample, expected, envs.BELIEF, atol=1e-14)
-
-
-class Doubled(envs.Changed):
-    """Twice the observation; it declares what it writes, unless it is told not to."""
-
-    def __init__(self, declares=True):
-        super().__init__(lambda td: td.set("doubled", 2 * td["observation"]))
-        self.declares = declares
-
-    def transform_observation_spec(self, observation_spec):
-        if self.declares:
-            observation_spec["doubled"] = observation_spec["observation"].clone()
-        return observation_spec
-
-
-def test_a_function_that_writes_an_entry_does_not_declare_it():
-    """torchrl takes a function in the place of a transform, and no one knows what it writes: the message says so."""
-    one = torch.eye(2)
-
-    def kalman(scale, key):
-        options = {"mean": torch.zeros(2), "cov": one, "observation_key": key}
-        return DEnKFTransform(
-            KalmanFilter(0.9 * one, scale * one, process_noise_cov=one, noise_cov=scale**2 * one, **options)
-        )
-
-    for undeclared in (lambda td: td.set("doubled", 2 * td["observation"]), Doubled(declares=False)):
-        env = TransformedEnv(envs.base_env(), Compose(undeclared, kalman(2, "doubled")))
-        with pytest.raises(KeyError, match=r"declare it, in its transform_observation_spec; a function .* nothing"):
-            env.rollout(2)
-
-    rollouts = []  # twice the reading, with twice its deviation, says what the reading says
-    for transforms in ((kalman(1, "observation"),), (Doubled(), kalman(2, "doubled"))):
-        env = TransformedEnv(envs.base_env(), Compose(*transforms))
-        env.set_seed(0)
-        rollouts.append(env.rollout(5)["next"])
-    assert_equal(*rollouts, [("belief", "mean"), ("belief", "cov")], atol=1e-6)
-
-
 # ----------------------------------------------------------------------------------- transforms that come behind it
 
 MEAN, NORM = ("belief", "mean"), {"loc": 0.0, "scale": 10.0}
@@ -306,21 +157,6 @@ def test_a_transform_that_writes_over_the_carry_is_named(float64, make, key):
     ) as e:
         env.rollout(2)
     assert repr(key) in str(e.value)
-
-
-def test_transforms_that_leave_the_carry_alone(float64):
-    plain = env_with(linear_kalman()).rollout(5)
-    normed = env_with(linear_kalman(), ObservationNorm(in_keys=[MEAN], out_keys=["policy"], **NORM)).rollout(5)
-    assert_equal(normed["next"], plain["next"], [MEAN, ("belief", "cov")])
-    torch.testing.assert_close(normed["next", "policy"], 10 * plain["next", "belief", "mean"])
-    # In front of the filter, or over a mean that an ensemble does not carry.
-    first = TransformedEnv(envs.base_env(batch_size=[3]), ObservationNorm(in_keys=["observation"], **NORM))
-    first.append_transform(DEnKFTransform(linear_kalman()))
-    first.rollout(2)
-    plain = env_with(envs.random_filter()).rollout(5)
-    normed = env_with(envs.random_filter(), ObservationNorm(in_keys=[MEAN], **NORM)).rollout(5)
-    assert normed["belief", "ensemble"].equal(plain["belief", "ensemble"])
-    torch.testing.assert_close(normed["next", "belief", "mean"], 10 * plain["next", "belief", "mean"])
 
 
 @pytest.mark.parametrize("given", ["mean", "cov"])

@@ -1,9 +1,9 @@
 """The action that led to an observation: beside it, zero after a reset, in every kind of environment."""
 
 import torch
-from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
+from torchrl.envs import SerialEnv, TransformedEnv
 
-from tests.filters.composed import ReplayedFrames, compose, frames_for
+from tests.filters.composed import ReplayedFrames, frames_for
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.transforms import LastAction
 
@@ -17,16 +17,6 @@ def test_it_is_the_action_before_and_zero_where_an_episode_begins(float64):
     expected = torch.where(frames["is_init"], 0.0, expected)
     assert rollout["previous", "action"].equal(expected)
     assert rollout["next", "previous", "action"].equal(rollout["action"])
-
-
-def test_specs_alone_and_with_a_filters_primer():
-    check_env_specs(TransformedEnv(base_env(seed=0, batch_size=[2]), LastAction()))
-    check_env_specs(TransformedEnv(base_env(seed=0), LastAction({"action": "last"})))
-    primer = compose(["actions"]).float().make_tensordict_primer()
-    env = TransformedEnv(base_env(seed=0, batch_size=[2]), primer)
-    check_env_specs(env)
-    keys = {("previous", "belief", "ensemble"), ("previous", "known"), ("previous", "action")}
-    assert keys <= set(env.reset().keys(True, True))
 
 
 def test_workers_have_their_own():

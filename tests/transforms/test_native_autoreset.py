@@ -5,7 +5,6 @@ The oracle is the same filter on the stored frames, with the marks of where epis
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import ExcludeTransform, InitTracker, TransformedEnv
@@ -82,17 +81,6 @@ def test_nan_before_the_filter_raises_without_a_mask_and_is_a_missing_reading_wi
     data = env.rollout(12, break_when_any_done=False)
     assert data["next", "observed"].equal(~data["next", "done"])
     assert_equal(data, filter.sequence(data.select("observation", "observed", "is_init")), filter.belief_keys)
-
-
-def test_in_a_policy_it_does_so_too(float64):
-    filter = linear_kalman()
-    env = TransformedEnv(simulator(), InitTracker())
-    env.append_transform(filter.make_tensordict_primer())
-    still = TensorDictModule(lambda mean: torch.zeros_like(mean[..., :1]), [("belief", "mean")], ["action"])
-    data = collected(env, TensorDictSequential(filter, still))
-    assert next_is_nan_where_done(data)
-    expected = filter.sequence(data.select("observation", "observed", "is_init"))
-    assert_equal(data, expected, filter.belief_keys, atol=1e-12)
 
 
 @pytest.mark.parametrize("rejected", [False, True])

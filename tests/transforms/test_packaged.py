@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 import torch
-from torchrl.envs import TransformedEnv, check_env_specs
+from torchrl.envs import TransformedEnv
 
 from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import BELIEF, base_env, fixed_filter, random_filter, toy_base_env, toy_filter
@@ -86,11 +86,6 @@ def test_the_package_is_what_runs(packages):
     assert not changed["next", "belief", "mean"].allclose(expected["next", "belief", "mean"], atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["[3]", "action"])
-def test_specs(packages, name):
-    check_env_specs(envs(packages, name)[1])
-
-
 def packaged_env(filter, step, batch_size=(), **options):
     return TransformedEnv(base_env(seed=0, batch_size=batch_size), DEnKFTransform(filter, packaged=step, **options))
 
@@ -115,19 +110,6 @@ def test_what_went_wrong_is_said(packages, tmp_path):
     example = noisy.draw_noise(one_step(base_env(seed=0), noisy))
     given = export_step(noisy, example, tmp_path / "b.pt2", compiled=False)
     assert_refused(KeyError, r"noise\.transition", DEnKFTransform, noisy, packaged=load_step(given))
-
-
-def test_actions_may_be_in_double_precision(packages):
-    """dm_control takes them so; the filter casts them, and so does what stands before the package."""
-    both = envs(packages, "action")
-    row = both[1].rand_action(both[1].reset())
-    beliefs = []
-    for env in both:
-        action = row["action"].double()
-        out = env.transform._step(row.copy().set("action", action), row.select("observation", "observed"))
-        beliefs.append(out["belief", "mean"])
-    assert beliefs[1].dtype == torch.float32
-    torch.testing.assert_close(beliefs[1], beliefs[0], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("check", [True, False])

@@ -68,10 +68,12 @@ def check_belief(structure: Structure, entries: Entries, written: Entries) -> No
     Raises:
         ValueError: that names the cause.
     """
+    if on_gpu(written[structure.carry[0]]):  # to look would wait for the device
+        return
     nothing = None  # NaN where a number is not finite: fewer calls than isfinite() takes
     for key, kind in structure.carried:
         for value in (written[key], entries.get(key)):  # a particle that is not finite may have been resampled away
-            if value is None or not value.is_floating_point() or on_gpu(value):  # to look would wait for the device
+            if value is None or not value.is_floating_point():
                 continue
             zero = (value - value).sum() if kind is None else kind.finite(key[-1], value).logical_not()
             nothing = zero if nothing is None else nothing + zero

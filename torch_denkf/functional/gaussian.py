@@ -135,14 +135,14 @@ def innovation_update(
 
     p, h, r = cov, observation_matrix.expand(*batch, dim, cov.shape[-1]), innovation.unsqueeze(-1)
     if len(batch) != 1:  # a product of batches with one dimension costs a third of any other
-        p, h, r, noise = (value.reshape(-1, *value.shape[-2:]) for value in (p, h, r, noise.expand(*batch, dim, dim)))
+        p, h, r, noise = [value.reshape(-1, *value.shape[-2:]) for value in (p, h, r, noise.expand(*batch, dim, dim))]
     cross = torch.bmm(h, p)
     gain, nis, log_det = solve_for_gain(torch.bmm(cross, h.mT) + noise, cross, r.squeeze(-1))
     keep = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device) - torch.bmm(gain, h)
     new = torch.bmm(torch.bmm(keep, p), keep.mT) + torch.bmm(torch.bmm(gain, noise), gain.mT)
     mean, new = torch.bmm(gain, r).squeeze(-1), (new + new.mT) / 2
     if len(batch) != 1:
-        mean, new, nis, log_det = (value.reshape(*batch, *value.shape[1:]) for value in (mean, new, nis, log_det))
+        mean, new, nis, log_det = [value.reshape(*batch, *value.shape[1:]) for value in (mean, new, nis, log_det)]
     log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
     return GaussianUpdate(mean, new, innovation, nis, log_likelihood)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
-from torchrl.envs import Compose, InitTracker, SerialEnv, TransformedEnv, check_env_specs
+from torchrl.envs import Compose, InitTracker, TransformedEnv
 
 from tests.applications.car.vision.drives_for_tests import rendered
 from tests.filters.factories import FixedEnsemble
@@ -20,7 +20,6 @@ from torch_denkf.applications.car import (
 )
 from torch_denkf.applications.car.kitti.frames import frames_at
 from torch_denkf.applications.car.vision.motion import image_motion
-from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import DiagonalNoise, EnsembleAnalysis, Select, StochasticMLP
 from torch_denkf.transforms import DEnKFTransform
@@ -62,34 +61,6 @@ def test_replayed_frames_have_the_drives_motion(colour):
     same(rollout["next"], expected[1:])
 
 
-def test_rows_of_a_batch_have_their_own_stretch():
-    drive = a_drive()
-    expected = with_motion(drive, cache=None)
-    rollout = flow_env(drive, batch_size=[2, 2], start=[[0, 3], [7, 11]], length=6).rollout(100)
-    assert rollout["flow"].shape == (2, 2, 5, *FLOW_SHAPE)
-    assert rollout["road"].shape == (2, 2, 5, *ROAD_SHAPE)
-    for index, start in (((0, 0), 0), ((0, 1), 3), ((1, 0), 7), ((1, 1), 11)):
-        same(rollout[index], expected[start : start + 5])
-        same(rollout[index]["next"], expected[start + 1 : start + 6])
-
-
-def test_rows_that_reset_start_anew():
-    drive = a_drive()
-    expected = with_motion(drive, cache=None)
-    env = flow_env(drive, batch_size=[2], start=[2, 10], length=[3, 20 - 10])
-    rollout = env.rollout(5, break_when_any_done=False)
-    same(rollout[0], expected[[2, 3, 2, 3, 2]])
-    same(rollout[1], expected[10:15])
-
-
-def test_data_from_a_replay_buffer():
-    drive = a_drive()
-    frames = frames_at(drive, torch.arange(20).reshape(4, 5))
-    transform = OpticalFlow(calibration(drive))
-    same(transform(frames).reshape(-1), with_motion(drive, cache=None))
-    assert frames["flow"].shape == (4, 5, *FLOW_SHAPE)
-
-
 def test_frames_that_are_not_observed_are_zero_and_not_read():
     drive = a_drive()
     frames = frames_at(drive, torch.arange(10, 14))
@@ -119,27 +90,6 @@ def test_height_calibration_and_keys_by_hand():
     assert (transform(td.set("there", torch.tensor([False])))["a"] == 0).all()
 
 
-def test_spec():
-    drive = a_drive()
-    for batch in ([], [2]):
-        env = flow_env(drive, batch_size=batch, start=2, length=4)
-        check_env_specs(env)
-        assert env.observation_spec["flow"].shape == (*batch, *FLOW_SHAPE)
-        assert env.observation_spec["road"].shape == (*batch, *ROAD_SHAPE)
-        assert env.observation_spec["road"].dtype == torch.float32
-    nested = OpticalFlow(calibration(drive), out_keys=(("motion", "flow"), ("motion", "road")))
-    check_env_specs(TransformedEnv(KITTIReplayEnv(drive, length=4), nested))
-
-
-def test_errors_say_what_to_pass():
-    transform = OpticalFlow((87.0, 86.5, 73.4, 24.8))
-    with pytest.raises(KeyError, match=r"'pixels'.*'?image"):
-        transform(TensorDict({"image": torch.zeros(2, 50, 150)}))
-    for shape in ((3, 50, 150), (50, 150), (1, 2, 50, 150)):
-        with pytest.raises(ValueError, match=r"2C, H, W.*'pixels'"):
-            transform(TensorDict({"pixels": torch.zeros(shape)}))
-
-
 # ------------------------------------------------------------------------------------------------------ in a filter
 
 
@@ -161,11 +111,6 @@ def flow_filter(layer):
 def filtered(drive, filter, **kwargs):
     base = KITTIReplayEnv(drive, **kwargs)
     return TransformedEnv(base, Compose(OpticalFlow(calibration(drive)), InitTracker(), DEnKFTransform(filter)))
-
-
-@pytest.mark.parametrize("batch", [[], [2]])
-def test_specs_with_a_filter(batch):
-    check_env_specs(filtered(a_drive(), flow_filter("dropout"), batch_size=batch, start=2, length=4))
 
 
 def test_a_filter_over_a_replay_is_the_filter_on_the_drives_motion():
@@ -192,40 +137,3 @@ def test_a_filter_over_a_replay_is_the_filter_on_the_drives_motion():
     assert truth[..., 4].max() < -0.2
     assert belief[..., 4].max() < -0.15
     assert (belief[:, -1, 3] - truth[:, -1, 3]).abs().max() < 1.5
-
-
-def test_a_stochastic_filter_over_a_replay():
-    drive = a_drive()
-    env = filtered(drive, flow_filter("dropout"), batch_size=[2], start=[3, 10], length=8)
-    torch.manual_seed(1)
-    first = env.rollout(100)
-    torch.manual_seed(1)
-    again = env.rollout(100)
-    assert first["next", "belief", "ensemble"].isfinite().all()
-    assert first["next", "belief", "ensemble"].equal(again["next", "belief", "ensemble"])
-    assert not env.rollout(100)["next", "belief", "mean"].equal(first["next", "belief", "mean"])
-
-
-def test_training_through_the_filter_reaches_the_sensor():
-    drive, filter = a_drive(), flow_filter("dropout")
-    motion = with_motion(drive, cache=None)
-    frames = motion.select("flow", "road").set("observed", frames_at(drive, torch.arange(20))["observed"])
-    frames["is_init"] = torch.zeros(20, 1, dtype=torch.bool)
-    frames["is_init"][0] = True
-    out = filter.sequence(frames)
-    (out["belief", "ensemble"][..., 3:] - motion["state"][:, None, 3:]).square().mean().backward()
-    for name, parameter in filter["sensor"].named_parameters():
-        assert parameter.grad.isfinite().all(), name
-        assert name == "module.trunk.road.4.bias" or parameter.grad.abs().max() > 0, name
-
-
-def test_inside_of_a_serial_env():
-    drive = a_drive()
-    expected = with_motion(drive, cache=None)
-    env = SerialEnv(2, [lambda start=start: flow_env(drive, start=start, length=4) for start in (2, 10)])
-    try:
-        rollout = env.rollout(100)
-    finally:
-        env.close()
-    same(rollout[0], expected[2:5])
-    same(rollout[1], expected[10:13])

@@ -1,22 +1,17 @@
 """The drawing of rendered drives: pictures are where poses and geometry put them, on hills too; cars move."""
 
 import dataclasses
-from itertools import pairwise
 
 import cv2
 import numpy as np
 import pytest
 
-from torch_denkf.applications.car.kitti.render import random_drive, roadside_scene
-from torch_denkf.applications.car.street import raster
+from torch_denkf.applications.car.kitti.render import roadside_scene
 from torch_denkf.applications.car.street.camera import HEIGHT, Camera
-from torch_denkf.applications.car.street.path import Path as Way
-from torch_denkf.applications.car.street.random_drive import LOOKS_DOWN, hilly_poses
 from torch_denkf.applications.car.street.renderer import Renderer
-from torch_denkf.applications.car.street.scene import RESOLUTION, Box, Mover
-from torch_denkf.applications.car.street.terrain import SMOOTH, Terrain
+from torch_denkf.applications.car.street.scene import RESOLUTION
+from torch_denkf.applications.car.street.terrain import SMOOTH
 from torch_denkf.applications.car.street.textures import TILE
-from torch_denkf.applications.car.street.traffic import traffic
 from torch_denkf.applications.car.vision.poses import KITTI_DT, poses_to_state
 
 cv2.setNumThreads(1)
@@ -117,147 +112,3 @@ def test_dots_on_the_road_are_where_the_poses_put_them(road, reach):
     assert found > 20
     assert (np.median(errors, 0) < 0.35).all()
     assert (errors.max(0) < 1.4).all()
-
-
-def test_a_moving_car_moves_by_itself_and_stands_on_the_hill():
-    poses, height = hill()
-    way = Way.of(poses_to_state(poses, KITTI_DT), poses[:, 1, 3] + HEIGHT)
-    red = [np.full((32, 32, 3), (0, 0, 255), np.uint8)]
-    camera = Camera.odometry((250, 828))
-    for pace, aside in ((-9.0, 3.5), (6.8, 0.0)):
-        time = KITTI_DT * np.arange(-6, 7)
-        track = way.at(way.along[40] + 20 + pace * time, aside)
-        track[:, 2:] *= np.sign(pace)
-        car = Mover(34, track, 4.0, 1.8, 1.5, [red] * 4)
-        renderer = Renderer(empty(poses, traffic=[car]), camera)
-        assert car.at(33) is None
-        assert car.at(47) is None
-        places = []
-        for number in (38, 42, 46):
-            picture = renderer.render(poses[number], number).astype(int)
-            seen = (picture[..., 2] - picture[..., 1] > 90).nonzero()
-            middle = poses[40, 2, 3] + 20 + pace * KITTI_DT * (number - 40)
-            x, z = np.meshgrid([-aside - 0.9, -aside + 0.9], [middle - 2, middle + 2])
-            x, z = x.ravel(), z.ravel()
-            feet = np.stack([x, height(x, z), z], -1)
-            heads = feet.copy()
-            heads[:, 1] = feet[:, 1].mean() - 1.5
-            corners, _ = project(camera, poses[number], np.concatenate([feet, heads]))
-            for k, axis in ((0, seen[1]), (1, seen[0])):
-                assert abs(axis.min() - corners[:, k].min()) < 1.6
-                assert abs(axis.max() - corners[:, k].max()) < 1.6
-            places.append((seen[1].mean(), len(seen[0])))
-        sizes = np.array(places)[:, 1]
-        if pace < 0:  # comes nearer by 1.6 m a frame, of 20 m: grows fast
-            assert sizes[2] > 2.5 * sizes[0]
-        else:  # as fast as the camera: a car that stood would come 5.6 m nearer
-            assert 0.9 < sizes[2] / sizes[0] < 1.15
-        assert (renderer.render(poses[40])[..., 2].astype(int) - renderer.render(poses[40])[..., 1] < 90).all()
-
-
-def test_leaving_out_what_is_hidden_changes_no_picture(monkeypatch):
-    poses, _ = hill()
-    state = poses_to_state(poses, KITTI_DT)
-    scene = roadside_scene(state, np.random.default_rng(3), ground=poses[:, 1, 3] + HEIGHT, traffic_on=True)
-    renderer = Renderer(scene, Camera.odometry((50, 150)))
-    numbers = range(0, 190, 6)
-    quick = [renderer.render(poses[number], number) for number in numbers]
-    hidden, left_out = raster.hidden, []
-
-    def nothing(pixels, *others):
-        left_out.append(hidden(pixels, *others).sum() - hidden(pixels, others[0], 0 * others[1], others[2]).sum())
-        return np.zeros(len(pixels), bool)
-
-    monkeypatch.setattr(raster, "hidden", nothing)
-    for number, picture in zip(numbers, quick, strict=True):
-        np.testing.assert_array_equal(renderer.render(poses[number], number), picture)
-    assert np.mean(left_out) > 3  # behind walls, besides what is outside the picture
-
-
-def test_traffic_has_its_own_speed():
-    state = random_drive(2000, np.random.default_rng(1))
-    way = Way.of(state, np.full(2000, HEIGHT))
-    movers = traffic(way, [[None] * 4], np.random.default_rng(2))
-    oncoming, leading, gaps = [], [], []
-    for mover in movers:
-        if len(mover.track) < 5:
-            continue
-        frames = mover.first + np.arange(len(mover.track))
-        own = np.column_stack([-np.sin(state[frames, 2]), np.cos(state[frames, 2])])
-        offset = mover.track[:, :2] - np.column_stack([-state[frames, 1], state[frames, 0]])
-        same = (mover.track[:, 2:] * own).sum(-1)
-        step = (np.diff(mover.track[:, :2], axis=0) * mover.track[1:, 2:]).sum(-1) / KITTI_DT
-        assert step.min() > -0.5  # nobody reverses
-        assert step.max() < 40
-        near = np.linalg.norm(offset, axis=-1) < 12
-        if near.any() and same[near].mean() < -0.5:
-            left = offset[near] @ np.array([[0, -1], [1, 0]]) * own[near]
-            oncoming.append(left.sum(-1).mean())
-        elif (same > 0.5).all():
-            leading.append(len(frames))
-            gaps.append(np.linalg.norm(offset, axis=-1).min())
-    assert len(oncoming) > 5
-    np.testing.assert_allclose(np.median(oncoming), 3.5, atol=0.5)  # in the lane to the left
-    assert len(leading) > 2
-    assert min(gaps) > 5  # no car within the camera's own
-
-
-def test_nothing_stands_on_any_stretch_of_the_road():
-    # A figure of eight that is driven twice: crossings, and the second time along the first.
-    angle = np.linspace(0, 4 * np.pi, 700)
-    x, y = 60 * np.sin(angle), 40 * np.sin(2 * angle)
-    theta = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
-    for seed in range(3):
-        scene = roadside_scene(np.column_stack([x, y, theta]), np.random.default_rng(seed))
-        assert len(scene.objects) > 30
-        for item in scene.objects:
-            outline = (
-                [item.foot]
-                if not isinstance(item, Box)
-                else [
-                    a + t * (b - a)
-                    for a, b in pairwise([*item.corners, item.corners[0]])
-                    for t in np.linspace(0, 1, 24)
-                ]
-            )
-            gap = np.linalg.norm(scene.road[:, None] - np.array(outline), axis=-1).min()
-            assert gap > scene.road_width / 2 - 0.6, (seed, item)  # the map of the roads has cells of 0.5 m
-
-
-def test_ground_that_neighbouring_stretches_share_is_the_same():
-    # Once round a block, and on along the same street 3 m higher: recorded altitudes drift.
-    side = np.arange(60.0)
-    square = [np.stack([0 * side, side], -1), np.stack([side, 60 + 0 * side], -1)]
-    square += [np.stack([60 + 0 * side, 60 - side], -1), np.stack([60 - side, 0 * side], -1)]
-    line = np.concatenate([*square, square[0], square[0][-1] + np.stack([0 * side, side + 1], -1)])
-    heights = HEIGHT - 0.0125 * np.arange(len(line))
-    terrain = Terrain(line, heights)
-    for metre in range(16, len(line) - 120, 16):
-        first, second = terrain.around(metre), terrain.around(metre + 16)
-        visible = line[metre : metre + 80]
-        np.testing.assert_allclose(first.at(*visible.T), second.at(*visible.T), atol=0.03)
-        near = line[metre : metre + 30]
-        np.testing.assert_allclose(first.at(*near.T), heights[metre : metre + 30], atol=0.15)
-    # The same place, at both times, lies where the car was at that time.
-    np.testing.assert_allclose(terrain.around(32).at(*line[40]), heights[40], atol=0.15)
-    np.testing.assert_allclose(terrain.around(272).at(*line[280]), heights[280], atol=0.15)
-
-
-def test_invented_cars_pitch_with_the_road():
-    rng = np.random.default_rng(0)
-    state = random_drive(1500, rng)
-    poses = hilly_poses(state, rng)
-    rotation = poses[:, :, :3]
-    np.testing.assert_allclose(
-        rotation @ rotation.transpose(0, 2, 1), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-9
-    )
-    np.testing.assert_allclose(np.linalg.det(rotation), 1)
-    np.testing.assert_allclose(poses_to_state(poses, KITTI_DT)[:, :2], state[:, :2], atol=1e-9)
-    np.testing.assert_allclose(poses_to_state(poses, KITTI_DT)[:, 2], state[:, 2], atol=2e-3)
-    climb = -np.diff(poses[:, 1, 3]) / np.maximum(np.linalg.norm(np.diff(state[:, :2], axis=0), axis=-1), 1e-9)
-    pitch = np.arcsin(-rotation[1:, 1, 2])
-    moving = state[1:, 3] > 1
-    sway = (pitch + LOOKS_DOWN - np.arctan(climb))[moving]
-    assert abs(sway.mean()) < 1e-3
-    assert 0.002 < sway.std() < 0.006
-    assert np.ptp(climb[moving]) > 0.04

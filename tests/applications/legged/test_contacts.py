@@ -1,4 +1,3 @@
-import pytest
 import torch
 
 from torch_denkf.applications.legged import contacts
@@ -20,8 +19,3 @@ def test_rows_one_by_one_are_all_at_once():
         rows.append(contacts(force[:, row : row + 1], 60.0, before=before))
         before = rows[-1][:, 0]
     assert torch.equal(torch.cat(rows, 1), contacts(force, 60.0, 30.0))
-
-
-def test_thresholds_the_wrong_way_round_are_refused():
-    with pytest.raises(ValueError, match="off"):
-        contacts(torch.zeros(3, 1), 10.0, 20.0)

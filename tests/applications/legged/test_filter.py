@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from torchrl.envs import TransformedEnv
 
 from tests.applications.legged.test_environment import trotting
 from tests.real_data import SHARED
@@ -11,7 +10,6 @@ from torch_denkf.applications.legged.icub import ICUB, icub_log, icub_model
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.functional.manifolds import SO3, rotate
 from torch_denkf.imperfect import RejectReadings
-from torch_denkf.transforms import DEnKFTransform
 
 VELOCITY, VAR = ("belief", "velocity"), ("belief", "velocity_var")
 ICUB_FOLDER = SHARED / "icub"
@@ -35,15 +33,6 @@ def test_a_trot_is_followed(kind):
     assert (out[VAR] > 0).all()
 
 
-def test_it_is_a_transform_of_an_environment():
-    base = quadruped_env(seed=2)
-    filter = legged_filter(base.model, **QUADRUPED, dt=base.dt, kind="EKF")
-    env = TransformedEnv(base, DEnKFTransform(filter))
-    rows = env.rollout(5)
-    assert rows["next", *VELOCITY].isfinite().all()
-    assert rows["next", *VELOCITY].shape == (5, 3)
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(not ICUB_FOLDER.exists(), reason="the log is not here")
 def test_a_real_humanoid_walks():
@@ -65,11 +54,6 @@ def test_a_real_humanoid_walks():
     assert tilt < 0.7
 
 
-def test_an_unknown_kind_is_refused():
-    with pytest.raises(ValueError, match="kind is"):
-        legged_filter(quadruped_env().model, **QUADRUPED, dt=0.01, kind="Kalman")
-
-
 @pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
 def test_a_start_without_acceleration_is_level(kind):
     """A first row that is rejected does not spoil the run."""
@@ -86,31 +70,6 @@ def test_a_start_without_acceleration_is_level(kind):
     torch.testing.assert_close(start[0, :4], sensor[:4])
 
 
-def test_a_robot_may_start_upside_down():
-    """Of all turns by half a circle one is chosen, and up is up."""
-    env = quadruped_env(seed=0)
-    row = env.reset().select("imu", "joints", "joint_rates", "contact")
-    sensor = LegKinematics(env.model, **QUADRUPED).base
-    row["imu"][3:] = rotate(SO3().inverse(sensor[:4]), torch.tensor([0.0, 0.0, -9.81]))
-    start = legged_filter(env.model, **QUADRUPED, dt=env.dt, kind="EKF").initialise(row)["legs", "start"]
-    up = rotate(SO3().inverse(start[:4]), torch.tensor([0.0, 0.0, 1.0]))
-    torch.testing.assert_close(up, row["imu"][3:] / 9.81, atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("key", ["imu", "joints", "joint_rates", "contact"])
-def test_readings_of_another_robot_are_named(key):
-    env = quadruped_env(seed=0)
-    row = env.reset().select("imu", "joints", "joint_rates", "contact")
-    row[key] = row[key][:-1]
-    with pytest.raises(ValueError, match=key):
-        legged_filter(env.model, **QUADRUPED, dt=env.dt, kind="EKF").initialise(row)
-
-
-def test_no_time_between_rows_is_refused():
-    with pytest.raises(ValueError, match="dt"):
-        legged_filter(quadruped_env().model, **QUADRUPED, dt=0.0)
-
-
 @pytest.mark.parametrize("kind", ["EKF", "UKF", "DEnKF"])
 def test_a_run_goes_on_from_what_is_carried(kind):
     """The velocity of the stored belief follows from it and from what the gyro reads then."""
@@ -123,16 +82,3 @@ def test_a_run_goes_on_from_what_is_carried(kind):
         rest = filter.sequence(log[:, 7:].clone().update(whole[:, 7:].select(*filter.carry_keys)))
     for key in filter.belief_keys:
         torch.testing.assert_close(rest[key], whole[key][:, 7:], rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
-def test_an_environment_starts_from_a_given_belief(kind):
-    base = quadruped_env(seed=2)
-    filter = legged_filter(base.model, **QUADRUPED, dt=base.dt, kind=kind, ensemble_size=8)
-    env = TransformedEnv(base, DEnKFTransform(filter))
-    given = env.reset().select(*filter.carry_keys)
-    reset = env.reset(given.clone())
-    for key in filter.carry_keys:
-        assert reset[key].equal(given[key])
-    assert reset[VELOCITY].abs().max() < 0.5
-    assert (reset[VAR] > 0).all()

@@ -6,7 +6,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
-from torchrl.envs import TransformedEnv
 
 from tests.applications.legged.test_environment import trotting
 from torch_denkf import from_pretrained
@@ -14,7 +13,6 @@ from torch_denkf.applications.legged import (
     QUADRUPED,
     LearnedContacts,
     LeggedNoises,
-    last_rows,
     legged_filter,
     quadruped_env,
     with_last_rows,
@@ -96,49 +94,6 @@ def test_feet_of_a_rigid_turn_say_one_velocity(model, log):
     stands = log["contact"][0].any(-1)
     assert_close(features[stands][..., 7:10], velocity[stands].unsqueeze(-2).expand(-1, 4, 3), rtol=0, atol=1e-3)
     assert torch.equal(features[..., 0].bool(), log["contact"][0])
-
-
-def test_feet_in_the_air_do_not_count_in_the_mean(model):
-    """Feet that disagree: the mean is of those that stand, row by row, and zero where none does."""
-    torch.manual_seed(0)
-    contacts, rows, count = contacts_of(model, rows=3), 3, 6
-    imu, joints, rates = (
-        torch.randn(count, rows * 6),
-        0.3 * torch.randn(count, rows * 16),
-        torch.randn(count, rows * 16),
-    )
-    stands = torch.rand(count, rows, 4) < 0.5
-    stands[0, 1] = False
-    features = contacts.features(imu, joints, rates, stands.flatten(-2)).unflatten(-1, (rows, 16))
-    base, mean = features[..., 4:7], features[..., 7:10]  # [count, feet, rows, 3]
-    for row in range(rows):
-        for one in range(count):
-            own = base[one, stands[one, row], row]
-            expected = own.sum(0) / max(len(own), 1)
-            assert_close(mean[one, :, row], expected.expand(4, 3), rtol=0, atol=1e-5)
-
-
-def test_the_newest_row_comes_last_and_the_first_stands_for_those_before(log):
-    last = with_last_rows(log, 3)["last", "imu"].unflatten(-1, (3, 6))
-    assert torch.equal(last[:, :, 2], log["imu"])
-    assert torch.equal(last[:, 5, 0], log["imu"][:, 3])
-    assert torch.equal(last[:, 1, 0], log["imu"][:, 0])
-
-
-@pytest.mark.parametrize("every", [1, 2])
-def test_an_environment_keeps_the_rows_of_a_log(every):
-    env = TransformedEnv(quadruped_env(seed=4), last_rows(3, every))
-    row = env.reset()
-    rows = [row]
-    for step in range(6):
-        row = env.step(row.set("action", torch.full((12,), 0.1 * step)))["next"]
-        rows.append(row)
-    found = torch.stack([row.select(*KEYS, "last") for row in rows]).unsqueeze(0)
-    expected = with_last_rows(found.select(*KEYS), 3, every)
-    assert env.observation_spec["last", "imu"].shape == (18,)
-    assert torch.equal(expected["last", "imu"][0, 6, :6], found["imu"][0, 6 - 2 * every])
-    for key in KEYS:
-        assert torch.equal(found["last", key], expected["last", key]), key
 
 
 def test_a_foot_walks_as_its_noise_says():
@@ -233,20 +188,6 @@ def test_a_filter_moves_a_foot_that_slides(model):
     assert found[1] > 0.1
 
 
-@pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
-def test_the_time_step_may_be_an_entry(kind, model, log):
-    contacts, velocities = contacts_of(model), []
-    torch.nn.init.normal_(list(contacts.mean.parameters())[-1])
-    rows = with_last_rows(log, 10)
-    rows["dt"] = torch.full((*rows.shape, 1), 0.01)
-    for dt in (0.01, "dt"):
-        filter = legged_filter(model, **QUADRUPED, dt=dt, kind=kind, ensemble_size=16, contacts=contacts)
-        torch.manual_seed(0)
-        with torch.no_grad():
-            velocities.append(filter.sequence(rows.clone())["belief", "velocity"])
-    assert_close(*velocities, rtol=0, atol=1e-4)
-
-
 def test_they_learn_through_the_filter(model, log):
     contacts = contacts_of(model)
     filter = legged_filter(model, **QUADRUPED, dt=0.01, kind="EKF", contacts=contacts)
@@ -260,28 +201,7 @@ def test_they_learn_through_the_filter(model, log):
     assert gradients[next(name for name in gradients if name.startswith("mean"))] is not None
 
 
-def test_without_rates_they_are_refused(model):
-    with pytest.raises(ValueError, match="rates_key"):
-        legged_filter(model, **QUADRUPED, dt=0.01, rates_key=None, contacts=contacts_of(model))
-
-
-def test_errors_last_for_a_row_at_least(model):
-    with pytest.raises(ValueError, match="lasts"):
-        LearnedContacts(model, **QUADRUPED, lasts=0.5)
-
-
-def test_rows_without_a_standing_foot_teach_nothing(model, log):
-    rows = with_last_rows(log, 10)
-    rows["last", "contact"] = torch.zeros_like(rows["last", "contact"])
-    with pytest.raises(ValueError, match="No foot stands"):
-        contacts_of(model).loss(rows)
-
-
-def test_other_numbers_of_rows_are_named(model, log):
-    with pytest.raises(ValueError, match=r"rows of 'imu' .* last_rows"):
-        contacts_of(model).loss(with_last_rows(log, 11))
-
-
+@pytest.mark.slow
 def test_the_shipped_filter_knows_feet_that_slide():
     """Against contacts that a threshold tells alone, with the noises of its validation, where friction is .2."""
     base = quadruped_env(friction=0.2, seed=7)

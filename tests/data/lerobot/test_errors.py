@@ -11,7 +11,6 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 import pytest
 import torch
-from torchrl.data import SliceSampler
 
 from tests.data.lerobot.lerobot_folder import (
     SIZE,
@@ -137,17 +136,6 @@ def test_a_damaged_frame_blinds_its_row_alone(tmp_path):
     torch.testing.assert_close(replay.statistics["pixels", "mean"].flatten(), expected)  # without the missing one
 
 
-def test_a_video_that_ends_early(tmp_path):
-    """Frames of the next episode in the same file do not fill in."""
-    write_version_3(tmp_path, [[6, 5]])
-    write_video(tmp_path / f"videos/{CAMERA}/chunk-000/file-000.mkv", pictures(0, 9), "FFV1")
-    with pytest.warns(UserWarning, match=r"file-000.mkv: of episode 1 these frames .*: 3, 4$"):
-        rows = open_all(tmp_path)[:]
-    assert rows["observed"].flatten().tolist() == [True] * 9 + [False] * 2
-    write_video(tmp_path / f"videos/{CAMERA}/chunk-000/file-000.mkv", pictures(0, 6), "FFV1")
-    fails(ValueError, r"file-000.mkv shows none of the 5 frames of episode 1", tmp_path)
-
-
 def test_images_that_cannot_be_decoded(tmp_path):
     write_version_2(tmp_path, [6], images="bytes")
     file = tmp_path / "data/chunk-000/episode_000000.parquet"
@@ -197,55 +185,6 @@ def test_tables_that_are_damaged_or_contradict_the_metadata(tmp_path):
     fails(ValueError, r"000000.parquet has 6 rows of episode 0, but the metadata says 7", tmp_path)
 
 
-def test_slices_and_caches(tmp_path):
-    write_version_2(tmp_path, [4, 9], images="bytes")
-    for options in ({"slice_len": 5}, {"num_slices": 2}, {"sampler": SliceSampler(slice_len=5)}):
-        fails(
-            ValueError, r"slices have 5 rows, .* shorter: \{'episode_000000': 4\}", tmp_path, batch_size=10, **options
-        )
-    assert len(open_all(tmp_path, batch_size=10, slice_len=5, strict_length=False).sample()) > 0
-    (tmp_path / "file").write_text("")
-    fails(
-        OSError,
-        r"cannot write the cache at .*file.* pass cache=FOLDER or cache=None",
-        tmp_path,
-        cache=tmp_path / "file/x",
-    )
-
-
-def test_damage_in_av1(tmp_path):
-    """A damaged packet is skipped; at least the keyframes behind it are there (two frames a group)."""
-    write_version_2(tmp_path, [12], codec="av1", suffix="mp4")
-    import av
-
-    video = tmp_path / f"videos/chunk-000/{CAMERA}/episode_000000.mp4"
-    with av.open(str(video)) as container:
-        packets = [(p.pos, p.size) for p in container.demux(video=0) if p.size]
-    before, data = open_all(tmp_path)[:]["pixels"], bytearray(video.read_bytes())
-    place, size = packets[4]
-    data[place : place + size] = b"\xff" * size
-    video.write_bytes(data)
-    with pytest.warns(UserWarning, match=r"episode_000000.mp4: of episode 0 these frames .*: 4"):
-        rows = open_all(tmp_path)[:]
-    seen = rows["observed"].flatten()
-    assert not seen[4]
-    assert seen.sum() >= 9
-    after = seen.clone()
-    after[5] = False  # predicted from frame 4
-    assert rows["pixels"][after].equal(before[after])
-
-
-def test_cv2_reads_in_colour(tmp_path):
-    """Grey and transparent images come as three channels."""
-    write_version_2(tmp_path, [2], images="folder")
-    folder = tmp_path / "images/observation.images.top/episode_000000"
-    cv2.imwrite(str(folder / "frame_000000.png"), np.full(SIZE, 77, np.uint8))
-    cv2.imwrite(str(folder / "frame_000001.png"), np.full((*SIZE, 4), (1, 2, 3, 255), np.uint8))
-    pixels = open_all(tmp_path)[:]["pixels"] * 255
-    assert (pixels[0].round() == 77).all()
-    assert (pixels[1].mean((1, 2)).round() == torch.tensor([3.0, 2, 1])).all()
-
-
 @pytest.mark.parametrize("key", ["data_path", "video_path"])
 @pytest.mark.parametrize("version", [2, 3])
 def test_paths_that_lead_out_of_the_data_set_are_refused(tmp_path, version, key):
@@ -267,21 +206,6 @@ def test_paths_that_lead_out_of_the_data_set_are_refused(tmp_path, version, key)
         )
     file.write_text(json.dumps({**info, key: f"{root}/{info[key]}"}))  # absolute, but inside
     assert len(open_all(root)) == 8
-
-
-def test_images_and_cameras_outside_of_the_data_set_are_refused(tmp_path):
-    root = tmp_path / "robot"
-    write_version_2(root, [4, 4], images="path")
-    assert len(open_all(root)) == 8
-    file = root / "data/chunk-000/episode_000001.parquet"
-    secret = tmp_path / "secret.png"
-    cv2.imwrite(str(secret), np.zeros((*SIZE, 3), np.uint8))
-    for path in ("../secret.png", str(secret)):
-        paths = pa.array([{"bytes": None, "path": path}] * 4, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
-        edit_table(file, **{CAMERA: paths})
-        fails(ValueError, r"frame 0 of episode 1 in .*robot names a file outside of the data set, '.*secret.png'", root)
-    write_info(root, "v2.1", False, cameras=("../../secret",))
-    fails(ValueError, r"info.json, by the name of a camera, names a file outside of the data set", root)
 
 
 def test_bombs_are_refused_before_they_are_unpacked(tmp_path):

@@ -9,7 +9,6 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 import pytest
 import torch
-from tensordict import TensorDict
 from torch.testing import assert_close
 
 from tests.data.lerobot.lerobot_folder import (
@@ -23,7 +22,6 @@ from tests.data.lerobot.lerobot_folder import (
     write_version_3,
 )
 from torch_denkf.data import LeRobotReplay
-from torch_denkf.data.lerobot.rows import recording_from_rows
 
 open_all = partial(LeRobotReplay, size=SIZE, cache=None, split="all", progress=False)
 VIDEO = "videos/chunk-{:03d}/observation.images.top/episode_{:06d}.mkv"
@@ -91,19 +89,6 @@ def test_times_that_contradict_fps(tmp_path, fps):
     assert_close(open_all(tmp_path)[:]["time"].flatten(), torch.arange(6).double() / FPS, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize(("name", "announced"), [("total_episodes", 50), ("total_frames", 12), ("total_frames", "9")])
-def test_totals_of_others_than_are_listed(tmp_path, name, announced):
-    write_version_2(tmp_path, [4, 5])
-    edit_info(tmp_path, total_episodes=2, total_frames=9)
-    assert len(open_all(tmp_path)) == 9
-    edit_info(tmp_path, **{name: announced})
-    with pytest.raises(
-        ValueError, match=rf"info.json announces {name} {announced!r}, but .*episodes.jsonl lists \d; .*episodes="
-    ):
-        open_all(tmp_path)
-    assert len(open_all(tmp_path, episodes=[0, 1])) == 9
-
-
 @pytest.mark.parametrize("name", ["actions", "observation.command", "motor_cmd"])
 def test_commands_under_another_name(tmp_path, name):
     write_version_2(tmp_path, [4])
@@ -118,17 +103,6 @@ def test_commands_under_another_name(tmp_path, name):
     assert said[0].filename == __file__
     assert_close(open_all(tmp_path, action_key=name)[:]["action"], torch.from_numpy(actions(0, 4)))
     assert "action" not in open_all(tmp_path, action_key=None)[:]
-
-
-def test_commands_under_another_name_in_rows():
-    image = torch.zeros(4, 3, 8, 8, dtype=torch.uint8)
-    rows = {
-        "observation": {"image": image, "state": torch.rand(4, 2)},
-        "episode": torch.zeros(4),
-        "actions": image[:, 0, 0],
-    }
-    with pytest.warns(UserWarning, match="the rows: 'actions' is left out.* action_key='actions'"):
-        recording_from_rows(TensorDict(rows, [4]), fps=10.0)
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -223,15 +197,6 @@ def test_origins_that_are_none(tmp_path, origin, error, match):
     write_version_2(tmp_path, [3])
     with pytest.raises(error, match=match):
         open_all(tmp_path, origin=origin)
-
-
-def test_rows_in_memory_are_selected_by_their_owner():
-    image = torch.zeros(4, 3, 8, 8, dtype=torch.uint8)
-    rows = TensorDict({"observation": {"image": image, "state": torch.rand(4, 2)}, "episode": torch.zeros(4)}, [4])
-    recording = recording_from_rows(rows, fps=10.0)
-    for options in ({"episodes": [0]}, {"origin": {"state": 1.0}}):
-        with pytest.raises(ValueError, match="episodes= and origin= are for folders"):
-            LeRobotReplay(recording, **options)
 
 
 def test_a_stamp_that_is_missing_leaves_the_others_their_steps(tmp_path):

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tensordict import MemoryMappedTensor, NonTensorStack, TensorDict
+from tensordict import NonTensorStack, TensorDict
 from torchrl.data.datasets import LeRobotExperienceReplay as VLAExperienceReplay
 from torchrl.data.datasets import OpenXExperienceReplay
 from torchrl.data.datasets.openx import _format_data, _StreamingStorage
@@ -89,14 +89,6 @@ def test_open_x_as_torchrl_opens_it(stored, tmp_path, monkeypatch):
         data.delete()
 
 
-def test_images_that_fit_are_not_copied(stored, tmp_path):
-    mapped = stored.memmap(tmp_path)
-    recording = recording_from_rows(mapped, **OPTIONS)
-    assert isinstance(recording.rows["image"], MemoryMappedTensor)
-    assert recording.rows["image"].data_ptr() == mapped["observation", "image"].data_ptr()
-    check(LeRobotReplay(recording, split="all"), stored, stored["observation", "image"])
-
-
 def test_channels_behind_sizes_and_floats(stored):
     hand = ("observation", "hand_image")
     channels_first = stored[hand].permute(0, 3, 1, 2)
@@ -125,13 +117,6 @@ def test_torchrls_lerobot_rows():
     assert rows["state"].equal(columns["observation.state"])
     assert rows["action"].equal(columns["action"])
     assert [(e.number, e.start, e.length) for e in data.episodes] == [(7, 0, 5), (4, 5, 3)]
-
-
-def test_rows_without_actions(stored):
-    rows = stored.exclude("action")
-    recording = recording_from_rows(rows, fps=5, state_key=("observation", "robot_state"))
-    assert "action" not in recording.rows
-    assert "action" not in LeRobotReplay(recording).statistics
 
 
 def test_errors(stored, monkeypatch):

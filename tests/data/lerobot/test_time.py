@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.data import replay_for_tests as shared
-from tests.data.lerobot.lerobot_folder import write_info, write_version_2
+from tests.data.lerobot.lerobot_folder import write_version_2
 from torch_denkf.data import LeRobotReplay, lag_errors
 from torch_denkf.data.lerobot.repeats import repeated_pictures
 from torch_denkf.data.lerobot.rows import recording_from_rows
@@ -69,15 +69,6 @@ def test_repeats_are_those_that_were_written():
     shared.check_contract(data)
 
 
-def test_count_is_of_the_split():
-    repeats = torch.zeros(EPISODES, LENGTH, dtype=torch.bool)
-    repeats[:, 5] = True
-    record, _ = recording(0, repeats)
-    for split in ("train", "test"):
-        data = LeRobotReplay(record, split=split, repeats="mask")
-        assert data.repeats_masked == len(data.episodes)
-
-
 def test_an_episode_does_not_repeat_the_one_before():
     pictures = torch.full((4, 3, 4, 4), 7, dtype=torch.uint8)
     first = torch.tensor([True, False, True, False])
@@ -97,12 +88,6 @@ def test_threshold_is_in_grey_levels():
     rows = torch.arange(2)
     assert not repeated_pictures(pictures, rows, rows == 0, threshold=0.0999)[1]
     assert repeated_pictures(pictures, rows, rows == 0, threshold=0.1001)[1]
-
-
-def test_other_words_are_refused():
-    record, _ = recording(0)
-    with pytest.raises(ValueError, match="'keep' or 'mask', got 'drop'"):
-        LeRobotReplay(record, repeats="drop")
 
 
 # Lag ------------------------------------------------------------------------------------------------------------------
@@ -149,16 +134,6 @@ def test_statistics_are_of_the_pictures_that_are_offered():
     torch.testing.assert_close(data.statistics["pixels", "mean"].flatten(), seen.mean((0, 2, 3)))
 
 
-def test_lag_is_refused_where_nothing_is_left():
-    record, _ = recording(0)
-    with pytest.raises(ValueError, match=r"lag=60 leaves nothing of the episodes \[0, 1, 2"):
-        LeRobotReplay(record, lag=60)
-    with pytest.raises(ValueError, match="opened with lag=2 already"):
-        lag_errors(LeRobotReplay(record, lag=2))
-    with pytest.raises(ValueError, match="each of more than 80 rows"):
-        lag_errors(LeRobotReplay(record), range(-40, 41))
-
-
 def test_from_a_folder(tmp_path):
     write_version_2(tmp_path, [9, 6, 12, 7, 8])
     plain = LeRobotReplay(tmp_path, size=SIZE, cache=None, split="all")
@@ -169,12 +144,3 @@ def test_from_a_folder(tmp_path):
     assert (rows["state"] == all_rows["state"][2:]).all()
     assert (rows["pixels"] == all_rows["pixels"][:10]).all()
     assert data.repeats_masked == 0  # neighbours differ by 14 levels
-
-
-def test_names_in_a_list_of_lists(tmp_path):
-    write_version_2(tmp_path, [6] * 5)
-    features = {"observation.state": {"dtype": "float32", "shape": [3], "names": [["a", "b", "c"]]}}
-    camera = {"dtype": "video", "shape": [48, 64, 3], "names": None}
-    write_info(tmp_path, "v2.1", True, "mkv", features={**features, "observation.images.top": camera})
-    data = LeRobotReplay(tmp_path, size=SIZE, cache=None, split="all", action_key=None)
-    assert data.names == ("a", "b", "c")

@@ -38,14 +38,6 @@ def test_tables(tmp_path, text, match):
     fails(ValueError, match, state=Table(tmp_path / "run.csv"))
 
 
-def test_columns_and_files(tmp_path):
-    write_csv(tmp_path / "run.csv", time=[0, 1], x=[1, 2])
-    fails(ValueError, r"run.csv lacks the columns \['y'\]; .* pass columns=", state=Table(tmp_path / "run.csv", ["y"]))
-    fails(ValueError, r"columns is a list of names, such as \['x'\]", state=Table(tmp_path / "run.csv", "x"))
-    fails(FileNotFoundError, r"no table .*other.csv; check the path", state=Table(tmp_path / "other.csv"))
-    fails(FileNotFoundError, r"no table .*x.parquet; check the path", state=Table(tmp_path / "x.parquet"))
-
-
 def test_parquet(tmp_path):
     file = tmp_path / "run.parquet"
     parquet.write_table(

@@ -3,18 +3,15 @@
 import os
 import shutil
 import warnings
-from copy import deepcopy
 from fractions import Fraction
 from pathlib import Path
-from pickle import dumps, loads
 
 import numpy as np
 import pytest
 
-from tests.data.recordings.own_files import SIZE, grey, write_csv, write_images, write_video
+from tests.data.recordings.own_files import SIZE, grey, write_images, write_video
 from torch_denkf.applications.car.odometry.images import read_frames
-from torch_denkf.data import Images, Recording, RecordingReplay, Table, Video
-from torch_denkf.envs import ReplayEnv
+from torch_denkf.data import Images, Recording, RecordingReplay, Video
 from torch_denkf.plots._frames import write_mp4
 
 
@@ -55,26 +52,6 @@ def test_a_video_that_lost_its_end_is_told(tmp_path, name):
         assert len(left) < 12
         shown = (10 * left["time"]).round().int().tolist()
         assert (left["pixels"].numpy() == np.stack([grey(k).transpose(2, 0, 1) for k in shown])).all()
-
-
-def test_hidden_files_are_no_pictures(tmp_path):
-    write_images(tmp_path / "run", ["0.png", "1.png", "._1.png", "2.png"])
-    (tmp_path / "run" / "thumbnails.png").mkdir()
-    data = RecordingReplay(Recording(camera=Images(tmp_path / "run", rate=1.0)), size=SIZE, cache=None)
-    assert data[:]["time"].squeeze(-1).tolist() == [0, 1, 2]
-    assert data[:]["observed"].all()
-
-
-def test_copies_show_the_same(tmp_path):
-    """Also of pictures that are memory-mapped, which torch itself cannot copy."""
-    write_images(tmp_path / "run", [f"{k}.png" for k in range(6)])
-    write_csv(tmp_path / "run.csv", time=range(6), x=range(6))
-    run = Recording(camera=Images(tmp_path / "run"), picture=Table(tmp_path / "run.csv"))
-    data = RecordingReplay(run, size=SIZE, cache=tmp_path / "cache")
-    assert data[:]["picture"].squeeze(-1).tolist() == list(range(6))
-    for copy in (deepcopy(data), loads(dumps(data)), deepcopy(ReplayEnv(data)).data):
-        for key in ("pixels", "picture", "observed"):
-            assert copy[:][key].equal(data[:][key]), key
 
 
 def test_pictures_behind_a_damaged_one_keep_their_times(tmp_path):

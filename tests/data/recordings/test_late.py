@@ -133,25 +133,3 @@ def test_late_readings_give_the_belief_of_readings_in_order(tmp_path):
             expected, variance = expected + gain * (at[row] - expected), (1 - gain) * variance
     assert len(at) > 8
     np.testing.assert_allclose(mean, expected, atol=1e-5)
-
-
-def test_late_tables_that_are_refused(tmp_path):
-    recording, *_ = late_files(tmp_path)
-    file = tmp_path / "gps.csv"
-    write_csv(tmp_path / "early.csv", taken=[0, 1], arrived=[0.25, 0.5], x=[0, 0])
-    with pytest.raises(
-        ValueError, match=r"early.csv:3: 'arrived' is 0.5 s, before 'taken', 1 s; a reading arrives after"
-    ):
-        Table(tmp_path / "early.csv", time="taken", arrived="arrived").read()
-    with pytest.raises(
-        ValueError, match=r"gps.csv lacks the column 'came' of arrivals; it has \['arrived', 'x', 'y'\]"
-    ):
-        Table(file, time="taken", arrived="came").read()
-    with pytest.raises(ValueError, match=r"arrived='arrived' says when .* sample='linear' does not wait for"):
-        Table(file, time="taken", arrived="arrived", sample="linear")
-    assert Table(file, ["y"], time="taken", arrived="arrived").read().columns == ("y",)
-    other = Recording(name="other", encoder=recording.streams["encoder"], gps=Table(file, time="taken"))
-    with pytest.raises(ValueError, match=r"table 'gps' has arrived= in one of the recordings 'other' and 'run'"):
-        open_runs([recording, other])
-    with pytest.raises(ValueError, match="an entry 'gps_late' of its own"):
-        Recording(gps=recording.streams["gps"], gps_late=recording.streams["encoder"])

@@ -10,13 +10,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.data.recordings.own_files import SIZE, write_csv, write_images
+from tests.data.recordings.own_files import SIZE, write_csv
 from tests.real_data import SHARED
 from torch_denkf import KalmanFilter
-from torch_denkf.data import Images, Recording, RecordingReplay, Table
+from torch_denkf.data import Recording, RecordingReplay, Table
 
 CAR = SHARED / "logs" / "car.csv"
-WHEELS = sorted((SHARED / "logs").glob("wheels_gyro_*.txt"))
 
 
 def replay(**streams):
@@ -127,14 +126,6 @@ def test_a_fix_that_is_repeated_counts_once(tmp_path):
     assert inside["dropped"] > 0.9 > 0.75 > inside["kept"]
 
 
-def test_one_slow_column_among_fast_ones(tmp_path):
-    walk, gps, _ = fixes()
-    file = write_csv(tmp_path / "run.csv", time=np.arange(len(walk)) / 10, gyro=walk, gps=gps)
-    with pytest.warns(UserWarning, match=r"'gps' repeats .* in a Table of its own, columns=\['gps'\]"):
-        replay(imu=Table(file))
-    replay(imu=Table(file, repeats="keep"))
-
-
 def test_what_is_no_repeat(tmp_path):
     """A robot that stands, an encoder's ticks, a temperature, commands that are held."""
     random, count = np.random.default_rng(0), 400
@@ -177,13 +168,6 @@ def test_the_log_of_a_car():
     assert_close(rows["gps"].double().numpy(), degrees - [51.04, 13.79], rtol=0, atol=1e-9)
     degrees = torch.from_numpy(degrees)
     assert 0.2 < (degrees.float().double() - degrees).abs().max() * 111_200 < 0.22  # m, without an origin
-
-
-@pytest.mark.skipif(not WHEELS, reason="the logs are not here")
-def test_the_logs_of_a_wheeled_robot():
-    """Nothing is wrong in them."""
-    for file in WHEELS:
-        assert len(replay(state=Table(file))) == len(file.read_text().splitlines()) - 1
 
 
 def queued(rate, count=2000):
@@ -231,18 +215,6 @@ def test_times_that_no_log_has(tmp_path, time, seen):
     file = write_csv(tmp_path / "run.csv", time=time, x=np.arange(len(time)))
     with pytest.warns(UserWarning, match=rf"run.csv: 'time' {seen}.*pass unit='ms', 'us' or 'ns'"):
         Table(file, unit="s").read()
-
-
-def test_times_of_pictures(tmp_path):
-    write_images(tmp_path / "images", [f"{k * 33_000_000}.png" for k in range(8)])
-    with pytest.warns(
-        UserWarning, match="images: 'time' has steps of usually 3.3e\\+07 s.*pass unit='ms', 'us' or 'ns'"
-    ):
-        replay(camera=Images(tmp_path / "images"))
-    assert len(replay(camera=Images(tmp_path / "images", unit="ns"))) == 8
-    masked = np.ma.masked_equal(np.arange(8.0), 3.0)
-    with pytest.raises(ValueError, match=r"times of .*images has masked elements"):
-        replay(camera=Images(tmp_path / "images", times=masked))
 
 
 def test_times_that_logs_have(tmp_path):

@@ -4,23 +4,12 @@ from contextlib import nullcontext
 from functools import partial
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as parquet
 import pytest
-import torch
-from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import check_env_specs
 
-import torch_denkf.data.recordings.frames as frames_module
 from tests.data import replay_for_tests as shared
 from tests.data.recordings.own_files import SIZE, pixels, write_csv, write_images, write_video
 from torch_denkf.data import Images, Recording, RecordingReplay, Table, Video
-from torch_denkf.data.cache_entry import CachedTensor
 from torch_denkf.data.episodes import hashed_share
-from torch_denkf.envs import ReplayEnv
-from torch_denkf.filters import DEnKF
-from torch_denkf.objectives import DEnKFLoss
-from torch_denkf.transforms import DEnKFTransform
 
 open_runs = partial(RecordingReplay, size=SIZE, cache=None, progress=False)
 
@@ -99,14 +88,6 @@ def test_a_rate_shows_each_picture_once(run):
         assert (rows["pixels"][row].numpy() == (pixels(int(frame[row])) if new[row] else 0)).all()
 
 
-def test_the_clock_of_a_table(run):
-    rows = open_runs(Recording(**streams(run)), clock="action")[:]
-    assert rows["time"].flatten().tolist() == [0.25 * k for k in range(6)]  # 0.25, 0.5, ... 1.5 s
-    assert rows["action"].flatten().tolist() == [1, 2, 3, 4, 5, 6]
-    for row, number in enumerate((2, 5, 7, 10, 12, 15)):
-        assert (rows["pixels"][row].numpy() == pixels(number)).all()
-
-
 def test_old_readings_are_missing_beyond_the_tolerance(run):
     table = Table(run / "commands.csv", tolerance=0.12)
     rows = open_runs(Recording(camera=Video(run / "run1.mkv"), speed=table))[:]
@@ -114,34 +95,6 @@ def test_old_readings_are_missing_beyond_the_tolerance(run):
     held = age <= 0.12 + 1e-6
     expected = np.where(held, np.floor(np.arange(20) / 2.5 + 1e-9), 0)
     assert rows["speed"].flatten().tolist() == expected.tolist()
-
-
-def test_images_and_parquet(tmp_path):
-    """Images that are named by their times in ns, and a table of the same clock."""
-    stamps = [1_700_000_000_000_000_000 + 100_000_000 * k for k in range(8)]
-    write_images(tmp_path / "run7", [f"{stamp}.png" for stamp in stamps])
-    times = np.array(stamps[0] + 50_000_000 * np.arange(-2, 18), dtype=np.int64)
-    table = {"stamp": pa.array(times), "x": pa.array(np.arange(20.0)), "n": pa.array(np.arange(20)), "note": ["-"] * 20}
-    parquet.write_table(pa.table(table), tmp_path / "state.parquet")
-    state = Table(tmp_path / "state.parquet", ["n", "x"], time="stamp", unit="ns")
-    data = open_runs(Recording(eye=Images(tmp_path / "run7", unit="ns"), state=state), size=(12, 16))
-    rows = data[:]
-    assert data.episodes[0].name == "run7"
-    np.testing.assert_allclose(rows["time"].flatten(), np.arange(8) / 10, atol=1e-6)
-    assert rows["state"].tolist() == [[2 + 2 * k, 2 + 2 * k] for k in range(8)]
-    expected = np.stack([pixels(k)[:, :12, :16] for k in range(8)])
-    assert (rows["pixels"].numpy() == expected).all()
-    # The same pictures at a rate, and with times from a table; img_10 comes after img_9.
-    write_images(tmp_path / "plain", [f"img_{k}.png" for k in range(12)])
-    write_csv(tmp_path / "times.csv", time=np.arange(12) ** 1.5)
-    for images, expected in (
-        (Images(tmp_path / "plain", rate=4.0, start=3.0), 3 + np.arange(12) / 4),
-        (Images(tmp_path / "plain", times=tmp_path / "times.csv"), np.arange(12) ** 1.5),
-        (Images(tmp_path / "plain", times=list(range(12)), unit="ms"), np.arange(12) / 1000),
-    ):
-        data = open_runs(Recording(eye=images))
-        np.testing.assert_allclose(data[:]["time"].flatten() + data.episodes[0].begin, expected)
-        assert (data[:]["pixels"].numpy() == np.stack([pixels(k) for k in range(12)])).all()
 
 
 def test_images_are_in_the_order_of_their_numbers(tmp_path):
@@ -223,38 +176,4 @@ def test_recordings_are_episodes(runs, tmp_path):
     )
 
 
-def test_pictures_are_decoded_once(runs, run, tmp_path, monkeypatch):
-    cached = partial(RecordingReplay, size=SIZE, cache=tmp_path, progress=False)
-    first = cached(runs)
-    video = cached(Recording(**streams(run)))
-    assert len(list(tmp_path.iterdir())) == 5
-    with monkeypatch.context() as patch:
-        patch.setattr(frames_module, "decode_picture", None)
-        patch.setattr(frames_module, "decoded_frames", None)
-        again = cached(runs, split="all")
-        other = cached(Recording(**streams(run)), clock=25.0)  # another clock, the same pictures
-    assert (again[:] == first[:]).all()
-    assert isinstance(again._pictures.stores[0], CachedTensor)
-    assert other[0]["pixels"].equal(torch.from_numpy(pixels(1)))
-    assert "pixels" not in video._storage[:]
-    cached(runs, size=(12, 16))
-    assert len(list(tmp_path.iterdir())) == 9
-
-
 # Filters --------------------------------------------------------------------------------------------------------------
-
-
-def test_an_environment_a_filter_and_a_loss(runs):
-    data = open_runs(runs, num_slices=3, slice_len=5)
-    denkf = DEnKF.paper(state_dim=2, observation_dim=2, image_shape=(3, *SIZE), ensemble_size=4)
-    env = TransformedEnv(ReplayEnv(data, batch_size=[2]), DEnKFTransform(denkf))
-    check_env_specs(env)
-    env.set_seed(0)
-    rollout = env.rollout(20)
-    assert rollout.batch_size == (2, 8)
-    assert rollout["next", "belief", "mean"].isfinite().all()
-    assert rollout["next", "state"][1, :, 0].tolist() == pytest.approx([1 + k / 100 for k in range(1, 9)])
-    losses = DEnKFLoss(denkf, transition=0.0, sensor=0.0)(data.sample())
-    losses["loss_state"].backward()
-    assert all(p.grad.isfinite().all() for p in denkf.parameters() if p.grad is not None)
-    assert any(p.grad is not None and p.grad.any() for p in denkf.parameters())

@@ -76,18 +76,6 @@ def test_other_encodings_are_refused_with_the_file(tmp_path, encoding):
         read(tmp_path, GOOD.replace("y", "größe"), encoding=encoding)
 
 
-def test_parquet_without_numbers(tmp_path):
-    pyarrow = pytest.importorskip("pyarrow")
-    parquet = pytest.importorskip("pyarrow.parquet")
-    for column, match in (
-        (pyarrow.array([0, 1], pyarrow.timestamp("us")), r"'x' holds timestamp\[us\], not a number a row"),
-        (pyarrow.array([0.0, 1e39]), "row 1 .*'x' is 1e"),
-    ):
-        parquet.write_table(pyarrow.table({"time": [0, 1], "x": column}), tmp_path / "run.parquet")
-        with pytest.raises(ValueError, match=match):
-            Table(tmp_path / "run.parquet", ["x"]).read()
-
-
 def test_parquet_with_dates(tmp_path):
     pyarrow = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")

@@ -4,11 +4,8 @@ import pytest
 import torch
 from torch.multiprocessing import start_processes
 
-from tests.functional.checks import assert_refused
 from tests.functional.kernels.two_shards import SHARES, analyse_shares, problem
-from torch_denkf.deployment import ShardedEnsembleAnalysis
 from torch_denkf.functional import analyse
-from torch_denkf.functional.kernels.sharded import analyse_sharded
 from torch_denkf.modules import EnsembleAnalysis
 
 # Sums in another order. The forecast's members reach 5, where single precision has steps of 5e-7: ten of them.
@@ -55,31 +52,3 @@ def test_the_module_inflates_where_another_process_observes(ranks):
     expected = whole.compute(forecast, predicted, given["etkf"], noise, observed, noise=None)
     for key, value in zip(joined(ranks, "module").items(), expected, strict=True):
         torch.testing.assert_close(key[1], value, rtol=1e-9, atol=1e-12)
-
-
-def arguments():
-    return torch.randn(4, 3), torch.randn(4, 2), torch.randn(2), torch.ones(2)
-
-
-def test_draws_must_be_given():
-    assert_refused(ValueError, r"perturbation.*another seed", analyse_sharded, *arguments(), scheme="perturbed")
-    assert_refused(ValueError, "'perturbed'", ShardedEnsembleAnalysis, "perturbed")
-
-
-def test_gradients_are_refused():
-    forecast, *rest = arguments()
-    with pytest.raises(RuntimeError, match="forecast requires a gradient"):
-        analyse_sharded(forecast.requires_grad_(), *rest, scheme="etkf")
-    with torch.no_grad():
-        analyse_sharded(forecast, *rest, scheme="etkf")
-
-
-def test_processes_must_have_begun(monkeypatch):
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    assert_refused(RuntimeError, "init_process_group", analyse_sharded, *arguments(), scheme="etkf")
-
-
-def test_shapes_are_checked():
-    forecast, predicted, reading, noise = arguments()
-    with pytest.raises(ValueError, match="predicted must be"):
-        analyse_sharded(forecast, predicted[:3], reading, noise, scheme="etkf")

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from torch_denkf.functional import kalman_update
 from torch_denkf.functional.kernels.small_system import (
     LARGEST,
     LARGEST_FACTOR,
@@ -61,15 +60,6 @@ def test_the_factor_and_its_gradient_are_those_of_linalg(float64, size):
     torch.testing.assert_close(*(x + x.mT for x in gradients), rtol=1e-10, atol=1e-10)  # see above
 
 
-@pytest.mark.parametrize("size", range(1, LARGEST_FACTOR + 1))
-def test_the_solution_by_a_factor_is_that_of_linalg(float64, size):
-    gram, right, *_ = systems(size)
-    matrix = gram + torch.eye(size)
-    expected = torch.linalg.solve(matrix, right)
-    torch.testing.assert_close(WrittenOut(matrix).solve(right), expected, rtol=1e-11, atol=1e-11)
-    assert WrittenOut(-matrix).solve(right).isnan().all()
-
-
 @pytest.mark.parametrize("place", range(3))
 def test_a_matrix_without_a_factor_is_nan_and_alone(float64, place):
     matrix = torch.eye(3).repeat(2, 1, 1)
@@ -78,20 +68,3 @@ def test_a_matrix_without_a_factor_is_nan_and_alone(float64, place):
     assert torch.equal(factor[0], torch.eye(3))
     assert factor[1].isnan().all()
     torch.testing.assert_close(factor, cholesky(matrix), equal_nan=True)
-
-
-def test_a_compiled_update_equals_the_eager_one(float64):
-    root, matrix, observation = torch.randn(4, 5, 5), torch.randn(4, 2, 5), torch.randn(4, 2)
-    noise, observed = torch.rand(4, 2) + 0.1, torch.tensor([[True, True], [True, False], [False, False], [True, True]])
-    noise[3] = -100  # no positive definite S
-
-    def update(mean, root):
-        return tuple(kalman_update(mean, root @ root.mT, observation, matrix, noise, observed=observed))
-
-    inputs = torch.randn(4, 5, requires_grad=True), root.requires_grad_()
-    eager, compiled = update(*inputs), torch.compile(update, fullgraph=True, backend="aot_eager")(*inputs)
-    assert all(value[3].isnan().all() for value in (eager[0], eager[1], compiled[0], compiled[1]))
-    torch.testing.assert_close(compiled, eager, rtol=1e-10, atol=1e-10, equal_nan=True)
-    gradients = [torch.autograd.grad(sum(v[:3].square().sum() for v in out), inputs) for out in (compiled, eager)]
-    for ours, theirs in zip(*gradients, strict=True):
-        torch.testing.assert_close(ours[:3], theirs[:3], rtol=1e-9, atol=1e-9)

@@ -5,7 +5,6 @@ import json
 import re
 import shlex
 import shutil
-from fractions import Fraction
 
 import cv2
 import numpy as np
@@ -100,95 +99,6 @@ def test_odometry_leaves_the_belief_in_all_files(kitti, checkpoint, tmp_path, ca
     assert (tmp_path / "path.png").is_file()
     assert main(["plot", str(tmp_path / "path.csv"), "--out", str(tmp_path / "pictures")]) == 0
     assert (tmp_path / "pictures/bands.png").is_file()
-
-
-def test_odometry_of_a_video_and_of_a_folder_of_ones_own(kitti, checkpoint, tmp_path, capsys):
-    images = list(read_frames(kitti / "sequences/b/image_2"))
-    (tmp_path / "own").mkdir()
-    for number, image in enumerate(images):  # 10 comes after 9
-        cv2.imwrite(str(tmp_path / f"own/left{number}.png"), image)
-    video = cv2.VideoWriter(str(tmp_path / "drive.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, SIZE[::-1])
-    for image in images:
-        video.write(image)
-    video.release()
-    fx, fy, cx, cy = read_camera(kitti / "sequences/b/calib.txt")
-    (tmp_path / "camera.yaml").write_text(f"fx: {fx}\nfy: {fy}\ncx: {cx}\ncy: {cy}\n")
-    common = ["--calibration", str(tmp_path / "camera.yaml"), "--checkpoint", str(checkpoint), "--no-pictures"]
-    folder, drive = str(tmp_path / "own"), str(tmp_path / "drive.avi")
-    assert main(["odometry", folder, *common, "--fps", "10", "--out", str(tmp_path / "a")]) == 0
-    assert main(["odometry", drive, *common, "--out", str(tmp_path / "b")]) == 0
-    assert not (tmp_path / "a/path.png").exists()
-    one, other = (read_path(tmp_path / name / "path.csv") for name in "ab")
-    assert one["time"].flatten().tolist() == pytest.approx([0.1 * n for n in range(12)])
-    torch.testing.assert_close(one["time"], other["time"])
-    way = one["belief", "mean"][-1, 0]
-    assert way > 1
-    assert other["belief", "mean"][-1, 0] == pytest.approx(float(way), rel=0.2)  # JPEG
-    capsys.readouterr()
-    assert main(["odometry", folder, *common, "--out", str(tmp_path / "c")]) == 2
-    err = capsys.readouterr().err
-    assert "does not say when its frames were taken; pass --fps NUMBER or --times FILE" in err
-
-
-def test_a_video_of_uneven_frames_is_the_folder_with_its_times(kitti, checkpoint, tmp_path, capsys):
-    """Lossless, so that both see the same pixels; the sixth frame comes 0.3 s late, and all after it."""
-    av = pytest.importorskip("av")
-    times = [0.1 * n + 0.3 * (n > 5) for n in range(12)]
-    images = list(read_frames(kitti / "sequences/b/image_2"))
-    (tmp_path / "own").mkdir()
-    with av.open(str(tmp_path / "drive.mkv"), "w") as out:
-        stream = out.add_stream("ffv1", rate=10)
-        stream.width, stream.height, stream.pix_fmt = *SIZE[::-1], "bgr0"
-        stream.codec_context.time_base = stream.time_base = Fraction(1, 1000)
-        for number, image in enumerate(images):
-            cv2.imwrite(str(tmp_path / f"own/{number}.png"), image)
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24").reformat(format="bgr0")
-            frame.pts, frame.time_base = round(1000 * times[number]), Fraction(1, 1000)
-            out.mux(stream.encode(frame))
-        out.mux(stream.encode())
-    (tmp_path / "times.txt").write_text("\n".join(map(str, times)))
-    stamps = read_frames(tmp_path / "drive.mkv").stamps()
-    assert stamps == pytest.approx(times, abs=1e-3)
-    assert read_frames(tmp_path / "own").stamps() is None
-    common = ["--calibration", str(kitti / "sequences/b/calib.txt"), "--checkpoint", str(checkpoint), "--no-pictures"]
-    cases = {"folder": ["own", "--times", str(tmp_path / "times.txt")], "video": ["drive.mkv"]}
-    cases["even"] = ["drive.mkv", "--fps", "10"]
-    said = {}
-    for name, (frames, *words) in cases.items():
-        assert main(["odometry", str(tmp_path / frames), *words, *common, "--out", str(tmp_path / name)]) == 0
-        said[name] = capsys.readouterr().err
-    folder, video, even = (read_path(tmp_path / name / "path.csv") for name in cases)
-    torch.testing.assert_close(video["time"], folder["time"], rtol=0, atol=1e-3)
-    torch.testing.assert_close(video["belief", "mean"], folder["belief", "mean"])
-    assert float(even["time"][-1]) == pytest.approx(1.1)
-    assert "1 of 11 frames come earlier or later than 0.1 s" in said["video"]
-    assert "--fps" in said["video"]
-    assert "earlier or later" not in said["even"] + said["folder"]
-
-
-def test_a_cut_video_says_how_many_frames_are_left_out(kitti, checkpoint, tmp_path, capsys):
-    """The file loses its last third. Frames before the cut, which goes through a frame, give the whole file's path."""
-    file = tmp_path / "drive.avi"
-    video = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*"MJPG"), 10, SIZE[::-1])
-    for image in read_frames(kitti / "sequences/b/image_2"):
-        video.write(image)
-    video.release()
-    common = ["--calibration", str(kitti / "sequences/b/calib.txt"), "--checkpoint", str(checkpoint), "--no-pictures"]
-    assert main(["odometry", str(file), *common, "--out", str(tmp_path / "whole")]) == 0
-    assert "left out" not in capsys.readouterr().err
-    data = file.read_bytes()
-    file.write_bytes(data[: 2 * len(data) // 3])
-    assert main(["odometry", str(file), *common, "--out", str(tmp_path / "cut")]) == 0
-    said = capsys.readouterr()
-    whole, cut = (read_path(tmp_path / name / "path.csv") for name in ("whole", "cut"))
-    left = len(cut)
-    assert len(whole) == 12
-    assert 4 < left < 9
-    torch.testing.assert_close(cut["belief", "mean"][:-1], whole["belief", "mean"][: left - 1])
-    assert f"says that it has 12 frames; only the first {left} can be read" in said.err
-    assert f"leaves {12 - left} out" in said.err
-    assert said.err.count("Is the file cut?") == 1
-    assert f"{left} steps, 0 without a reading" in said.out
 
 
 def test_missing_numbers_are_missing_frames(kitti, checkpoint, tmp_path, capsys):

@@ -27,12 +27,3 @@ def test_demo_of_a_rendered_drive(tmp_path, capsys, monkeypatch):
         assert animation.n_frames == 3
     with Image.open(tmp_path / "demo.png") as picture:
         assert picture.width >= 800
-
-
-def test_mistakes_of_the_demo(tmp_path, capsys):
-    assert main(["demo", "--root", str(tmp_path)]) == 2
-    assert "pass --root and --drive together, or neither" in capsys.readouterr().err
-    assert main(["demo", "--frames", "3"]) == 2
-    assert "--frames must be a whole number, at least 30; got 3" in capsys.readouterr().err
-    assert main(["demo", "--root", str(tmp_path), "--drive", "09", "--out", str(tmp_path)]) == 2
-    assert "error: " in capsys.readouterr().err

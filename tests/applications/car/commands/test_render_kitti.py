@@ -53,6 +53,7 @@ def test_the_reader_gives_back_the_given_poses(recorded, tmp_path):
     assert np.abs(one.astype(float) - cv2.cvtColor(three, cv2.COLOR_BGR2GRAY)).mean() < 4  # two kinds of grain
 
 
+@pytest.mark.slow
 def test_bytes_depend_neither_on_processes_nor_on_interruptions(recorded, tmp_path, monkeypatch):
     monkeypatch.setattr(writer, "STRETCH", 5)
     options = {"poses": recorded, "frames": 12, "size": (12, 36)}
@@ -119,26 +120,3 @@ def test_errors_name_the_file_and_the_remedy(recorded, tmp_path, capsys):
     words = ["--out", str(tmp_path / "out"), "--poses", str(tmp_path / "bad"), "--processes", "1"]
     assert RenderKITTI.main(words) == 2
     assert re.match(r"error: .*03\.txt:2: ", capsys.readouterr().err)
-
-
-def test_the_command_writes_what_the_function_does(recorded, tmp_path):
-    words = ["--poses", str(recorded), "--out", str(tmp_path / "a"), "--names", "01", "--size", "12", "36"]
-    words += [
-        "--frames",
-        "4",
-        "--seed",
-        "5",
-        "--camera",
-        "image_0",
-        "--focal",
-        "0.7",
-        "--processes",
-        "1",
-        "--no-traffic",
-    ]
-    assert RenderKITTI.main(words) == 0
-    render_drives(
-        tmp_path / "b", poses=recorded, names=["01"], size=(12, 36), frames=4, seed=5, camera="image_0", focal=0.7,
-        traffic=False,
-    )  # fmt: skip
-    assert content(tmp_path / "a") == content(tmp_path / "b")

@@ -1,15 +1,12 @@
 """Two commands in one folder: the second is refused, and a killed one is not in the way of the next."""
 
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from torch_denkf.applications.car.odometry.paths import read_path
-from torch_denkf.cli.command import alone_in
 from torch_denkf.cli.main import main
 
 ROOT = Path(__file__).parents[2]
@@ -57,39 +54,3 @@ def test_the_second_odometry_in_a_folder_is_refused(kitti, checkpoint, tmp_path,
     for name in ("path.csv", "path_kitti.txt", "path_tum.txt"):
         assert (both / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
     assert sorted(os.listdir(both)) == sorted(os.listdir(tmp_path / "alone"))
-
-
-def test_a_killed_odometry_leaves_the_earlier_path_and_nothing_after_the_next(kitti, checkpoint, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert main(words(kitti, checkpoint, out, 1)) == 0
-    earlier = (out / "path.csv").read_bytes()
-    command = [sys.executable, "-c", SLOW, *words(kitti, checkpoint, out, 2)]
-    process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    process.stdin.write("\n\n\n")
-    process.stdin.flush()
-    for _ in range(4):
-        assert process.stdout.readline() == "row\n"
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert (out / "path.csv").read_bytes() == earlier
-    assert not [name for name in os.listdir(out) if name.endswith(".part")]
-    assert main(words(kitti, checkpoint, out, 2)) == 0
-    assert sorted(os.listdir(out)) == ["path.csv", "path_kitti.txt", "path_tum.txt"]
-    assert len(read_path(out / "path.csv")) == 12
-    assert (out / "path.csv").read_bytes() != earlier
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["evaluate", "--root", "{kitti}", "--drives", "a", "--checkpoint", "{checkpoint}"],
-        ["train", "--root", "{kitti}"],
-        ["demo", "--frames", "30"],
-    ],
-    ids=lambda words: words[0],
-)
-def test_the_other_commands_that_fill_a_folder_are_alone_in_it(kitti, checkpoint, tmp_path, command, capsys):
-    given = [word.format(kitti=kitti, checkpoint=checkpoint) for word in command]
-    with alone_in(tmp_path):
-        assert main([*given, "--out", str(tmp_path)]) == 2
-    assert f"cannot use {tmp_path}: another process is writing to it (process {os.getpid()})" in capsys.readouterr().err

@@ -177,6 +177,7 @@ def test_a_file_is_read_as_rows(tmp_path):
     assert rows["repeats"][4].tolist() == [1, 1, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DRIVE.exists(), reason="the drive is not here")
 def test_a_real_drive():
     """Odometry sequence 07: 400 rows of it, of which some repeat the corners of the row before."""

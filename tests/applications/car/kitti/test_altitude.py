@@ -38,9 +38,3 @@ def test_a_slow_climb_keeps_to_where_the_camera_looks(hills):
     assert step[1] >= original[1] - 2 * TOLERANCE * np.hypot(*original[[0, 2]])
     assert np.array_equal(found[:, :, :3], wall[:, :, :3])
     assert np.array_equal(found[:, [0, 2], 3], wall[:, [0, 2], 3])
-
-
-def test_a_car_that_never_moves(hills):
-    parked = np.repeat(hills[:1], 5, axis=0)
-    parked[:, 1, 3] = [0.0, 1.0, 0.0, 1.0, 0.0]
-    assert not steady_altitude(parked)[:, 1, 3].any()

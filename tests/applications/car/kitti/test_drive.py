@@ -1,23 +1,17 @@
 """The reader, on a layout written by hand with known numbers, and on a few real frames where they are."""
 
 import math
-import os
 import shutil
-import warnings
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-import torch_denkf.applications.car.kitti.drive as module
 from tests.real_data import KITTI
 from torch_denkf.applications.car import dead_reckoning, read_kitti_drive
-from torch_denkf.applications.car.kitti.drive import list_kitti_drives
-from torch_denkf.applications.car.kitti.files import read_calibration, read_poses
+from torch_denkf.applications.car.kitti.files import read_poses
 from torch_denkf.applications.car.vision.poses import poses_to_state, state_to_poses
-from torch_denkf.data import cache_entry
-from torch_denkf.data.cache_entry import CachedTensor
 
 cv2.setNumThreads(1)
 
@@ -101,14 +95,6 @@ def test_speed_changes_belong_to_the_pair_that_shows_them():
     np.testing.assert_allclose(state[7, 3], moved[6] / dt)
 
 
-def test_reverse_is_negative_and_standing_is_nought():
-    path = np.zeros((5, 3))
-    path[:, 2] = 2.0
-    path[:, :2] = np.array([0, 1, 1, 0.5, 0.5])[:, None] * [math.cos(2.0), math.sin(2.0)]
-    state = poses_to_state(state_to_poses(path), 0.5)
-    np.testing.assert_allclose(state[:, 3], [2, 2, 0, -1, 0], atol=1e-12)
-
-
 def test_dead_reckoning_undoes_the_differences():
     rng = np.random.default_rng(0)
     velocities = torch.tensor(np.stack([rng.uniform(-3, 15, 200), rng.uniform(-0.5, 0.5, 200)], -1))
@@ -126,16 +112,6 @@ def test_missing_frames_keep_their_row(tmp_path):
     assert drive["state"][:, 0].tolist() == [1, 2, 3, 4]
     torch.testing.assert_close(drive["state"][:, 3], torch.full((4,), 10.0))  # the first from the pose before
     assert drive["time"].flatten().tolist() == pytest.approx([0.1, 0.2, 0.3, 0.4])
-
-
-def test_images_without_a_pose_are_left_out(tmp_path):
-    make(tmp_path, images=range(6), poses=range(4))
-    assert len(read_kitti_drive(tmp_path, "00", cache=None)) == 4
-    make(tmp_path, images=[9, 10], sequence="01")
-    with pytest.raises(
-        ValueError, match=r"poses/01.txt has 6 poses, for frames 0 to 5, but the first image .* is number 9"
-    ):
-        read_kitti_drive(tmp_path, "01", cache=None)
 
 
 def test_damaged_images_are_missing_frames(tmp_path):
@@ -162,126 +138,6 @@ def test_damaged_images_are_missing_frames(tmp_path):
         pytest.raises(ValueError, match=r"none of the 6 images in .* can be read"),
     ):
         read_kitti_drive(tmp_path, "00", cache=None)
-
-
-def test_grey_and_colour(tmp_path):
-    make(tmp_path, camera="image_0", grey=True)
-
-    def channels(**options):
-        return read_kitti_drive(tmp_path, "00", size=(10, 30), cache=None, **options)["image"][4, :, 0, 0].tolist()
-
-    assert channels() == [54, 54, 54]
-    assert channels(colour=None) == [54]
-    assert channels(colour=False) == [54]
-    make(tmp_path, camera="image_2")
-    assert channels() == [104, 54, 4]  # colour is preferred
-    assert channels(colour=None) == [104, 54, 4]
-    grey = 0.299 * 104 + 0.587 * 54 + 0.114 * 4
-    assert channels(colour=False) == [pytest.approx(grey, abs=1)]
-    assert channels(camera="image_0") == [54, 54, 54]
-    make(tmp_path, camera="image_3", sequence="07")
-    make(tmp_path, camera="image_1", sequence="07", grey=True)
-    calibration = read_kitti_drive(tmp_path, 7, size=(10, 30), cache=None)["calibration"]
-    assert calibration[0, 0] == 40  # that of image_3
-
-
-def test_images_of_any_size_are_scaled(tmp_path):
-    make(tmp_path, size=(37, 122))
-    drive = read_kitti_drive(tmp_path, "00", size=(10, 30), cache=None)
-    assert drive["image"][3, :, 5, 5].tolist() == [103, 53, 3]
-
-
-def test_a_drive_has_one_size(tmp_path):
-    """An image of another size would have another calibration; a damaged one has no size."""
-    make(tmp_path)
-    make(tmp_path, images=[4], size=(37, 122))
-    (tmp_path / "sequences/00/image_2/000000.png").write_bytes(b"nothing")
-    message = r"000004.png is 122 pixels wide and 37 high, but .*000001.png is 30 pixels wide and 10 high; .* one size"
-    with pytest.warns(UserWarning, match="000000.png is not a complete PNG"), pytest.raises(ValueError, match=message):
-        read_kitti_drive(tmp_path, "00", size=(10, 30), cache=tmp_path / "cache")
-    assert not list(tmp_path.glob("cache/*"))
-
-
-def test_progress_counts_the_images_that_are_decoded(tmp_path):
-    make(tmp_path, images=[0, 1, 3, 5])
-    seen = []
-    read_kitti_drive(tmp_path, "00", cache=tmp_path / "cache", progress=seen.append)
-    assert sum(seen) == 4
-    read_kitti_drive(tmp_path, "00", cache=tmp_path / "cache", progress=seen.append)
-    assert sum(seen) == 4
-
-
-def test_times_are_nominal_without_a_file(tmp_path):
-    drive = read_kitti_drive(make(tmp_path, times=False), "00", cache=None)
-    torch.testing.assert_close(drive["dt"], torch.full((6, 1), 0.103))
-    torch.testing.assert_close(drive["state"][:, 3], torch.full((6,), 1 / 0.103))
-    (tmp_path / "sequences/00/times.txt").write_text("0\n0.1\n0.2\n0.3\n0.4\n9.0\n")
-    with pytest.warns(UserWarning, match=r"times.txt: 1 gaps, the longest of 8.6 s before line 6"):
-        drive = read_kitti_drive(tmp_path, "00", cache=None)
-    torch.testing.assert_close(drive["dt"][0], torch.tensor([0.1]))  # the median: one jump does not count
-    assert drive["time"][-1] == 9.0
-
-
-def test_the_cache(tmp_path, monkeypatch):
-    root, cache = make(tmp_path / "kitti"), tmp_path / "cache"
-    first = read_kitti_drive(root, "00", cache=cache)
-    assert isinstance(first["image"], CachedTensor)
-    entries = list(cache.iterdir())
-    assert len(entries) == 1
-    # From now on the cache alone is read: images are not opened again.
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "_decode", None)
-        again = read_kitti_drive(root, "00", cache=cache)
-        assert (again == first).all()
-        monkeypatch.setenv("TORCH_DENKF_CACHE", str(cache))
-        assert (read_kitti_drive(root, "00") == first).all()
-    # Other options are other entries; a changed file is read anew.
-    read_kitti_drive(root, "00", size=(20, 60), cache=cache)
-    assert len(list(cache.iterdir())) == 2
-    make(root, poses=range(0, 12, 2))
-    os.utime(root / "poses/00.txt", ns=(1, 1))
-    changed = read_kitti_drive(root, "00", cache=cache)
-    assert changed["state"][1, 0] == 2
-    # A damaged entry is made anew, and nothing else is left behind.
-    for entry in cache.iterdir():
-        (entry / cache_entry.MANIFEST).write_text("{")
-    assert (read_kitti_drive(root, "00", cache=cache) == changed).all()
-    assert not [entry for entry in cache.iterdir() if entry.name.startswith(".")]
-    assert not [entry for entry in root.rglob("*") if entry.suffix == ".bin"]
-    assert not isinstance(read_kitti_drive(root, "00", cache=None)["image"], CachedTensor)
-
-
-def test_a_cache_that_is_cut_short_is_never_seen(tmp_path, monkeypatch):
-    root, cache = make(tmp_path / "kitti"), tmp_path / "cache"
-
-    def killed(folder, content):
-        (folder / "image.bin").write_bytes(b"half")
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(cache_entry, "seal_entry", killed)
-        with pytest.raises(KeyboardInterrupt):
-            read_kitti_drive(root, "00", cache=cache)
-    assert list(cache.iterdir()) == []
-    assert len(read_kitti_drive(root, "00", cache=cache)) == 6
-
-
-def test_a_cache_that_cannot_be_written_says_what_to_do(tmp_path):
-    root = make(tmp_path / "kitti")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match=r"cannot write the cache at .*file.*pass cache=FOLDER or cache=None"):
-        read_kitti_drive(root, "00", cache=tmp_path / "file")
-
-
-def test_drives_are_listed(tmp_path):
-    make(tmp_path, sequence="03")
-    make(tmp_path, sequence="01")
-    make(tmp_path, sequence="05", images=[])
-    make(tmp_path, sequence="12")
-    (tmp_path / "poses" / "12.txt").unlink()
-    assert list_kitti_drives(tmp_path) == ["01", "03"]
-    with pytest.raises(FileNotFoundError, match="pass the folder that holds 'sequences' and 'poses'"):
-        list_kitti_drives(tmp_path / "poses")
 
 
 def test_errors_name_the_file(tmp_path):
@@ -333,45 +189,6 @@ def test_errors_name_the_file(tmp_path):
     fails(FileNotFoundError, r"no calibration at .*calib.txt")
 
 
-@pytest.mark.parametrize(
-    ("file", "row", "text", "match"),
-    [
-        (
-            "poses/00.txt",
-            3,
-            "1 0 0 1000000 0 1 0 0 0 0 1 3",
-            r"00.txt:4: the position is 1e\+06 m from .*, 0.1 s earlier",
-        ),
-        ("poses/00.txt", 0, "1 0 0 0 0 1 0 0 0 0 1 -31", r"00.txt:2: the position is 32 m from that of the row before"),
-        ("poses/00.txt", 3, "1 0 0 0 0 1 0 0 0 0 1 1_3", r"00.txt:4: expected 12 finite numbers"),
-        ("sequences/00/calib.txt", 2, "P2: 7_0 0 0 0 0 9 0 0 0 0 1 0", r"calib.txt:3: expected 12 finite numbers"),
-        ("sequences/00/times.txt", 3, "0_3", r"times.txt:4: expected 1 finite number \(seconds\), got 1 words: '0_3'"),
-        (
-            "sequences/00/times.txt",
-            None,
-            "0\n103\n206\n309\n412\n515\n",
-            r"times is 103 s, .*; write the times in seconds",
-        ),
-    ],
-)
-def test_what_cannot_be_a_drive_is_refused(tmp_path, file, row, text, match):
-    """A leap, numbers that Python alone reads as such, and times in ms."""
-    path = make(tmp_path) / file
-    lines = path.read_text().splitlines()
-    path.write_text(text if row is None else "\n".join([*lines[:row], text, *lines[row + 1 :]]))
-    with pytest.raises(ValueError, match=match):
-        read_kitti_drive(tmp_path, "00", cache=None)
-
-
-def test_a_leap_over_a_gap_is_none(tmp_path):
-    """60 m in 6 s."""
-    root = make(tmp_path, poses=[0, 1, 2, 62, 63, 64])
-    (root / "sequences/00/times.txt").write_text("0\n0.1\n0.2\n6.2\n6.3\n6.4\n")
-    with pytest.warns(UserWarning, match="1 gaps"):
-        drive = read_kitti_drive(tmp_path, "00", cache=None)
-    torch.testing.assert_close(drive["state"][:, 3], torch.full((6,), 10.0))
-
-
 # Real frames ---------------------------------------------------------------------------------------------------------
 
 
@@ -391,22 +208,6 @@ def real(tmp_path, sequence, camera, frames):
         if file.is_file():
             (target / camera / file.name).symlink_to(file)
     return tmp_path
-
-
-def test_real_grey_frames_with_a_gap(tmp_path):
-    root = real(tmp_path, "2011_09_26_drive_0039", "image_0", range(5, 25))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        drive = read_kitti_drive(root, "2011_09_26_drive_0039", cache=None)
-    assert drive["image"].shape == (20, 3, 50, 150)
-    assert (~drive["frame_valid"]).flatten().nonzero().flatten().tolist() == [13]  # frame 18
-    assert (drive["image"][:, 0] == drive["image"][:, 2]).all()
-    picture = cv2.imread(str(root / "sequences/2011_09_26_drive_0039/image_0/000007.png"), cv2.IMREAD_GRAYSCALE)
-    expected = cv2.resize(picture, (150, 50), interpolation=cv2.INTER_AREA)
-    assert (drive["image"][2, 0].numpy() == expected).all()
-    # 414 x 125 with fx = 240.5, cx = 203.2
-    expected = [240.512567 * 150 / 414, 240.512567 * 0.4, (203.186433 + 0.5) * 150 / 414 - 0.5, 58.118 * 0.4 - 0.5]
-    torch.testing.assert_close(drive["calibration"][0], torch.tensor(expected))
 
 
 # The mean step is that of all rows; for 09 the reference code's own statistics say 1.0712 m (full_parameters.pkl).
@@ -429,9 +230,3 @@ def test_real_poses_have_the_state_of_kloss(sequence, mean_step):
     bend = np.arctan2(ten[:-10, 0] * ten[10:, 1] - ten[:-10, 1] * ten[10:, 0], (ten[:-10] * ten[10:]).sum(-1))
     fast = np.linalg.norm(ten[:-10], axis=-1) > 3
     assert np.corrcoef(bend[fast], (state[15:-5, 2] - state[5:-15, 2])[fast])[0, 1] > 0.95
-
-
-def test_the_calibration_of_each_camera(tmp_path):
-    make(tmp_path)
-    file = tmp_path / "sequences/00/calib.txt"
-    assert [read_calibration(file, f"image_{k}")[0] for k in range(4)] == [10, 20, 30, 40]

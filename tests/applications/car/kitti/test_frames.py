@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.applications.car.kitti.frames import drive_frames, frames_at
+from torch_denkf.applications.car.kitti.frames import drive_frames
 
 
 def make_drive(rows=8, missing=(), channels=3, size=(4, 6), seed=0):
@@ -51,41 +51,3 @@ def test_a_missing_frame_blinds_two_rows():
     # Not even what a damaged file may have left there is shown.
     drive["image"][3] = 77
     assert (drive_frames(drive)["pixels"] == frames["pixels"]).all()
-
-
-def test_rows_in_any_shape():
-    drive = make_drive()
-    frames, index = drive_frames(drive), torch.tensor([[1, 5, 2], [0, 7, 7]])
-    picked = frames_at(drive, index)
-    assert picked.batch_size == (2, 3)
-    for key in ("pixels", "state", "observed", "time"):
-        assert (picked[key] == frames[key][index]).all()
-    single = frames_at(drive, torch.tensor(4))
-    assert single.batch_size == ()
-    assert (single["pixels"] == frames["pixels"][4]).all()
-
-
-def test_motion_comes_along():
-    """Flow and road as float32, zero where the row is not observed; without images there are no pixels."""
-    drive = make_drive(missing=[3])
-    drive["flow"] = torch.randn(8, 3, 2, 4).half()
-    drive["road"] = torch.randn(8, 5, 6).half()
-    observed = [1, 2, 5, 6, 7]
-    for given in (drive, drive.exclude("image")):
-        frames = drive_frames(given)
-        assert ("pixels" in frames.keys()) == ("image" in given.keys())  # noqa: SIM118
-        for key in ("flow", "road"):
-            assert frames[key].dtype == torch.float32
-            assert (frames[key][observed] == drive[key][observed].float()).all()
-            assert not frames[key][[0, 3, 4]].any()
-        windows = frames_at(given, torch.tensor([[1, 2], [5, 6]]))
-        assert windows["flow"].shape == (2, 2, 3, 2, 4)
-        assert (windows["road"][0, 1] == drive["road"][2].float()).all()
-
-
-def test_errors_say_what_to_do():
-    drive = make_drive()
-    with pytest.raises(KeyError, match=r"lacks \['image'\]"):
-        drive_frames(drive.exclude("image"))
-    with pytest.raises(KeyError, match=r"lacks \['frame_valid', 'time'\]; pass what .*read_kitti_drive returns"):
-        drive_frames(drive.exclude("frame_valid", "time"))

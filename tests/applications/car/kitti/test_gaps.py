@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.applications.car import KITTIReplayEnv, OpticalFlow, read_kitti_drive, with_motion, write_drives
+from torch_denkf.applications.car import read_kitti_drive, with_motion, write_drives
 from torch_denkf.applications.car.kitti.frames import frames_at
 from torch_denkf.applications.car.kitti.gaps import bridge_gaps, steps_between
 
@@ -27,11 +27,6 @@ def test_steps_are_those_that_a_search_finds(longest):
         drive = TensorDict({"frame_valid": valid[row].unsqueeze(-1)}, [400])
         assert bridge_gaps(drive, longest)["steps"].flatten().tolist() == expected[row]
         assert "steps" not in drive
-
-
-def test_no_pair_without_a_step():
-    with pytest.raises(ValueError, match="at least 1; got 0"):
-        bridge_gaps(TensorDict({"frame_valid": torch.ones(3, 1, dtype=torch.bool)}, [3]), 0)
 
 
 @pytest.fixture(scope="module")
@@ -57,20 +52,3 @@ def test_differences_and_flow_are_those_of_the_frames_left_side_by_side(drive):
         assert motion[key][kept][seen].equal(expected[key][seen])
         assert not motion[key][~kept].any()
         assert not motion[key][12].any()
-
-
-def test_the_cache_knows_the_pairs(drive, tmp_path):
-    apart, bridged = with_motion(drive, cache=tmp_path), with_motion(bridge_gaps(drive), cache=tmp_path)
-    assert not apart["road"][4].any()
-    assert bridged["road"][4].any()
-    assert with_motion(bridge_gaps(drive), cache=tmp_path)["road"].equal(bridged["road"])
-
-
-def test_a_replay_shows_the_bridged_pairs_and_their_flow(drive):
-    whole = bridge_gaps(drive)
-    env = KITTIReplayEnv(whole).append_transform(OpticalFlow(drive["calibration"][0]))
-    seen = env.rollout(100)["next"]
-    expected = with_motion(whole, cache=None)
-    assert seen["steps"].equal(whole["steps"][1:])
-    assert seen["observed"].equal(whole["steps"][1:] > 0)
-    torch.testing.assert_close(seen["road"], expected["road"][1:].float(), rtol=0, atol=2e-3)

@@ -7,12 +7,9 @@ import torch
 
 import torch_denkf.applications.car.kitti.motion as motion_module
 from tests.applications.car.vision.drives_for_tests import rendered
-from tests.applications.car.vision.plane_for_tests import as_image, random_texture
-from torch_denkf.applications.car import read_kitti_drive, with_motion, write_drives
-from torch_denkf.applications.car.vision.epipolar import two_view_motion
+from torch_denkf.applications.car import with_motion
 from torch_denkf.applications.car.vision.motion import image_motion
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
-from torch_denkf.applications.car.vision.signs import picture_signs, static_region
 
 cv2.setNumThreads(1)
 ROWS = 8
@@ -55,21 +52,6 @@ def test_rows_are_image_motion_of_neighbours(drive):
     assert "flow" not in drive
 
 
-def test_corners_are_tracked_if_asked_for(drive, tmp_path):
-    plain = with_motion(drive, cache=tmp_path)
-    out = with_motion(drive, cache=tmp_path, two_view=True)  # not the entry without
-    assert "two_view" not in plain
-    assert out["flow"].equal(plain["flow"])
-    assert not out["two_view"][0].any()
-    images = drive["image"][:, 0].numpy()
-    for row in range(1, ROWS):
-        expected = two_view_motion(images[row - 1], images[row], drive["calibration"][row].tolist())
-        assert out["two_view"][row].equal(torch.from_numpy(expected))
-    turned = drive["state"][1:, 4] * drive["dt"][1:, 0]
-    # Images of 60 rows: a twentieth of a degree, or a tenth of a pixel.
-    assert (out["two_view"][1:, 0] - turned).abs().median() < np.deg2rad(0.05)
-
-
 def test_rows_without_a_pair_are_zero(drive):
     whole = with_motion(drive, cache=None)
     drive["image"][4] = 0
@@ -82,45 +64,6 @@ def test_rows_without_a_pair_are_zero(drive):
             else:
                 assert out[key][row].equal(whole[key][row])
                 assert out[key][row].abs().max() > 0.01
-
-
-def test_images_can_be_left_out(drive, tmp_path):
-    whole = with_motion(drive, cache=None)
-    light = with_motion(drive, cache=None, keep_images=False)
-    assert set(light.keys()) == set(whole.keys()) - {"image"}
-    assert light["road"].equal(whole["road"])
-    assert "image" in drive
-    write_drives(tmp_path, ["town"], frames=3)
-    for _ in range(2):  # memory-mapped drives, and the motion too at the second time, are locked
-        locked = read_kitti_drive(tmp_path, "town", cache=tmp_path / "cache")
-        for keep in (True, False):
-            out = with_motion(locked, cache=tmp_path / "cache", keep_images=keep)
-            assert ("image" in out) == keep
-            assert out["flow"].shape == (3, *FLOW_SHAPE)
-
-
-def test_the_second_call_reads_the_cache(drive, tmp_path, count):
-    fresh = with_motion(drive, cache=None)
-    assert len(count) == ROWS - 1
-    first = with_motion(drive, cache=tmp_path)
-    assert len(count) == 2 * (ROWS - 1)
-    again = with_motion(drive.clone(), cache=str(tmp_path))
-    # Neither what does not enter the computation nor where the drive lies matters.
-    light = with_motion(drive.clone().set("state", drive["state"] + 1), cache=tmp_path, keep_images=False)
-    assert len(count) == 2 * (ROWS - 1)
-    for out in (first, again, light):
-        for key in ("flow", "road"):
-            assert out[key].equal(fresh[key])
-    assert len(list(tmp_path.glob("motion-*"))) == 1
-
-
-def test_the_default_cache_is_the_readers(drive, tmp_path, monkeypatch):
-    monkeypatch.setenv("TORCH_DENKF_CACHE", str(tmp_path / "there"))
-    with_motion(drive)
-    assert [entry.name[:7] for entry in (tmp_path / "there").iterdir()] == ["motion-"]
-    before = set(tmp_path.rglob("*"))
-    with_motion(drive, cache=False)
-    assert set(tmp_path.rglob("*")) == before
 
 
 def one_pixel(drive):
@@ -152,14 +95,6 @@ def test_what_matters_makes_another_key(drive, tmp_path, count, change):
     assert len(list(tmp_path.glob("motion-*"))) == 2
 
 
-def test_the_height_makes_another_key(drive, tmp_path, count):
-    with_motion(drive, cache=tmp_path)
-    out = with_motion(drive, height=1.2, cache=tmp_path)
-    assert len(count) == 2 * (ROWS - 1)
-    assert count[-1] == {"height": 1.2}
-    assert out["road"].equal(with_motion(drive, height=1.2, cache=None)["road"])
-
-
 def test_flow_is_in_tangents_of_the_drives_camera(drive):
     """With half the focal length, the same pixels see twice the angles and move by twice the angle."""
     out, wide = drive.clone(), drive.clone()
@@ -173,35 +108,6 @@ def test_flow_is_in_tangents_of_the_drives_camera(drive):
     # quarter of a pixel, on motions of 4 pixels and more.
     assert (far - 2 * near).abs().median() < 0.004
     assert torch.corrcoef(torch.stack([near.flatten(), far.flatten()]))[0, 1] > 0.8
-
-
-def test_colour_and_grey_agree():
-    grey, colour = (with_motion(rendered("road9", 60, c)[20:40], cache=None)[1:] for c in (False, True))
-    # OpenCV reads grey, or colour that is reduced to grey: rounded differently, before and after scaling.
-    difference = (grey["flow"] - colour["flow"]).float()[:, :2].abs()
-    assert difference.median() < 2e-3  # 0.2 pixels
-    assert (grey["road"] - colour["road"]).abs().max() < 0.08
-    assert grey["flow"][:, 0].float().abs().median() > 5 * difference.median()
-
-
-def test_colours_are_weighed_in_rgb_order(drive):
-    """0.299 R + 0.587 G + 0.114 B: of a red world that moves and a blue one that stands, the red one is seen."""
-    red, blue = (random_texture(seed, blur=2.5)[:50, :160] for seed in (5, 6))
-    pairs = {"red moves": [], "blue moves": [], "mixed": []}
-    for moved in (4, 0):
-        r, b = as_image(red[:, moved : moved + 150]), as_image(blue[:, :150])
-        pairs["red moves"].append(np.stack([r, np.full_like(r, 128), b]))
-        pairs["blue moves"].append(pairs["red moves"][-1][::-1])
-        pairs["mixed"].append(np.tile(as_image(0.299 * r + 0.587 * 128 + 0.114 * b), (3, 1, 1)))
-    flows = {}
-    for name, images in pairs.items():
-        two = drive[:2].clone().set("image", torch.from_numpy(np.stack(images)))
-        flows[name] = with_motion(two, cache=None)["flow"][1].float()
-    shift = 4 / drive["calibration"][0, 0].item()
-    assert flows["red moves"][0].median() > 0.8 * shift
-    assert flows["blue moves"][0].median() < 0.2 * shift
-    # Red, green and blue that are equal give that grey; OpenCV's weights are rounded to 1/2^15.
-    assert (flows["red moves"][0] - flows["mixed"][0]).abs().median() < 0.01 * shift
 
 
 def test_mirrored_images_give_the_mirrored_flow():
@@ -220,28 +126,3 @@ def test_mirrored_images_give_the_mirrored_flow():
     # The table sees the flow only through the median turn.
     assert (mirrored["road"] - out["road"]).abs().max() < 0.1
     assert (mirrored["road"] - out["road"]).abs().float().mean() < 0.01
-
-
-@pytest.mark.parametrize("key", ["image", "frame_valid", "calibration"])
-def test_missing_entries_are_named(drive, key):
-    with pytest.raises(KeyError, match=rf"{key}.*read_kitti_drive"):
-        with_motion(drive.exclude(key), cache=None)
-
-
-def test_signs_and_repaired_flow_are_those_of_each_pair(tmp_path):
-    drive = read_kitti_drive(tmp_path, *write_drives(tmp_path, ["town"], frames=4), colour=False, cache=None).copy()
-    image = drive["image"].clone()
-    image[2:, :, 15:35, 60:90] = 0  # hidden in the last two pictures
-    drive["image"] = image
-    plain, repaired = (with_motion(drive, cache=tmp_path / "cache", signs=True, repair=each) for each in (False, True))
-    pictures = image[:, 0].numpy()
-    for row in (1, 2, 3):
-        before, after = pictures[row - 1], pictures[row]
-        assert torch.equal(plain["signs"][row], torch.from_numpy(picture_signs(before, after)))
-        hidden = static_region(before, after)
-        assert hidden.any() == (row == 3)
-        flow, _ = image_motion(before, after, drive["calibration"][row].tolist(), hidden=hidden)
-        assert torch.equal(repaired["flow"][row], torch.from_numpy(flow).half())
-    assert torch.equal(plain["flow"][:3], repaired["flow"][:3])
-    assert not torch.equal(plain["flow"][3], repaired["flow"][3])
-    assert "signs" not in with_motion(drive, cache=tmp_path / "cache")

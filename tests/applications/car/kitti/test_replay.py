@@ -6,16 +6,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
-from torchrl.envs.transforms import ObservationNorm
 
-import torch_denkf.applications.car.kitti.drive as kitti_module
 from tests.data import replay_for_tests as shared
-from torch_denkf.applications.car import KITTIOdometryExperienceReplay, read_kitti_drive, with_motion, write_drives
+from torch_denkf.applications.car import KITTIOdometryExperienceReplay, read_kitti_drive, write_drives
 from torch_denkf.applications.car.kitti.frames import drive_frames
 from torch_denkf.applications.car.kitti.mirror import mirror_drive
-from torch_denkf.data.cache_entry import CachedTensor
 
 SIZE = (12, 36)
 LENGTHS = {"hill": 14, "lane": 9, "town": 23}
@@ -74,26 +70,6 @@ def test_all_rows(root):
     shared.check_indices(data)
 
 
-@pytest.mark.parametrize("options", shared.ways_to_slice())
-def test_slices_are_contiguous_and_in_one_episode(root, options):
-    # 18 + 8 + 36 windows fit in the drives and as many in their mirror images.
-    shared.check_slices(open_dataset(root, mirrored=True, **{"batch_size": 24, **options}), options, "step", KEYS)
-
-
-def test_single_rows(root):
-    data = open_dataset(root, ["town", "lane"], batch_size=8, sampler=SamplerWithoutReplacement())
-    seen = torch.cat([batch["index"] for batch in data])
-    assert sorted(seen.flatten().tolist()) == list(range(23 + 9))
-    rows = data[:]
-    batch = data.sample()
-    assert (batch["pixels"] == rows["pixels"][batch["index"].flatten()]).all()
-    # The gap blinds two rows; row 8 has a frame, but no difference.
-    assert (~rows["observed"][:23]).flatten().nonzero().flatten().tolist() == [0, 7, 8]
-    assert not rows["pixels"][7].any()
-    assert rows["pixels"][8, :3].any()
-    assert not rows["pixels"][8, 3:].any()
-
-
 def test_statistics_by_hand(root):
     """Of the training drives alone: numpy, from the PNGs of those two drives."""
     data = open_dataset(root, ["hill", "town"])
@@ -121,98 +97,4 @@ def test_statistics_by_hand(root):
     assert abs(others["velocity", "mean"][0] - statistics["velocity", "mean"][0]) > 0.01  # the lane would count
 
 
-def test_statistics_of_mirrored_drives(root):
-    plain, mirrored = open_dataset(root).statistics, open_dataset(root, mirrored=True).statistics
-    assert abs(plain["velocity", "mean"][1]) > 1e-3
-    assert abs(mirrored["velocity", "mean"][1]) < 1e-9
-    expected = (plain["velocity", "std"][1] ** 2 + plain["velocity", "mean"][1] ** 2).sqrt()
-    torch.testing.assert_close(mirrored["velocity", "std"][1], expected)
-    torch.testing.assert_close(mirrored["velocity", "mean"][0], plain["velocity", "mean"][0])
-    torch.testing.assert_close(mirrored["pixels"], plain["pixels"])
-
-
-def test_transforms_see_the_pixels(root):
-    training = open_dataset(root, ["hill", "lane"]).statistics["pixels"]
-    norm = ObservationNorm(training["mean"], training["std"], in_keys=["pixels"], standard_normal=True)
-    data = open_dataset(root, ["hill", "lane"], transform=norm)
-    frames = data[:]["pixels"][:, :3]
-    torch.testing.assert_close(frames.mean((0, 2, 3)), torch.zeros(3), atol=1e-4, rtol=0)
-    torch.testing.assert_close(frames.std((0, 2, 3), correction=0), torch.ones(3), atol=1e-4, rtol=0)
-    doubled = open_dataset(root, "lane", transform=lambda rows: rows.set("double", 2 * rows["pixels"]), batch_size=4)
-    doubled.append_transform(lambda rows: rows.set("more", 2 * rows["double"]))
-    sample = doubled.sample()
-    assert (sample["more"] == 4 * sample["pixels"]).all()
-
-
-def test_flow(root, tmp_path):
-    """Added once for each drive and camera, mirrored with its episode, with or without pixels."""
-    calls = []
-
-    def flow(drive, **options):
-        calls.append(len(drive))
-        return with_motion(drive, cache=tmp_path, **options)
-
-    data = open_dataset(root, ["lane", "town"], mirrored=True, flow=flow)
-    assert calls == [9, 23]
-    rows = data[:]
-    for episode in data.episodes:
-        _, drive = expected_rows(root, episode)
-        drive = with_motion(drive, cache=tmp_path)
-        frames = drive_frames(mirror_drive(drive) if episode.mirrored else drive)
-        for key in ("flow", "road", "pixels"):
-            assert rows[key][episode.start : episode.start + episode.length].equal(frames[key]), key
-    assert rows["flow"][1, 0].any()
-    assert not (rows["flow"][1] == rows["flow"][1 + 9]).all()  # the lane's mirror image
-    light = open_dataset(root, ["lane", "town"], mirrored=True, flow=partial(flow, keep_images=False))
-    assert "pixels" not in light[:]
-    assert light[:]["flow"].equal(rows["flow"])
-    assert light[:]["calibration"].equal(rows["calibration"])
-    assert set(light.statistics.keys()) == {"state", "velocity"}
-    short = open_dataset(root, ["lane", "town"], mirrored=True, flow=True, cache=tmp_path / "cache")
-    assert (short[:] == rows).all()
-    assert len(list(tmp_path.glob("cache/motion-*"))) == 2
-    assert "flow" not in open_dataset(root, "lane", flow=False)[:]
-    for bad in (lambda drive: drive, lambda drive: flow(drive)[1:]):
-        with pytest.raises(ValueError, match=r"flow must return the drive with 'flow', 9 rows of it; for lane/image_2"):
-            open_dataset(root, "lane", flow=bad)
-
-
-def test_the_cache_is_mapped_and_opens_without_decoding(root, tmp_path, monkeypatch):
-    options = {"cameras": "both", "mirrored": True, "cache": tmp_path}
-    first = open_dataset(root, **options)
-    entries = sorted(path.name for path in tmp_path.iterdir())
-    assert len(entries) == 5  # mirror images take no space
-    with monkeypatch.context() as patch:
-        patch.setattr(kitti_module, "_decode", None)
-        again = open_dataset(root, **options)
-    assert all(isinstance(drive["image"], CachedTensor) for drive in again._drives)
-    assert (again[:] == first[:]).all()
-    assert "pixels" not in again._storage[:]
-    assert sum(value.nbytes for value in again._storage[:].values(True, True)) < 120 * len(again)
-    assert sorted(path.name for path in tmp_path.iterdir()) == entries
-
-
-def test_a_bar_counts_what_is_decoded(root, tmp_path, monkeypatch):
-    bars = shared.counting_bars(monkeypatch)
-    open_dataset(root, "hill", cache=tmp_path)
-    assert [(bar.n, bar.total, bar.closed) for bar in bars] == [(14, 14, True)]
-    open_dataset(root, progress=False)
-    assert len(bars) == 1
-    open_dataset(root, ["hill", "lane", "town"], cache=tmp_path)  # what is there counts as done
-    assert [(bar.n, bar.total, bar.closed) for bar in bars[1:]] == [(14 + 9 + 22,) * 2 + (True,)]
-    open_dataset(root, "lane", cache=tmp_path, flow=partial(with_motion, cache=None))
-    assert [(bar.n, bar.total) for bar in bars[2:]] == [(18, 18)]
-
-
 # The rest of torchrl's interface -------------------------------------------------------------------------------------
-
-
-def test_it_deletes_nothing_of_the_users(root):
-    data = open_dataset(root, "lane")
-    shared.check_nothing_is_deleted(data)
-    assert data.root == root
-    assert (root / "sequences/lane/image_2/000000.png").is_file()
-
-
-def test_preprocess_sees_pixels(root, tmp_path):
-    shared.check_preprocess(open_dataset(root, "lane", mirrored=True), tmp_path)

@@ -8,7 +8,6 @@ import torch
 from tests.applications.car.metrics.paths_for_tests import evo_errors, straight, winding
 from torch_denkf.applications.car.metrics.benchmark import kitti_pathlength_error
 from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
-from torch_denkf.functional import wrap_angles
 
 
 @pytest.mark.parametrize("window", [1, 37, 100])
@@ -79,10 +78,3 @@ def test_pathlength_error_sums_the_steps_of_each_path():
     standing = torch.cat([straight(1).expand(50, 3), straight(60)])
     with pytest.raises(ValueError, match="stands still"):
         kitti_pathlength_error(standing, standing, windows=[20, 100])
-
-
-def test_wrapped_headings_are_the_callers_matter():
-    truth = straight(101)
-    truth[:, 2] = torch.linspace(3.0, 3.3, 101)
-    estimated = torch.cat([truth[:, :2], wrap_angles(truth[:, 2:])], -1)
-    torch.testing.assert_close(kitti_pathlength_error(estimated, truth).rotation.item(), 3.6)

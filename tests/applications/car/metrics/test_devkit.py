@@ -86,34 +86,6 @@ def test_by_hand():
     torch.testing.assert_close(turned.length_translation[0].item(), sum(law_of_cosines) / 15)
 
 
-def test_metres_are_those_of_the_truth_and_starts_are_all_tried():
-    truth = straight(400, step=0.5)
-    error = kitti_devkit_error(torch.zeros_like(truth), truth, lengths=(50,), step=1)
-    assert error.segments.tolist() == [299]  # 101 steps each
-    torch.testing.assert_close(error.translation.item(), 101.0)  # 50.5 m of 50 m: the estimate stands
-
-
-def test_batches_are_paths_of_their_own():
-    truth, estimated = winding(0, rows=300, batch=(2, 3)), winding(1, rows=300, batch=(2, 3))
-    truth[1, 2, :, :2] *= 0.6  # shorter: fewer segments
-    error = kitti_devkit_error(estimated, truth)
-    assert error.segments.shape == (2, 3, 8)
-    for i in range(2):
-        for j in range(3):
-            one = kitti_devkit_error(estimated[i, j], truth[i, j])
-            for all_of_them, single in zip(error, one, strict=True):
-                torch.testing.assert_close(all_of_them[i, j], single, equal_nan=True)
-    assert error.segments[1, 2].sum() < error.segments[1, 1].sum()
-
-
-def test_float32_keeps_the_segments():
-    truth, estimated = winding(0, rows=460), winding(1, rows=460)
-    double, single = kitti_devkit_error(estimated, truth), kitti_devkit_error(estimated.float(), truth.float())
-    assert single.translation.dtype == torch.float32
-    assert single.segments.equal(double.segments)
-    torch.testing.assert_close(single.translation.double(), double.translation, rtol=1e-4, atol=0)
-
-
 def test_errors_say_what_to_do():
     path = straight(90)
     with pytest.raises(ValueError, match=r"the shortest path is 89\.0 m long; leave such paths out"):

@@ -21,21 +21,3 @@ def test_factors_are_lognormal_quantiles_that_stay_with_their_members(float64):
         assert float(factor[0, :, dim].square().mean().sqrt()) == pytest.approx(std)
     # Dimensions are shuffled apart: of 50 pairs, a correlation is 0 +- 0.14.
     assert abs(float(torch.corrcoef(factor[0].T)[0, 1])) < 0.42
-
-
-def test_gradients_and_other_keys(float64):
-    samples = torch.randn(3, 4, 2, requires_grad=True)
-
-    def run(samples, log_std):
-        gain = MemberGain([0.1, 0.2], ensemble_size=4, out_key=("a", "b"))
-        td = TensorDict({("sensor", "ensemble"): samples}, [3])
-        return torch.func.functional_call(gain, {"log_std": log_std}, (td,))["a", "b"]
-
-    assert torch.autograd.gradcheck(run, (samples, torch.randn(2, requires_grad=True)))
-
-
-def test_errors():
-    with pytest.raises(ValueError, match=r"std, a standard deviation, must be finite and above 0; got 0.0 at \[1\]"):
-        MemberGain([0.1, 0.0])
-    with pytest.raises(ValueError, match=r"made for samples \[\*B, 32, 1\]"):
-        MemberGain([0.1])(TensorDict({("sensor", "ensemble"): torch.zeros(8, 1)}))

@@ -10,7 +10,7 @@ from torch_denkf.applications.car import UnicycleMotion, UnicycleNoise, Unicycle
 from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, with_history
 from torch_denkf.filters import EKF, DEnKF
 from torch_denkf.imperfect import RejectReadings
-from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select, SubModel
+from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select
 
 DT, Q, R, START = 0.5, (0.3, 0.05), (0.2, 0.02), (0.0, 0.0, 0.0, 0.6, 0.1)
 
@@ -112,24 +112,6 @@ def test_a_reading_over_a_gap_corrects_velocity_and_way_like_a_kalman_filter_wit
     assert abs(float(way) - float(mean_v[3])) < 0.05 * float(mean_v[3])
 
 
-def test_an_exact_reading_over_a_gap_leaves_no_doubt_about_the_way(float64):
-    filter = pair_filter(64, "etkf")
-    frames = frames_of(torch.tensor([[0.0, 0.0], [0.0, 0.0], [10.0, 0.9]]), [0, 0, 2])
-    frames["y"][-1] = torch.tensor([10.0, 0.9])
-    exact = DEnKF(
-        filter["transition"],
-        None,
-        filter["observation"],
-        ConstantNoise([1e-6, 1e-6], in_key="y"),
-        filter["analysis"],
-        initial=filter.initial,
-    )
-    torch.manual_seed(1)
-    out = exact.sequence(frames)["belief", "ensemble"][-1]
-    turned = torch.full((64,), 0.9 * DT)
-    torch.testing.assert_close(out[:, 2], turned, rtol=0, atol=1e-4)
-
-
 def test_the_way_over_a_gap_is_that_of_the_corrected_steps(float64):
     before = torch.tensor([1.0, 2.0, 0.3, 9.0, 0.2]).expand(2, 5)
     history = torch.tensor([[9.0, 0.2], [8.0, -0.1]]).expand(2, 2, 2)
@@ -183,30 +165,6 @@ def test_a_slow_camera_is_read_again_when_the_car_slows_down(float64):
     assert abs(float(out["belief", "mean"][-1, 3]) - 2.0) < 1.0
 
 
-def test_steps_equal_the_sequence(float64):
-    filter = pair_filter(8, "etkf", change=torch.nn.Linear(2, 2))
-    frames = frames_of(torch.randn(10, 2) + torch.tensor([4.0, 0.1]), [0, 1, 0, 2, 1, 0, 0, 3, 1, 0])
-    filter.draw_noise(frames)
-    expected = filter.sequence(frames.copy())
-    row, rows = filter.initialise(frames[0].copy()), []
-    for t in range(1, 10):
-        row = filter.step(frames[t].copy().update(row.select(*filter.carry_keys)))
-        rows.append(row["belief", "ensemble"])
-    torch.testing.assert_close(torch.stack(rows), expected["belief", "ensemble"][1:], rtol=0, atol=1e-12)
-    assert filter.carry_keys == [("belief", "ensemble"), ("belief", "history")]
-
-
-def test_gradients_reach_the_past(float64):
-    before, history, analysis = (torch.randn(*shape, requires_grad=True) for shape in ((2, 5), (2, 2, 2), (2, 9)))
-
-    def moved(before, history, analysis):
-        td = TensorDict({"belief": {"ensemble": before, "history": history}, "analysis": {"ensemble": analysis}})
-        td = UnicycleMotion(0.1, history_key=("belief", "history"))(td.set("steps", torch.tensor([3])))
-        return td["belief", "ensemble"]
-
-    assert torch.autograd.gradcheck(moved, (before, history, analysis))
-
-
 def test_a_smoothed_path_is_that_of_a_kalman_filter_of_velocity_and_way(float64):
     """Its way is corrected by all innovations since; so is the filter's path, if the history is as long as the drive.
 
@@ -234,32 +192,6 @@ def test_a_smoothed_path_is_that_of_a_kalman_filter_of_velocity_and_way(float64)
     torch.testing.assert_close(way.var(), cov[1, 1], rtol=4 * (2 / size) ** 0.5, atol=0)
     assert float(mean[1] - found[False][:, 0].mean()) > 20 * error  # 0.13 m of 14.5 m
     torch.testing.assert_close(found[True][:, 3:], found[False][:, 3:], rtol=0, atol=1e-12)  # velocities are the same
-
-
-def test_smoothing_needs_a_history():
-    with pytest.raises(ValueError, match="pass its history_key"):
-        UnicycleMotion(DT, smooth=True)
-
-
-def test_a_curve_is_what_the_sensor_makes_of_the_whole_way(float64):
-    forecast, history = torch.tensor([[0.0, 0.0, 0.0, 10.0, 0.1]]), torch.tensor([[[9.0, 0.2]]])
-    td = TensorDict({"forecast": {"ensemble": forecast}, "belief": {"history": history}, "steps": [2]})
-    out = PairObservation([20.0, torch.inf], curve=lambda way: way**2)(td)["forecast"]
-    torch.testing.assert_close(out["observation"], torch.tensor([[19.0**2, 0.3**2]]))
-    assert out["observed"]  # it is the way, not what is read, that must be within reach
-
-
-def test_history_needs_a_lag():
-    with pytest.raises(ValueError, match="at least 1; got 0"):
-        with_history(AroundState([1.0] * 5), 0)
-
-
-def test_a_history_begins_with_the_present(float64):
-    start = with_history(AroundState([1.0] * 5, ensemble_size=7), 2)
-    out = start(TensorDict({"state": torch.zeros(3, 5)}, [3]))["belief"]
-    assert isinstance(start, SubModel)
-    for lag in range(2):
-        assert out["history"][:, :, lag].equal(out["ensemble"][..., 3:])
 
 
 def test_velocities_go_on_changing_by_a_share_of_their_last_change(float64):

@@ -16,7 +16,6 @@ from torch_denkf.applications.car.odometry.paths import read_path
 from torch_denkf.applications.car.vision.epipolar import two_view_motion
 from torch_denkf.applications.car.vision.motion import image_motion
 from torch_denkf.cli.main import main
-from torch_denkf.envs import OccludingBox
 from torch_denkf.pretrained import from_pretrained
 
 
@@ -84,22 +83,6 @@ def test_readings_are_velocities(checkpoint, drive):
         whole = car.sensor(TensorDict(frame))["sensor", "ensemble"].mean(0)
     spread = torch.stack([belief.reading for belief in plain[1:]]).std(0)
     assert ((gap[6].reading - whole / 2).abs() < spread + 0.5).all()
-
-
-def test_kinds_of_failures():
-    frames = [np.full((10, 30, 3), 50 + n, np.uint8) for n in range(4)]
-    failures = [CameraFailure("missing", 1, 1), CameraFailure("black", 2, 2), CameraFailure("box", 2, 3)]
-    first, missing, black, covered = fail_frames(frames, failures)
-    assert np.array_equal(first, frames[0])
-    assert missing is None
-    assert not black.any()
-    picture = torch.from_numpy(frames[3]).permute(2, 0, 1)
-    expected = OccludingBox()(TensorDict({"pixels": picture.clone()}))["pixels"].permute(1, 2, 0).numpy()
-    assert np.array_equal(covered, expected)
-    assert frames[3].min() == 53, "the caller's image stays"
-    assert [failure.announced for failure in failures] == [True, False, False]
-    with pytest.raises(ValueError, match="'missing', 'black' and 'box'"):
-        next(fail_frames(frames, [CameraFailure("rain", 0, 1)]))
 
 
 def test_dead_reckoning_integrates_what_was_read(checkpoint, drive):

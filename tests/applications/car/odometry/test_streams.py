@@ -58,11 +58,6 @@ def test_windows_are_faster_or_slower_worlds_that_agree_with_their_readings():
     assert windows["is_init"].sum() == 200
 
 
-def test_windows_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match=r"windows of 50 steps do not fit in drives of 5 frames"):
-        ReadingSampler([readings([[0.0, 0.0]] * 5)], [1.0], 50, 0.0)
-
-
 def test_a_mirrored_drive_goes_the_mirrored_way():
     rng = torch.Generator().manual_seed(0)
     velocity = torch.rand(30, 2, generator=rng, dtype=torch.float64) + torch.tensor([5.0, -0.5])

@@ -1,23 +1,15 @@
 """A training leaves a filter that predicts better than before; a broken one goes on to the same weights."""
 
-import json
 import shutil
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from tests.applications.car.odometry.conftest import OPTIONS
-from torch_denkf.applications.car.odometry.batches import ReadingSampler
-from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
 from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter, markdown_table, write_rows
-from torch_denkf.applications.car.odometry.filter import CarSettings, car_filter
 from torch_denkf.applications.car.odometry.roles import assign_roles
-from torch_denkf.applications.car.odometry.scores import calibrate
-from torch_denkf.applications.car.odometry.streams import Drive, all_frames, lose_frames, read_spans, take_spans
-from torch_denkf.applications.car.odometry.training import Updates, train_car_filter
-from torch_denkf.deployment.folder import described
-from torch_denkf.pretrained import from_pretrained
+from torch_denkf.applications.car.odometry.streams import Drive, all_frames, read_spans
+from torch_denkf.applications.car.odometry.training import train_car_filter
 from torch_denkf.training import FilterTrainer
 
 
@@ -28,40 +20,6 @@ def test_roles_are_disjoint_and_cover_all_drives():
         assert sorted(name for part in roles.values() for name in part) == names
     assert [len(part) for part in assign_roles([str(n) for n in range(20)]).values()] == [2, 5, 13]
     assert assign_roles(["a"]) == {"validation": [], "filter": ["a"], "sensor": []}
-
-
-def test_the_record_says_how_it_was_trained(trained):
-    config = json.loads((trained[0] / "config.json").read_text())
-    training = config["training"]
-    assert training["seed"] == 3
-    assert training["command"] == "denkf train"
-    assert training["updates"] == {"sensor": 6, "filter": 4, "end_to_end": 3, "length": 6}
-    assert [part[0].split("/")[1] for part in training["roles"].values()] == ["a", "b", "c"]
-    assert config["settings"]["dt"] == 0.103
-    assert config["settings"]["size"] == [25, 75]
-    assert config["settings"]["focal"] == pytest.approx(0.579 * 75, rel=0.01)
-    assert training["validation_crps"] > 0
-    states = Drive(trained[0], "c", (25, 75), True)
-    assert states.disturbed()[0] == states
-    assert sum(each.weight for each in states.disturbed()) == pytest.approx(1.5)
-
-
-@pytest.mark.parametrize(("apart", "best"), [({1.0: 1.0, 1.05: 3.0}, 1.0), ({1.0: 3.0, 1.05: 1.0}, 1.05)])
-def test_the_inflation_is_chosen_by_the_path_too(monkeypatch, apart, best):
-    """A spread that suits the velocities less is taken where the path is so much nearer to the truth."""
-    car = car_filter(ensemble_size=4)
-    car.inflation = 1.2
-
-    def run(filtered, _):
-        out = TensorDict({"state": torch.zeros(1, 5, 5), "belief": {"mean": torch.zeros(1, 5, 5)}}, [1, 5])
-        out["belief", "mean"][..., 0] = apart.get(filtered.inflation, 9.0)
-        # The CRPS of a Gaussian whose mean is right grows with its standard deviation.
-        out["belief", "var"] = torch.full((1, 5, 5), filtered.inflation**2)
-        return [out]
-
-    monkeypatch.setattr("torch_denkf.applications.car.odometry.scores._all", run)
-    assert calibrate(car, []) == best
-    assert car.inflation == 1.2  # as it was
 
 
 class Killed(Exception):
@@ -91,26 +49,6 @@ def test_a_killed_training_goes_on_to_the_same_weights(stage, root, trained, tmp
     for name, value in trained[1].state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
     assert resumed.inflation == trained[1].inflation
-
-
-def test_mistakes_say_what_to_do(root, trained, tmp_path):
-    with pytest.raises(
-        ValueError, match=r"2 drives are too few: none is left for \['validation'\]. Pass three or more"
-    ):
-        train_car_filter(tmp_path, root=root, drives=["a", "b"], **OPTIONS)
-    with pytest.raises(FileNotFoundError, match=r"no drives \['z'\] with images and poses below .*it has \['a', 'b'"):
-        train_car_filter(tmp_path, root=root, drives=["z"], **OPTIONS)
-    with pytest.raises(ValueError, match=r"last\.pt is of another training: seed \(3, now 4\)"):
-        train_car_filter(trained[0], root=root, **{**OPTIONS, "seed": 4})
-    with pytest.raises(ValueError, match="filter of Updates must be a whole number, at least 1; got 0"):
-        Updates(filter=0)
-    with pytest.raises(ValueError, match=r"dt must be finite and above 0; got 0.0"):
-        car_filter(dt=0.0)
-    with pytest.raises(ValueError, match=r"longest is 1 to lags \+ 1 = 3"):
-        CarSettings(lags=2, longest=4)
-    readings = [TensorDict({"state": torch.zeros(16, 5)}, [16])]
-    with pytest.raises(ValueError, match="windows of 40 steps do not fit in drives of 16 frames"):
-        ReadingSampler(readings, [1.0], 40, 0.0)
 
 
 def test_evaluation_beside_the_floor(trained, root, tmp_path):
@@ -147,66 +85,3 @@ def test_evaluation_beside_the_floor(trained, root, tmp_path):
     assert missing[0]["blind"] > 0.3
     with pytest.raises(ValueError, match=r"missing is in \[0, 1\)"):
         evaluate_car_filter(car, root, ["b"], missing=1.0)
-
-
-def test_readings_over_gaps_are_those_of_pairs(trained, root):
-    """take_spans picks, for each frame, the reading of as many steps as are missing before it."""
-    data = [each.read() for each in Drive(root, "b", (25, 75), trained[0] / "cache", two_view=True).spans(3)]
-    spans = read_spans(trained[1].sensor, data, 3)
-    steps = torch.tensor([0, 1, 0, 2, 3, 1, 5, *[1] * 9])
-    taken = take_spans(spans, steps)
-    assert taken["observed"].flatten().tolist() == [False, True, False, True, True, True, False, *[True] * 9]
-    assert torch.equal(taken["sensor", "ensemble"][4], spans["spans", "ensemble"][4, 2])
-    assert taken["steps"].flatten().tolist()[3:7] == [2, 3, 1, 0]
-    lost = lose_frames(spans, seed=0, share=0.5)
-    assert (lost["sensor"] == lose_frames(spans, seed=0, share=0.5)["sensor"]).all()
-
-
-def test_saved_and_loaded_filters_believe_the_same(trained, checkpoint, root):
-    loaded = from_pretrained(checkpoint)
-    assert loaded.settings == from_pretrained(trained[0]).settings
-    assert loaded.inflation == trained[1].inflation
-    options = {"cache": trained[0] / "cache", "draws": 1, "window": 10, "progress": False}
-    mine, theirs = (evaluate_car_filter(car, root, ["c"], **options)[1]["c"] for car in (trained[1], loaded))
-    for key in ("mean", "var", "ensemble"):
-        assert torch.equal(mine["belief", key], theirs["belief", key])
-
-
-def test_damaged_folders_are_named(checkpoint, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no filter in .*nowhere: it has no config\.json"):
-        load_car_filter(tmp_path / "nowhere")
-    config, weights = checkpoint / "config.json", checkpoint / "weights.safetensors"
-    good, bytes_ = config.read_text(), weights.read_bytes()
-
-    def change(**settings):
-        content = json.loads(good)
-        content["settings"] |= settings
-        config.write_text(described(content))
-
-    change(ensemble_size=16)
-    with pytest.raises(ValueError, match=r"weights\.safetensors does not fit config\.json"):
-        load_car_filter(checkpoint)
-    change(colour="red")
-    with pytest.raises(ValueError, match=r"does not make a filter: colour is no setting of a car filter"):
-        load_car_filter(checkpoint)
-    change(dt="soon")
-    with pytest.raises(ValueError, match=r"config\.json does not make a filter"):
-        load_car_filter(checkpoint)
-    config.write_text("{")
-    with pytest.raises(ValueError, match="is not JSON"):
-        load_car_filter(checkpoint)
-    config.write_text('{"format": "other"}')
-    with pytest.raises(ValueError, match="does not describe a filter"):
-        load_car_filter(checkpoint)
-    config.write_text(good)
-    weights.write_bytes(bytes_[:-100])
-    with pytest.raises(ValueError, match=r"weights\.safetensors is damaged, or not the file that config\.json"):
-        load_car_filter(checkpoint)
-    content = json.loads(good)
-    config.write_text(json.dumps({**content, "builder": "reacher"}))
-    with pytest.raises(ValueError, match="is of a filter that 'reacher' builds; expected 'car'"):
-        load_car_filter(checkpoint)
-    config.write_text(good)
-    weights.unlink()
-    with pytest.raises(FileNotFoundError, match="no weights"):
-        load_car_filter(checkpoint)

@@ -6,7 +6,6 @@ import pytest
 
 from tests.applications.car.vision.plane_for_tests import pair
 from torch_denkf.applications.car.vision.epipolar import fit_two_view, track_corners, two_view_motion
-from torch_denkf.applications.car.vision.exposure import same_exposure
 
 CALIBRATION = (240.0, 240.0, 207.0, 62.0)
 
@@ -57,12 +56,6 @@ def test_standard_deviations_are_those_of_many_draws():
         assert told == pytest.approx(found, rel=0.35)
 
 
-@pytest.mark.parametrize("shapes", [((14, 2), (14, 2)), ((20, 2), (19, 2)), ((20, 3), (20, 3))])
-def test_too_few_points_are_refused(shapes):
-    with pytest.raises(ValueError, match="two views need"):
-        fit_two_view(*map(np.zeros, shapes))
-
-
 def texture(rows=125, columns=414):
     image = np.random.default_rng(0).integers(0, 255, (rows, columns + 20)).astype(np.uint8)
     return cv2.normalize(cv2.GaussianBlur(image, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX)
@@ -98,18 +91,6 @@ def test_images_of_a_turn_give_the_turn(disturb):
     assert motion[-1] > 0.5
 
 
-def test_a_black_frame_tells_nothing():
-    assert not two_view_motion(texture()[:, :414], np.zeros((125, 414), np.uint8), CALIBRATION).any()
-
-
-def test_one_exposure_leaves_neighbouring_frames_alone_if_told_so():
-    image = texture()
-    brighter = cv2.convertScaleAbs(image, alpha=1.03, beta=2)
-    assert same_exposure(image, brighter, tolerance=True)[0] is image
-    matched = same_exposure(image, brighter)[0]
-    assert abs(matched.astype(int) - brighter).mean() < 1.0
-
-
 def test_what_hides_the_scene_gives_no_corners():
     """A box that stands still fills most of a turning view: its corners do not turn."""
     image = texture()[:, :414]
@@ -124,14 +105,6 @@ def test_what_hides_the_scene_gives_no_corners():
     before, _ = track_corners(image, other, hidden)
     assert len(before) > 20
     assert not hidden[before[:, 1].round().astype(int), before[:, 0].round().astype(int)].any()
-
-
-def test_a_hidden_part_of_an_enlarged_image_is_the_same_part():
-    small = cv2.resize(texture()[:, :414], None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-    calibration = np.array(CALIBRATION) / 4
-    nothing = np.ones(small.shape, bool)
-    assert not two_view_motion(small, small, calibration, hidden=nothing).any()
-    assert two_view_motion(small, small, calibration, hidden=~nothing)[-1] > 0.5
 
 
 @pytest.mark.parametrize("doubled", [1, 2])

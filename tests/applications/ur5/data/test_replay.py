@@ -2,22 +2,15 @@
 
 from functools import partial
 
-import cv2
 import numpy as np
 import pytest
 import torch
-from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
-from torchrl.envs.transforms import ObservationNorm
 
-from tests.applications.ur5.data.ur5_demos import LENGTHS, SIZE, make_demo, ten_demos, write_folder
+from tests.applications.ur5.data.ur5_demos import LENGTHS, SIZE, make_demo, ten_demos
 from tests.data import replay_for_tests as shared
 from torch_denkf.applications.ur5 import UR5ExperienceReplay
-from torch_denkf.applications.ur5.data import cache
-from torch_denkf.applications.ur5.data.files import read_demo
-from torch_denkf.applications.ur5.data.rows import is_for_tests
 from torch_denkf.applications.ur5.simulation.names import TASKS
-from torch_denkf.data.cache_entry import CachedTensor
 
 open_dataset = partial(UR5ExperienceReplay, cache=None)
 
@@ -52,44 +45,6 @@ def test_all_rows(root):
     shared.check_indices(data)
 
 
-def test_frames_only(root):
-    data = open_dataset(root, split="all", frames_only=True, batch_size=5, sampler=SamplerWithoutReplacement())
-    everything = open_dataset(root, split="all")[:]
-    expected = everything[everything["observed"].squeeze(-1)]
-    rows = data[:]
-    assert len(rows) == 30
-    for key in ("pixels", "state", "action", "step", "task", "episode", "success", "observed"):
-        assert (rows[key] == expected[key]).all(), key
-    assert rows["is_init"].all()
-    assert rows["next", "done"].all()
-    assert [(e.start, e.length) for e in data.episodes] == [(3 * k, 3) for k in range(10)]
-    seen = torch.cat([batch["index"].flatten() for batch in data])
-    assert sorted(seen.tolist()) == list(range(30))
-
-
-def test_splits_are_by_demo(root, tmp_path):
-    demos = {split: {e.demo for e in open_dataset(root, split=split).episodes} for split in ("train", "test", "all")}
-    assert demos["train"] | demos["test"] == demos["all"] == set(range(10))
-    assert demos["train"]
-    assert demos["test"]
-    assert not demos["train"] & demos["test"]
-    # A fifth of 2,000 is 400; the standard deviation of a binomial draw is 18.
-    tests = [number for number in range(2000) if is_for_tests(number)]
-    assert abs(len(tests) - 400) < 54
-    # These must never move: networks were trained on the others.
-    assert tests[:6] == [9, 12, 15, 19, 26, 31]
-    for task in range(3):
-        assert abs(sum(number % 3 == task for number in tests) - 133) < 40
-    fewer = write_folder(tmp_path, [make_demo(number, 5, size=(6, 8)) for number in (*tests[:3], 1)])
-    assert {e.demo for e in open_dataset(fewer, split="test").episodes} == set(tests[:3])
-
-
-@pytest.mark.parametrize("options", shared.ways_to_slice())
-def test_slices_are_contiguous_and_in_one_demo(root, options):
-    data = open_dataset(root, split="all", **{"batch_size": 24, **options})
-    shared.check_slices(data, options, "step", ("pixels", "state", "action", "observed", "step"))
-
-
 def test_statistics_are_of_the_training_demos_alone(root):
     train = [e.demo for e in open_dataset(root).episodes]
     demos = [make_demo(number, LENGTHS[number]) for number in train]
@@ -100,81 +55,3 @@ def test_statistics_are_of_the_training_demos_alone(root):
         shared.check_statistics(statistics, state=state, action=action, pixels=pixels)
     shape = tuple(statistics["pixels", "std"].shape)
     assert shape == (3, 1, 1)
-
-
-def test_scaled_pixels(root, tmp_path):
-    data = open_dataset(root, split="all", size=(6, 8), frames_only=True)
-    for picture, row in zip(make_demo(0, LENGTHS[0]).pixels, data[:3]["pixels"], strict=True):
-        # By half in each direction, areas are 2 x 2 blocks; OpenCV rounds the quarter sums.
-        blocks = picture.reshape(3, 6, 2, 8, 2).mean((2, 4))
-        np.testing.assert_allclose(row.numpy() * 255, blocks, atol=0.5001)
-    uneven = open_dataset(root, split="all", size=(5, 11), frames_only=True, cache=tmp_path)
-    expected = cv2.resize(make_demo(0, 9).pixels[0].transpose(1, 2, 0), (11, 5), interpolation=cv2.INTER_AREA)
-    assert (uneven[0]["pixels"].numpy() == expected.transpose(2, 0, 1).astype(np.float32) / 255).all()
-    pixels = uneven[:]["pixels"].numpy()[[e.start + k for e in uneven.episodes for k in range(3)]]
-    train = [e.demo for e in open_dataset(root).episodes]
-    of_training = pixels.reshape(10, 3, 3, 5, 11)[train]
-    np.testing.assert_allclose(
-        uneven.statistics["pixels", "std"].flatten(), of_training.std((0, 1, 3, 4), dtype=np.float64), rtol=1e-5
-    )
-
-
-def test_the_cache_is_read_and_follows_the_files(root, tmp_path, monkeypatch):
-    folder, place = tmp_path / "demos", tmp_path / "cache"
-    folder.mkdir()
-    write_folder(folder, [make_demo(number, 8) for number in range(4)])
-    decoded = []
-
-    def count(*args):
-        decoded.append(args)
-        return read_demo(*args)
-
-    monkeypatch.setattr(cache, "read_demo", count)
-    first = UR5ExperienceReplay(folder, split="all", cache=place)
-    assert len(decoded) == 1 + 4  # the first one also tells the size
-    assert isinstance(first._frames["pixels"], CachedTensor)
-    decoded.clear()
-    for split in ("all", "train"):
-        again = UR5ExperienceReplay(folder, split=split, cache=place)
-    assert not decoded
-    assert len(again) == 8 * len(again.episodes)
-    fresh = UR5ExperienceReplay(folder, split="all", cache=None)
-    assert (first[:] == fresh[:]).all()
-    assert (UR5ExperienceReplay(folder, split="all", cache=place)[:] == fresh[:]).all()
-
-    decoded.clear()
-    write_folder(folder, [make_demo(number, 8) for number in range(5)])
-    assert len(UR5ExperienceReplay(folder, split="all", cache=place).episodes) == 5
-    assert decoded
-    entries = sorted(place.iterdir())
-    assert len(entries) == 2
-    for entry in entries:  # damaged from outside: made again
-        (entry / "meta.json").write_text("{")
-    assert (UR5ExperienceReplay(folder, split="all", cache=place)[:32] == fresh[:]).all()
-
-    monkeypatch.setattr(cache, "_rows", lambda *args: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        UR5ExperienceReplay(folder, size=(3, 4), cache=place)
-    assert len(list(place.iterdir())) == 2  # nothing half-made stays
-    monkeypatch.undo()
-    assert len(UR5ExperienceReplay(folder, split="all", size=(3, 4), cache=place)) == 40
-
-
-def test_transforms_and_preprocess(root, tmp_path):
-    scale = ObservationNorm(loc=-1.0, scale=2.0, in_keys=["pixels"])
-    plain, scaled = open_dataset(root, split="all"), open_dataset(root, split="all", transform=scale)
-    torch.testing.assert_close(scaled[:9]["pixels"], 2 * plain[:9]["pixels"] - 1)
-    shared.check_preprocess(plain, tmp_path / "means")
-    shared.check_nothing_is_deleted(plain)
-
-
-def test_demos_without_pictures(tmp_path):
-    write_folder(tmp_path, [make_demo(number, 8, frames=0) for number in range(4)])
-    data = open_dataset(tmp_path, split="all", size=(224, 224))
-    rows = data[:]
-    assert "pixels" not in rows
-    assert not rows["observed"].any()
-    assert list(data.statistics.keys()) == ["state", "action"]
-    assert len(UR5ExperienceReplay(tmp_path, split="all", cache=tmp_path / "cache")) == 32
-    with pytest.raises(ValueError, match="no-pixels"):
-        open_dataset(tmp_path, frames_only=True)

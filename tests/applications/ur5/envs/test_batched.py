@@ -4,14 +4,11 @@ from functools import partial
 
 import pytest
 import torch
-from torchrl.collectors import Collector
-from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
+from torchrl.envs import ParallelEnv, SerialEnv, check_env_specs
 
 from tests.envs.opengl import needs_opengl
 from torch_denkf.applications.ur5 import UR5TableEnv
 from torch_denkf.applications.ur5.envs.expert import UR5Expert
-from torch_denkf.filters import KalmanFilter
-from torch_denkf.transforms import DEnKFTransform
 
 OPTIONS = {"size": (16, 24), "max_steps": 6}
 SEEDS = [{"seed": 3}, {"seed": 4}]
@@ -34,33 +31,3 @@ def test_batched(kind):
         assert (start[0] != start[1]).any()
     finally:
         env.close()
-
-
-def test_collector():
-    needs_opengl()
-    make = partial(UR5TableEnv, "pick", **OPTIONS, seed=3)
-    collector = Collector(make, UR5Expert(), frames_per_batch=9, auto_register_policy_transforms=False)
-    batch = next(iter(collector))
-    collector.shutdown()
-    env = UR5TableEnv("pick", **OPTIONS, seed=3)
-    expected = env.rollout(9, UR5Expert(), break_when_any_done=False)
-    for key in ("pixels", "state", ("next", "pixels"), ("next", "state"), "action"):
-        assert batch[key].equal(expected[key])
-
-
-def test_a_filter_on_the_state():
-    # Readings almost without noise: the filter's mean is the state.
-    one = torch.eye(10)
-    filter_ = KalmanFilter(
-        one,
-        one,
-        process_noise_cov=1e-2 * one,
-        noise_cov=1e-8 * one,
-        mean=torch.zeros(10),
-        cov=one,
-        observation_key="state",
-    )
-    env = TransformedEnv(UR5TableEnv("push", from_pixels=False, max_steps=20, seed=0), DEnKFTransform(filter_))
-    check_env_specs(env)
-    rollout = env.rollout(20, UR5Expert())
-    torch.testing.assert_close(rollout["next", "belief", "mean"], rollout["next", "state"], atol=1e-3, rtol=0)
