@@ -129,3 +129,10 @@ def test_an_episode_that_diverges_does_not_reach_the_one_before(float64):
     for ours, theirs in zip(found, expected, strict=True):
         assert_close(ours[:3], theirs[:3])
     assert found[0][3:5].isnan().any()
+
+
+@pytest.mark.filterwarnings("ignore:The variance")
+def test_in_time_holds_the_ceiling(float64):
+    filter, frames = linear_system(variance_ceiling=0.3), TensorDict({"observation": torch.randn(9, 2)}, [9])
+    expected = filter.sequence(frames.clone())["belief", "cov"]
+    assert_close(filter.compile(mode="in time").sequence(frames.clone())["belief", "cov"], expected)
