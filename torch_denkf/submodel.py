@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from torch_denkf._arguments import Checked
 from torch_denkf._registered import diagnosis
+from torch_denkf.functional.jacobians import is_older
 from torch_denkf.functional.manifolds import Space
 
 __all__ = ["Call", "Entries", "Initial", "Noise", "Sensor", "SubModel", "Transition", "Update", "in_role", "role"]
@@ -26,7 +27,7 @@ R = TypeVar("R", bound="SubModel")
 
 #: The methods that decide what a sub-model computes, and those that know its Jacobian.
 _COMPUTES = frozenset({"compute", "on_entries", "forward", "observe", "move", "features", "_run"})
-_JACOBIANS = ("jacobian", "linearised", "gradient", "move_and_gradient")
+_JACOBIANS = frozenset({"jacobian", "linearised", "gradient", "move_and_gradient"})
 
 #: Tensors by unravelled key: what a step of a filter works on.
 Entries: TypeAlias = dict[NestedKey, Tensor]
@@ -114,7 +115,7 @@ class SubModel(Checked, TensorDictModule):
         super().__init_subclass__(**kwargs)
         # tensordict wraps every __init__ and so must come first; what compute asks for is looked up once a class.
         cls._wants = frozenset({"noise", "batch_size"} & inspect.signature(cls.compute).parameters.keys())
-        if vars(cls).keys().isdisjoint(_JACOBIANS) and not _COMPUTES.isdisjoint(vars(cls)):
+        if is_older(cls, _JACOBIANS, _COMPUTES):
             # What is inherited is that of another function.
             cls.jacobian, cls.linearised = SubModel.jacobian, SubModel.linearised  # type: ignore[method-assign]
 

@@ -9,7 +9,10 @@ from tests.filters.factories import toy_denkf, toy_frames
 from torch_denkf.compilation.in_time import prefixes, rts_in_time
 from torch_denkf.filters import KalmanFilter
 from torch_denkf.functional.smoothing.rts import rts_smooth
+from torch_denkf.modules import KalmanAnalysis, LinearTransition
+from torch_denkf.modules.around import Wrapper
 from torch_denkf.smoothers import RTSSmoother
+from torch_denkf.submodel import Transition
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 8, 33])
@@ -93,6 +96,29 @@ def test_in_time_is_for_constant_matrices():
         linear_system().compile(mode="in time", dynamic=True)
 
 
+@pytest.mark.parametrize("kind", ["transition", "wrapper", "analysis"])
+def test_in_time_takes_no_module_that_changes_what_the_matrices_say(kind):
+    filter = linear_system()
+
+    class Drift(LinearTransition):
+        pass
+
+    class Wind(Wrapper, Transition):
+        pass
+
+    class Own(KalmanAnalysis):
+        pass
+
+    made = {
+        "transition": lambda: Drift(torch.eye(3), torch.eye(3)),
+        "wrapper": lambda: Wind(filter["transition"]),
+        "analysis": lambda: Own(torch.eye(2, 3), torch.ones(2)),
+    }[kind]()
+    other = filter.with_modules({"analysis" if kind == "analysis" else "transition": made})
+    with pytest.raises(TypeError, match=type(made).__name__):
+        other.compile(mode="in time").sequence(TensorDict({"observation": torch.zeros(3, 2)}, [3]))
+
+
 def test_an_episode_that_diverges_does_not_reach_the_one_before(float64):
     mean, *others = values(count=6)
     follows = torch.ones(6, dtype=torch.bool)
@@ -103,3 +129,10 @@ def test_an_episode_that_diverges_does_not_reach_the_one_before(float64):
     for ours, theirs in zip(found, expected, strict=True):
         assert_close(ours[:3], theirs[:3])
     assert found[0][3:5].isnan().any()
+
+
+@pytest.mark.filterwarnings("ignore:The variance")
+def test_in_time_holds_the_ceiling(float64):
+    filter, frames = linear_system(variance_ceiling=0.3), TensorDict({"observation": torch.randn(9, 2)}, [9])
+    expected = filter.sequence(frames.clone())["belief", "cov"]
+    assert_close(filter.compile(mode="in time").sequence(frames.clone())["belief", "cov"], expected)

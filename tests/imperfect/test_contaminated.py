@@ -259,6 +259,15 @@ def test_shares_of_zero_and_of_one(name, dtype):
     assert (all_of_them["info", "outlier"] == 1).all()
 
 
+@pytest.mark.parametrize("noise", [torch.tensor([0.5]), None])
+def test_a_kalman_analysis_keeps_its_inflation(noise):
+    """Oracle: the analysis alone, of which a share of 0 is nothing else."""
+    plain = KalmanAnalysis(torch.eye(1), noise, inflation=1.5)
+    values = {"forecast": {"mean": torch.zeros(1), "cov": torch.eye(1)}, "observation": torch.ones(1)}
+    td = TensorDict({**values, "sensor": {"noise": torch.tensor([0.5])}})
+    assert_close(Contaminated(plain, 0.0)(td.copy())["belief", "cov"], plain(td.copy())["belief", "cov"])
+
+
 @pytest.mark.parametrize("name", [*SEVERAL, "particles"])
 def test_masks_are_heeded(name):
     """Nothing observed is the forecast bit for bit; one component is a reading of one; NaN spoils no gradient."""

@@ -165,6 +165,16 @@ def test_chains_of_layers(float64, name):
     assert_close(ours, theirs, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_chains_keep_their_precision(name, dtype):
+    network = nn.Sequential(nn.Linear(2, 3), ACTIVATIONS[name](), nn.Linear(3, 2)).to(dtype)
+    x = torch.tensor([[-1.0, 0.5], [2.0, -0.3]], dtype=dtype)
+    jacobian = jacobian_of_network(network, x, 2)[1]
+    tolerance = 4 * torch.finfo(dtype).eps
+    assert_close(jacobian, torch.func.vmap(torch.func.jacrev(network))(x), rtol=tolerance, atol=tolerance)
+
+
 def test_what_a_chain_does_not_know_is_differentiated():
     x = torch.zeros(1, 3)
     others = [nn.LayerNorm(3), nn.Sequential(nn.Linear(3, 3), nn.GELU("tanh")), lambda x: x, nn.ReLU6()]
@@ -172,11 +182,21 @@ def test_what_a_chain_does_not_know_is_differentiated():
     hooked, outer = nn.Linear(3, 3), nn.Sequential(nn.Linear(3, 3))
     for layer in (hooked, outer):
         layer.register_forward_hook(lambda module, read, out: 2 * out)
-    for network in (*others, weighted, hooked, outer, nn.Sequential(hooked)):
+    still, watched, own = nn.Identity(), nn.Linear(3, 3), nn.Linear(3, 3)
+    still.register_forward_hook(lambda module, read, out: 2 * out)
+    watched.register_full_backward_hook(lambda module, read, out: None)
+    own.forward = lambda x: 2 * x
+
+    class Twice(StochasticMLP):
+        def forward(self, x, *args, **options):
+            return 2 * super().forward(x, *args, **options)
+
+    twice = Twice(3, 3, (4,), layer="none")
+    for network in (*others, weighted, hooked, outer, nn.Sequential(hooked), still, watched, own, twice):
         assert jacobian_of_network(network, x, 3) is None
 
 
-@pytest.mark.parametrize("kind", ["compute", "hook", "wrapper"])
+@pytest.mark.parametrize("kind", ["compute", "hook", "wrapper", "mixin"])
 def test_who_changes_what_a_sub_model_computes_changes_its_jacobian(float64, kind):
     """Oracle: the factor."""
 
@@ -184,7 +204,14 @@ def test_who_changes_what_a_sub_model_computes_changes_its_jacobian(float64, kin
         def observe(self, state):
             return 2 * super().observe(state)
 
-    observation = Doubled([0]) if kind == "compute" else Select([0])
+    class Twofold:
+        def compute(self, ensemble):
+            return 2 * super().compute(ensemble)
+
+    class Mixed(Twofold, Select):
+        pass
+
+    observation = {"compute": Doubled, "mixin": Mixed}.get(kind, Select)([0])
     if kind == "hook":
         observation.register_forward_hook(
             lambda module, read, out: out.set(("forecast", "observation"), 2 * out["forecast", "observation"])

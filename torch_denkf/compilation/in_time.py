@@ -22,9 +22,9 @@ from torch_denkf.filters.structure import FROM_STORED
 from torch_denkf.functional.gaussian import hide, kalman_update, solve_for_gain
 from torch_denkf.functional.linalg import as_covariance
 from torch_denkf.functional.smoothing.rts import smoothing_gain
-from torch_denkf.modules.around import Wrapper
 from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition
 from torch_denkf.modules.variance_ceiling import VarianceCeiling
+from torch_denkf.smoothers.past_moments import CrossTransition
 from torch_denkf.submodel import Call, Entries
 
 if TYPE_CHECKING:
@@ -148,10 +148,11 @@ class InTime:
         """
         steps = filter.steps if steps is None else steps
         transition, updates = steps.structure.transition[1], [module for _, module in steps.structure.update]
-        motion = transition.module if isinstance(transition, Wrapper) else transition
+        # No subclass and no other wrapper: what they change is not in the matrices.
+        motion = transition.module if type(transition) is CrossTransition else transition
         (update,) = updates if len(updates) == 1 else (None,)
-        linear = isinstance(motion, LinearTransition) and isinstance(motion.noise, Tensor)
-        linear = linear and isinstance(update, KalmanAnalysis) and update.noise is not None
+        linear = type(motion) is LinearTransition and isinstance(motion.noise, Tensor)
+        linear = linear and type(update) is KalmanAnalysis and update.noise is not None
         if not linear or update.reading_space is not None or update.inflation != 1:
             raise TypeError(
                 f'mode="in time" is for a KalmanFilter of plain numbers and constant matrices; {type(filter).__name__} '

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ __all__ = ["jacobian_of_layers", "jacobian_of_network"]
 #: Derivatives of activations, from the layer, what it read and what it wrote.
 _SLOPES: dict[type, Callable[..., Tensor]] = {
     nn.ReLU: lambda layer, x, y: x > 0,
-    nn.LeakyReLU: lambda layer, x, y: torch.where(x > 0, 1.0, layer.negative_slope),
+    nn.LeakyReLU: lambda layer, x, y: torch.where(x > 0, 1.0, torch.full_like(x, layer.negative_slope)),
     nn.ELU: lambda layer, x, y: torch.where(x > 0, 1.0, y + layer.alpha),
     nn.Tanh: lambda layer, x, y: 1 - y * y,
     nn.Sigmoid: lambda layer, x, y: y * (1 - y),
@@ -27,7 +27,8 @@ _SLOPES: dict[type, Callable[..., Tensor]] = {
 def jacobian_of_network(network: nn.Module, x: Tensor, size: int) -> tuple[Tensor, Tensor] | None:
     """Returns what a network makes of ``x``, and the Jacobian by its first numbers, where that is a product.
 
-    Both can be differentiated. A network that has a method of its own, ``jacobian(x, size)``, is asked.
+    Both can be differentiated. A network that has a method of its own, ``jacobian(x, size)``, is asked, unless a
+    subclass has a new ``forward`` and no new Jacobian.
 
     Args:
         network: linear layers and activations, one after the other in ``nn.Sequential``.
@@ -46,7 +47,7 @@ def jacobian_of_network(network: nn.Module, x: Tensor, size: int) -> tuple[Tenso
     """
     own = getattr(network, "jacobian", None)
     if own is not None:
-        return None if _hooked(network) else own(x, size)
+        return None if _hooked(network) or is_older(type(network), {"jacobian"}, {"forward"}) else own(x, size)
     return jacobian_of_layers(list(_flat(network)), x, size)
 
 
@@ -69,6 +70,14 @@ def jacobian_of_layers(
     return x, (_identity(x)[:size] if rows is None else rows).mT
 
 
+def is_older(kind: type, names: Set[str], others: Set[str]) -> bool:
+    """Tells whether a class takes ``names`` from further up among its bases than ``others``, or has none of them."""
+    first = (
+        next((n for n, base in enumerate(kind.__mro__) if each & vars(base).keys()), 99) for each in (names, others)
+    )
+    return next(first) > next(first)
+
+
 def _identity(x: Tensor) -> Tensor:
     return torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
 
@@ -78,9 +87,11 @@ def _flat(network: nn.Module) -> Iterator[nn.Module]:
     if type(network) is nn.Sequential and not _hooked(network):
         for layer in network:
             yield from _flat(layer)
-    elif type(network) is not nn.Identity:
+    elif type(network) is not nn.Identity or _hooked(network):
         yield network
 
 
 def _hooked(layer: nn.Module) -> bool:
-    return bool(layer._forward_hooks or layer._forward_pre_hooks)
+    """Tells whether a call does more than the class's forward."""
+    hooks = layer._forward_hooks or layer._forward_pre_hooks or layer._backward_hooks or layer._backward_pre_hooks
+    return bool(hooks) or "forward" in vars(layer)
