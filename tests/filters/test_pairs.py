@@ -334,4 +334,3 @@ def test_the_oracle_answers_to_each_feature():
     for feature in ("gate", "late reading", "black picture", "learned weights", "inflation", "reject"):
         other = oracle((feature,), frames_for((feature,)))
         assert np.abs(other["mean"] - plain["mean"]).max() + np.abs(other["var"] - plain["var"]).max() > 1e-3, feature
-    assert {*FEATURES} == {feature for traced in TRACED for feature in traced}

@@ -106,7 +106,7 @@ def test_another_model_is_refused(tmp_path):
         return FilterTrainer(net, [Stage("fit", None, None, 1)], out=tmp_path, device="cpu")
 
     state = {"settings": trainer(1)._settings, "stage": 1, "update": 0, "logs": {}, "best": None, "hooks": {}}
-    state |= {"updates": None, "results": {}, "last_metrics": {}, "model": trainer(1).model.state_dict()}
+    state |= {"updates": None, "results": {}, "last_metrics": {}, "first": None, "model": trainer(1).model.state_dict()}
     write_checkpoint(tmp_path / "last.pt", state)
     with pytest.raises(ValueError, match=r"(?s)last\.pt does not fit the model.*size mismatch for weight"):
         trainer(2).fit()

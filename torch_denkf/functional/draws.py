@@ -59,7 +59,9 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
     if uncorrelated and room:
         away, *others = map(_anomalies, uncorrelated)
         if away.shape[-1] > room:
-            away = _leading(away, room)
+            # Columns that lean towards what the anomalies vary most in, whatever their units.
+            square = away.square().sum(-2, keepdim=True)
+            away = (away @ (away / torch.where(square > 0, square, 1)).mT)[..., :room]
         for more in others:
             away = torch.cat([away, more], -1) if away.shape[-1] + more.shape[-1] <= room else away
         away = away.to(draws.dtype)
@@ -73,10 +75,3 @@ def _anomalies(members: Tensor) -> Tensor:
     away = members - members.mean(-2, keepdim=True)
     scale = away.detach().abs().amax(-2, keepdim=True)
     return away * torch.where(scale > torch.finfo(away.dtype).tiny, 1 / scale, 0)
-
-
-def _leading(away: Tensor, count: int) -> Tensor:
-    """Returns columns ``[*B, E, count]`` that lean towards what the anomalies vary most in, whatever their units."""
-    square = away.square().sum(-2, keepdim=True)
-    gram = away @ (away / torch.where(square > 0, square, 1)).mT
-    return gram[..., :count]

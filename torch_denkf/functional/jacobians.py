@@ -52,34 +52,27 @@ def jacobian_of_network(network: nn.Module, x: Tensor, size: int) -> tuple[Tenso
 
 
 def jacobian_of_layers(
-    layers: Sequence[nn.Module], x: Tensor, size: int, linear: tuple[type, ...] = (nn.Linear,)
+    layers: Sequence[Any], x: Tensor, size: int, linear: tuple[type, ...] = (nn.Linear,)
 ) -> tuple[Tensor, Tensor] | None:
     """Does what :func:`jacobian_of_network` does for layers in their order; those of types ``linear`` are W x + b."""
     if any(not (type(layer) in linear or type(layer) in _SLOPES) or _hooked(layer) for layer in layers):
         return None
-    layer: Any
+    identity = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)[:size]
     rows: Tensor | None = None  # the Jacobian's transpose, [*, S, H]
     for layer in layers:
         if type(layer) in linear:
             rows = layer.weight[:, :size].mT if rows is None else rows @ layer.weight.mT
             x = F.linear(x, layer.weight, layer.bias)
             continue
-        read, rows = x, _identity(x)[:size] if rows is None else rows
+        read, rows = x, identity if rows is None else rows
         x = layer(read.clone() if getattr(layer, "inplace", False) else read)
         rows = rows * _SLOPES[type(layer)](layer, read, x).unsqueeze(-2)
-    return x, (_identity(x)[:size] if rows is None else rows).mT
+    return x, (identity if rows is None else rows).mT
 
 
 def is_older(kind: type, names: Set[str], others: Set[str]) -> bool:
     """Tells whether a class takes ``names`` from further up among its bases than ``others``, or has none of them."""
-    first = (
-        next((n for n, base in enumerate(kind.__mro__) if each & vars(base).keys()), 99) for each in (names, others)
-    )
-    return next(first) > next(first)
-
-
-def _identity(x: Tensor) -> Tensor:
-    return torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+    return next((not vars(base).keys() & names for base in kind.__mro__ if vars(base).keys() & (names | others)), False)
 
 
 def _flat(network: nn.Module) -> Iterator[nn.Module]:

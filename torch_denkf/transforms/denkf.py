@@ -260,7 +260,8 @@ class DEnKFTransform(Checked, Transform):
                 )
         row.update(probe)
         # The shapes come from a trial; it must not use up random numbers.
-        with torch.no_grad(), torch.random.fork_rng(devices=_cuda_devices(row)), set_recurrent_mode(False):
+        cuda = [row.device] if row.device is not None and row.device.type == "cuda" else []
+        with torch.no_grad(), torch.random.fork_rng(devices=cuda), set_recurrent_mode(False):
             written = self._trial(self.filter.initialise(row))
             told = {self.filter.outer(key): written[key] for key in keys}
             if spec is observation_spec and self.ahead is not None:
@@ -335,8 +336,3 @@ class DEnKFTransform(Checked, Transform):
         with self._grad_mode(), set_recurrent_mode(True):
             out = self.filter(tensordict)
             return out if self.ahead is None else self.ahead(out)
-
-
-def _cuda_devices(tensordict: TensorDictBase) -> list[torch.device]:
-    device = tensordict.device
-    return [device] if device is not None and device.type == "cuda" else []

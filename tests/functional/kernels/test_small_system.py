@@ -7,6 +7,7 @@ from torch_denkf.functional.kernels.small_system import (
     LARGEST,
     LARGEST_FACTOR,
     WrittenOut,
+    made_once,
 )
 from torch_denkf.functional.linalg import cholesky
 
@@ -68,3 +69,11 @@ def test_a_matrix_without_a_factor_is_nan_and_alone(float64, place):
     assert torch.equal(factor[0], torch.eye(3))
     assert factor[1].isnan().all()
     torch.testing.assert_close(factor, cholesky(matrix), equal_nan=True)
+
+
+def test_a_constant_that_is_made_under_a_transform_is_no_part_of_it():
+    made = torch.func.jacfwd(lambda x: x * made_once(("test", "jacfwd"), lambda: torch.tensor([2.0, 3.0])))
+    torch.testing.assert_close(made(torch.ones(2)), torch.diag(torch.tensor([2.0, 3.0])))
+    kept = made_once(("test", "jacfwd"), lambda: torch.zeros(2))
+    assert not torch._C._functorch.is_functorch_wrapped_tensor(kept)
+    torch.testing.assert_close(kept, torch.tensor([2.0, 3.0]))

@@ -79,7 +79,7 @@ def _opened(file: Path) -> Iterator[Any]:
         with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
     except (AnyReaderError, OSError) as error:
-        raise ValueError(f"{file} is no complete bag ({error}); copy it anew, or pass its folder") from error
+        raise ValueError(f"{file} is no complete bag ({error}); copy it again, or pass its folder") from error
 
 
 def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:

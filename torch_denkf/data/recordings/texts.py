@@ -56,7 +56,7 @@ def read_cells(file: Path, columns: Sequence[str] | None = None) -> Cells:
     try:
         lines = file.read_text("utf-8-sig").splitlines(keepends=True)
     except UnicodeDecodeError as error:
-        raise ValueError(f"{file} is no text in UTF-8 ({error}); store it anew as CSV in UTF-8") from error
+        raise ValueError(f"{file} is no text in UTF-8 ({error}); store it again as CSV in UTF-8") from error
     said = [line.lstrip().startswith(_COMMENTS) for line in lines]
     texts = ["\n" if comment else line for line, comment in zip(lines, said, strict=True)]
     first = next((place for place, text in enumerate(texts) if text.strip(", ;\t\r\n")), len(texts))
@@ -114,7 +114,7 @@ def _split(file: Path, lines: Sequence[str], mark: str) -> tuple[list[list[str]]
                 rows.append([_pointed(cell) for cell in row] if mark == ";" else row)
                 ends.append(reader.line_num)
     except csv.Error as error:
-        raise ValueError(f"{file}:{reader.line_num}: {error}; store it anew as CSV") from error
+        raise ValueError(f"{file}:{reader.line_num}: {error}; store it again as CSV") from error
     return rows, ends
 
 

@@ -35,8 +35,11 @@ def made_once(key: Hashable, make: Callable[[], Tensor]) -> Tensor:
     """
     if key in _MADE:
         return _MADE[key]
-    made = make()
-    if type(made) is Tensor and not torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+    if torch.compiler.is_compiling() or torch.compiler.is_exporting():
+        return make()
+    with torch._C._DisableFuncTorch():  # torch.func would wrap it, for this call alone
+        made = make()
+    if type(made) is Tensor:
         _MADE[key] = made
     return made
 
