@@ -98,7 +98,7 @@ class Equations:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "equations.so"
             source = Path(__file__).parent / "equations.c"
-            options = ["-O3", "-march=native", "-ffast-math", "-shared", "-fPIC", "-lm"]
+            options = ["-O3", "-march=native", "-shared", "-fPIC", "-lm"]
             subprocess.run(["cc", source, *options[:-1], "-o", file, options[-1]], check=True)
             self.library = ctypes.CDLL(str(file))
 

@@ -184,7 +184,10 @@ def test_collectors_keep_it(kind):
     make = partial(world, max_steps=5)
     for data in collected(kind, policy, envs=make if kind is Collector else [make, make]):
         parts = data.reshape(-1, 12)
-        assert log_ratio(policy, parts).abs().max() < 1e-4
+        # Rounding of single precision: mostly 1e-6, a hundred times that where tanh saturates.
+        ratio = log_ratio(policy, parts).abs()
+        assert ratio.max() < 1e-3
+        assert ratio.median() < 1e-5
 
 
 def test_bytes_stay_bytes():

@@ -183,10 +183,10 @@ class AugmentedBelief(AroundInitial):
         follow: Callable[[Entries], Iterable[torch.Tensor]] | None = None,
         nested: bool = False,
     ):
-        out_keys = dict.fromkeys(map(unravel_key, (*initial.out_keys, *keys, *follow_keys)))
-        super().__init__(initial, out_keys=list(out_keys))
-        self.keys, self.begin = list(map(unravel_key, keys)), begin
-        self.follow_keys, self.follow = list(map(unravel_key, follow_keys)), follow
+        check_module("initial", initial)
+        own, follow_keys = ([*map(unravel_key, some)] for some in (keys, follow_keys))
+        super().__init__(initial, out_keys=list(dict.fromkeys([*initial.out_keys, *own, *follow_keys])))
+        self.keys, self.begin, self.follow_keys, self.follow = own, begin, follow_keys, follow
         self.place = "initial" if nested else None
 
     def on_entries(self, entries, call):

@@ -76,7 +76,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         **options: Unpack[EnsembleOptions],
     ):
         check_count("tile", tile)
-        if not isinstance(near, (Neighbours, torch.Tensor)):
+        if not (isinstance(near, Neighbours) or (isinstance(near, torch.Tensor) and near.ndim == 2)):
             raise TypeError(f"near is Neighbours, or a taper [S, O]; got {near!r}")
         super().__init__(**options)
         if isinstance(self.threshold, torch.Tensor) and self.threshold.numel() > 1:

@@ -9,6 +9,7 @@ or cannot be captured into a CUDA graph, as MAGMA's: :func:`inverse_of` takes th
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from contextlib import suppress
 
 import torch
 from torch import Tensor
@@ -35,12 +36,11 @@ def made_once(key: Hashable, make: Callable[[], Tensor]) -> Tensor:
     """
     if key in _MADE:
         return _MADE[key]
-    if torch.compiler.is_compiling() or torch.compiler.is_exporting():
-        return make()
-    with torch._C._DisableFuncTorch():  # torch.func would wrap it, for this call alone
-        made = make()
-    if type(made) is Tensor:
-        _MADE[key] = made
+    made = make()
+    if type(made) is Tensor and not torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+        with suppress(NotImplementedError, RuntimeError):  # torch.func's wrappers, of one call alone, have no storage
+            made.untyped_storage()
+            _MADE[key] = made
     return made
 
 

@@ -70,7 +70,7 @@ def conjugate(quaternion: Tensor) -> Tensor:
 
 
 def _signs(like: Tensor) -> Tensor:
-    return torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=like.dtype, device=like.device)
+    return torch.as_tensor([1.0, -1.0, -1.0, -1.0], dtype=like.dtype, device=like.device)
 
 
 def unit(quaternion: Tensor) -> Tensor:

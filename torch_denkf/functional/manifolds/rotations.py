@@ -338,13 +338,12 @@ def several(square: Tensor, *functions: Function) -> Sequence[Tensor]:
         return [series(square, function) for function in functions]
     dtype, device = square.dtype, square.device
     key = ("series", *map(id, functions), dtype, device)
-    first, *others = made_once(
-        key, lambda: torch.tensor([each.terms[::-1] for each in functions], dtype=dtype, device=device).mT.contiguous()
-    ).unbind()
+    terms = [list(each) for each in zip(*(function.terms[::-1] for function in functions), strict=True)]
+    first, *others = made_once(key, lambda: torch.as_tensor(terms, dtype=dtype, device=device)).unbind()
     small = square < _SMALL[dtype]
     safe, near = torch.where(small, 1.0, square).sqrt(), first
-    for terms in others:
-        near = torch.addcmul(terms, near, square)
+    for each in others:
+        near = torch.addcmul(each, near, square)
     return torch.where(small, near, torch.cat([each.formula(safe) for each in functions], -1)).split(1, -1)
 
 
