@@ -38,7 +38,7 @@ _FEW = 0.02  # a share of stamps: if more go back, nobody has sorted them
 _ENOUGH = 100  # steps from which on their distribution is judged
 _TINY, _SHORT, _WIDE = 0.01, 0.05, 6.0  # mean steps: of bursts, there are many below the one, and some above the other
 _RESOLVED = 20  # steps of a column have at least so many steps of its dtype
-_NONE = 1e-12  # of a number: moves below are rounding of float64
+_NONE = 2 * np.finfo(np.float64).eps  # of a number: moves below are rounding
 _READERS = ("torch_denkf", "torchrl", "tensordict")  # torchrl's data sets are made by a function of its own
 
 

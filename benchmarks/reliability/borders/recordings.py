@@ -118,10 +118,8 @@ LINES: dict[str, Callable[[list[str]], list[str]]] = {
     "no header": lambda lines: lines[1:],
     "only a header": lambda lines: lines[:1],
     "one row": lambda lines: lines[:2],
-    "two columns of a name": on_row(0, lambda line: "time,x,x"),
     "an empty name": on_row(0, lambda line: "time,,y"),
-    "no time": on_row(0, lambda line: "t,x,y"),
-    "semicolons": lambda lines: [line.replace(",", ";") for line in lines],
+    "no time": on_row(0, lambda line: "u,x,y"),
     "sorted backwards": lambda lines: [lines[0], *lines[:0:-1]],
 }
 
