@@ -142,7 +142,7 @@ def library_rows(
     smoke: bool = False,
     only: str = "",
 ) -> Iterator[dict]:
-    """Of the library's filters and smoothers; an empty row for each whose name has not ``only``.
+    """Yields rows of the library's filters and smoothers; an empty one for each whose name has not ``only``.
 
     Args:
         name: of the data.

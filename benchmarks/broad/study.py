@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -42,7 +43,7 @@ METHODS = (OWN, OWN + STAMPED, SIX, SIX + STAMPED, SMOOTH, VQF, LATE, VQF_SIX, G
 
 @dataclass(frozen=True)
 class Study:
-    """How well does an inertial sensor know its orientation?"""
+    """Compares orientation filters on the trials of BROAD."""
 
     data: Path = Path("../shared/data/broad")  # folder with .npz files of BROAD
     out: Path | None = None  # folder for broad.csv, broad.json, broad.md and broad.png
@@ -176,8 +177,8 @@ def page(rows: Sequence[dict], smoke: bool = False) -> str:
 
 
 def mean(rows: Sequence[dict], name: str) -> float:
-    """Of a column."""
-    return sum(row[name] for row in rows) / len(rows)
+    """Returns the mean of a column."""
+    return fmean(row[name] for row in rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

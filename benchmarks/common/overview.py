@@ -23,7 +23,7 @@ def rows_of(file: str) -> list[dict]:
 
 
 def mean(rows: Sequence[dict], name: str) -> float:
-    """Of a column."""
+    """Returns the mean of a column."""
     return fmean(float(row[name]) for row in rows)
 
 

@@ -114,7 +114,7 @@ class Motion:
         )
 
     def centered(self, data: TensorDict, ahead: int, late: int) -> TensorDict:
-        """What a filter reads, with the commands under way; the commands of the last rows are missing."""
+        """Returns what a filter reads, with the commands under way; those of the last rows are missing."""
         drive = TensorDict({key: data[key] - self.center for key in ("encoders", "action")}, data.batch_size)
         drive["encoders"] = drive["encoders"].roll(late, 1)
         waiting = [drive["action"].roll(-k, 1) for k in range(ahead)]

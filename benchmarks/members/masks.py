@@ -23,7 +23,7 @@ MASKS = ("random", "balanced")
 
 @dataclass(frozen=True)
 class Masks:
-    """What do balanced dropout masks gain, in filters whose noise is dropout?"""
+    """Compares balanced and random dropout masks in filters whose noise is dropout."""
 
     out: Path | None = None  # folder for masks.md
     runs: Path = Path("runs/members")  # with the manipulator's trained motion, made where missing

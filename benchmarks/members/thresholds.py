@@ -1,4 +1,4 @@
-"""Which threshold of the significance, if any: ``python -m benchmarks.members.thresholds``.
+"""Compares thresholds of the significance, and none: ``python -m benchmarks.members.thresholds``.
 
 Small tasks, all noise drawn exactly: the walks and the robot on wheels of this study, a target of which bearings alone
 are read, and linear systems of 20 and 27 components, more than 16 members can tell. Validation data alone are scored.
@@ -37,7 +37,7 @@ WALK, BEARING = [0.0, 0.0, 0.003, 0.003, 0.033], 0.02  # process noise of a step
 
 @dataclass(frozen=True)
 class Study:
-    """Which threshold of the significance, if any?"""
+    """Compares thresholds of the significance, and none."""
 
     out: Path | None = None  # folder for thresholds.md
     members: tuple[int, ...] = (16, 32, 64)

@@ -100,7 +100,7 @@ def trained(kind: str, study: Study, draw: int, data: tuple) -> Filter:
 
 
 def planned(study: Study, test: TensorDict) -> dict[tuple, Callable[[], dict]]:
-    """What makes each row, by model, filter, update and draw."""
+    """Yields what makes each row, by model, filter, update and draw."""
     told = test.clone().set("sound", torch.full((*test.shape, 1), 1 - SHARE))
     training = recordings(study.training, 100), recordings(study.training // 2, 101)
     jobs: dict[tuple, Callable[[], dict]] = {

@@ -143,7 +143,7 @@ def pose_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
 
 
 def noise_paths(slip: bool = True) -> Tensor:
-    """How what a row adds enters the tangent ``[D, q]``: noise of the twist, of the bias, of the slip."""
+    """Returns the matrix ``[D, q]`` from the noises of twist, bias and slip to the tangent."""
     size = 15 if slip else 9
     through = torch.zeros(size + 10, size, dtype=torch.float64)
     through[6:12, :6], through[12:16, :6] = torch.eye(6), torch.eye(6)[SWAYS]

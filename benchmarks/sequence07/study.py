@@ -124,7 +124,7 @@ def and_one_more(data: TensorDict) -> TensorDict:
 def filter_rows(
     label: str, kind: str, data: TensorDict, poses: Tensor, smoother: str = "", **options
 ) -> Iterator[tuple[dict, Tensor, Claim]]:
-    """Of one filter, and of its smoother if it has a name: a row for each condition, its path ``[T, 7]``, its claim.
+    """Yields a row for each condition, its path ``[T, 7]`` and its claim, of a filter, and of its smoother if named.
 
     An ensemble's row is the mean over ``DRAWS``; the path is that of the first.
     """

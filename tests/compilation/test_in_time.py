@@ -26,7 +26,7 @@ def test_prefixes_of_a_product_that_does_not_commute(float64, count):
 
 
 def values(*batch, count, size=3):
-    """What a linear filter hands to the smoother."""
+    """Returns what a linear filter hands to the smoother."""
 
     def spread():
         root = torch.randn(*batch, count, size, size)

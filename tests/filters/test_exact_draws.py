@@ -149,7 +149,7 @@ def test_an_iterated_smoother_keeps_what_it_found_of_the_noise(iterations):
 
 
 def test_perturbed_members_have_the_covariance_of_the_square_root_filter():
-    """Of predictions that are no linear function of the members: draws are uncorrelated with both."""
+    """Draws are uncorrelated with the members and with predictions that are no linear function of them."""
     forecast = torch.randn(5, E, S)
     forecast = {"ensemble": forecast, "observation": forecast[..., :2].square() + forecast[..., 1:]}
     td = TensorDict({"forecast": forecast, "reading": torch.ones(5, 2), "sensor": {"noise": R.expand(5, 2)}}, [5])

@@ -1,4 +1,4 @@
-"""What many tests ask of a function: that it refuses, and that it compiles."""
+"""Checks that many tests share: a function raises, and it compiles."""
 
 import pytest
 import torch

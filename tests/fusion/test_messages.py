@@ -250,7 +250,7 @@ def test_noise_of_each_reading_in_every_way_to_run(float64, covariance):
 
 
 def test_a_sensor_that_drives_and_makes_no_rows_is_a_mean_over_each_step():
-    """Of a line its mean is that of the middle of each step; without, all 100 messages are rows."""
+    """The mean over a step of a line is its value in the middle; without it all 100 messages are rows."""
     log = [(0.01 * k, "imu", [0.03 * k]) for k in range(101)]
     log += [(0.25 * k, "gps", [1.0]) for k in range(1, 5)]
     assert len(message_rows(log, driving=["imu"])) > 100

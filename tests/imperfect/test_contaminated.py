@@ -300,7 +300,7 @@ def test_masks_are_heeded(name):
 @pytest.mark.parametrize("name", ONE)
 @pytest.mark.parametrize("reading", [1.0, 2.5])
 def test_gradients_are_those_of_finite_differences(name, reading):
-    """Of the logit of the share, of the logarithm of the width or of the outliers' noise; of belief and scores."""
+    """Checks the gradients of belief and scores by logit of the share and logarithm of width or noise."""
     torch.manual_seed(0)
     perturbation, step = torch.randn(40, 1, dtype=torch.float64), 1e-5
     for wide in ({"width": 4.0}, {"noise": [1.7]}):

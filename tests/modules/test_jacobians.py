@@ -105,7 +105,7 @@ def entries(size, *batch, space=None, **others):
 
 
 def known_and_differentiated(monkeypatch, module, td, *, parameters=()):
-    """What a step writes and its gradients, by the Jacobian that the sub-model knows, and without it."""
+    """Returns what a step writes and its gradients, by the sub-model's Jacobian and by autodiff."""
     results = []
     for forget in (False, True):
         if forget:

@@ -35,7 +35,7 @@ from torch_denkf.modules.around import AroundInitial, Wrapper
 from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.modules.tensors import as_floating, as_standard_deviations
 from torch_denkf.running import check_module, linearise
-from torch_denkf.submodel import Initial, Transition, role
+from torch_denkf.submodel import Call, Entries, Initial, Transition, role
 
 __all__ = ["BiasedBelief", "BiasedNoise", "BiasedObservation", "BiasedTransition", "FadingBias"]
 
@@ -255,12 +255,10 @@ class BiasedTransition(Wrapper, Transition):
 
     def linearised(self, entries, call):
         """Returns the Jacobian of the transition, and behind it the decay."""
-        key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
-        state, slow = _split(self.required(entries, key), self.bias, self)
-        found = linearise(self.module, {**entries, key: state}, call.part(self.place))
-        if found is None or not is_flat(*found[2] or ()):
+        found = _linearised(self, self.bias, entries, call.part(self.place))
+        if found is None:
             return None
-        (written, matrix, _), count = found, len(self.bias)
+        (written, matrix, slow), count, out_key = found, len(self.bias), unravel_key(self.out_keys[0])
         decay = self.bias.decay.diag_embed().expand(*matrix.shape[:-2], count, count)
         rows = nn.functional.pad(matrix, (0, count)), nn.functional.pad(decay, (matrix.shape[-1], 0))
         moved = torch.cat([written[out_key], self.bias.decay * slow], -1)
@@ -343,12 +341,10 @@ class BiasedObservation(Wrapper):
 
     def linearised(self, entries, call):
         """Returns the Jacobian of the model, and behind it that by the biases."""
-        key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
-        state, slow = _split(self.required(entries, key), self.bias, self)
-        found = linearise(self.module, {**entries, key: state}, call.part(self.place))
-        if found is None or not is_flat(*found[2] or ()):
+        found = _linearised(self, self.bias, entries, call.part(self.place))
+        if found is None:
             return None
-        (written, matrix, _), count = found, len(self.bias)
+        (written, matrix, slow), count, out_key = found, len(self.bias), unravel_key(self.out_keys[0])
         read, own = written[out_key], self._own(slow, written[out_key])
         by_bias = self._own(torch.eye(count, dtype=read.dtype, device=read.device), read).mT
         if self.bias.factor:
@@ -476,6 +472,16 @@ def _fit(covariance: Tensor, count: Tensor, component: int, per_run: bool) -> tu
         raise ValueError(f"the residuals of component {component} do not last: take them for white noise")
     least, white = 1e-6 * (size + whole), float(covariance[0]) - size - whole
     return math.sqrt(max(size, least)), time, math.sqrt(max(white, least)), math.sqrt(max(whole, least))
+
+
+def _linearised(
+    wrapper: Wrapper, bias: FadingBias, entries: Entries, inside: Call
+) -> tuple[Entries, Tensor, Tensor] | None:
+    """Returns what the module inside writes, its Jacobian by the state alone, and the biases; ``None`` if not known."""
+    key = unravel_key(wrapper.in_keys[0])
+    state, slow = _split(wrapper.required(entries, key), bias, wrapper)
+    found = linearise(wrapper.module, {**entries, key: state}, inside)
+    return None if found is None or not is_flat(*found[2] or ()) else (found[0], found[1], slow)
 
 
 def _split(state: Tensor, bias: FadingBias, module: nn.Module) -> tuple[Tensor, Tensor]:
