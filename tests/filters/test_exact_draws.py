@@ -32,6 +32,17 @@ R = torch.tensor([0.5, 0.2], dtype=torch.float64)
 FORECAST = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}
 
 
+@pytest.fixture(params=["of all dimensions", "two noises through a matrix"])
+def process_noise(request):
+    """Q, as it is and as the two noises that it has."""
+    two = Q[[0, 2]]
+    return (
+        Q
+        if request.param == "of all dimensions"
+        else MappedNoise(ConstantNoise(two, **FORECAST), torch.eye(S)[:, [0, 2]])
+    )
+
+
 @pytest.fixture(autouse=True)
 def double(float64):
     """All in double precision: then the two are equal to rounding."""
@@ -71,7 +82,7 @@ def frames():
     return data
 
 
-def denkf(scheme, **kwargs):
+def denkf(scheme, process_noise=Q, **kwargs):
     made = parts()
     return DEnKF(
         made["transition"],
@@ -80,7 +91,7 @@ def denkf(scheme, **kwargs):
         ConstantNoise(R, in_key="reading"),
         EnsembleAnalysis(scheme, observation_key="reading"),
         initial=made["initial"],
-        process_noise=Q,
+        process_noise=process_noise,
         **kwargs,
     )
 
@@ -93,9 +104,9 @@ def assert_is_kalman(out, oracle, atol):
 
 
 @pytest.mark.parametrize("scheme", ["etkf", "perturbed"])
-def test_is_the_kalman_filter(scheme):
+def test_is_the_kalman_filter(scheme, process_noise):
     data = frames()
-    assert_is_kalman(denkf(scheme).sequence(data.copy()), kalman().sequence(data), 1e-9)
+    assert_is_kalman(denkf(scheme, process_noise).sequence(data.copy()), kalman().sequence(data), 1e-9)
 
 
 @pytest.mark.parametrize("scheme", ["etkf", "perturbed"])
@@ -109,19 +120,19 @@ def test_steps_are_the_kalman_filter(scheme):
         torch.testing.assert_close(row["belief", "mean"], expected["belief", "mean"], rtol=0, atol=1e-9)
 
 
-def test_with_errors_of_the_sensor():
+def test_with_errors_of_the_sensor(process_noise):
     data = frames()
 
     def bias():
         return FadingBias([0.4, 0.7], time=5.0, trainable=False)
 
     oracle = kalman(sensor_error=bias()).sequence(data.copy())
-    out = denkf("etkf", sensor_error=bias()).sequence(data)
+    out = denkf("etkf", process_noise, sensor_error=bias()).sequence(data)
     torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-8)
     torch.testing.assert_close(ensemble_cov(out["belief", "ensemble"]), oracle["belief", "cov"], rtol=0, atol=1e-8)
 
 
-def test_of_several_sensors():
+def test_of_several_sensors(process_noise):
     data, made = frames().exclude("observed"), parts(members=24)
     rows = system()[1]
     sensors = {
@@ -129,22 +140,22 @@ def test_of_several_sensors():
         for name, row, r in zip("ab", rows, R, strict=True)
     }
     data["a"], data["b"] = data["reading"].split(1, -1)
-    fused = FusedFilter(made["transition"], sensors, initial=made["initial"], process_noise=Q)
+    fused = FusedFilter(made["transition"], sensors, initial=made["initial"], process_noise=process_noise)
     out, oracle = fused.sequence(data.copy()), kalman().sequence(data)
     torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
 
 
-def test_a_lag_leaves_the_belief_exact():
+def test_a_lag_leaves_the_belief_exact(process_noise):
     data = frames()
-    out, oracle = FixedLag(denkf("perturbed"), 2).sequence(data.copy()), kalman().sequence(data)
+    out, oracle = FixedLag(denkf("perturbed", process_noise), 2).sequence(data.copy()), kalman().sequence(data)
     torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("iterations", [1, 3])
-def test_an_iterated_smoother_keeps_what_it_found_of_the_noise(iterations):
+def test_an_iterated_smoother_keeps_what_it_found_of_the_noise(iterations, process_noise):
     """Each iteration moves the noise, which is then exact no more: its mean is not zero."""
     made, data = parts(), frames()
-    options = {"observation_key": "reading", "process_noise": Q, "iterations": iterations}
+    options = {"observation_key": "reading", "process_noise": process_noise, "iterations": iterations}
     sensor = ConstantNoise(R, in_key="reading")
     filter = IEnKS(made["transition"], None, made["observation"], sensor, initial=made["initial"], **options)
     oracle, out = kalman().sequence(data.copy()), filter.sequence(data)
