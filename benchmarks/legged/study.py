@@ -34,8 +34,8 @@ ICUB = "iCub, real"
 DATA = {kind: {f"{kind}, {name}": ground for name, ground in GROUNDS.items()} for kind in SIMULATED}
 SCORES = ("velocity", "certain", "tilt", "drift", "nees", "held", "ms")
 COLUMNS = Columns(
-    names=("data", "filter", *SCORES, "nll", *NOISES),
-    text=("data", "filter"),
+    names=("data", "filter", "draws", *SCORES, "nll", *NOISES),
+    text=("data", "filter", "draws"),  # of an ensemble
     whole=(),
     order=lambda row: ([*DATA["quadruped"], *DATA["humanoid"], ICUB].index(row["data"]), row["filter"]),
 )
@@ -160,7 +160,8 @@ def filter_rows(
     for name, (belief, ms) in runs.items():
         parts = belief.chunk(len(robots))
         for (data, robot), part in zip(robots.items(), parts, strict=True):
-            rows.append({"data": data, "filter": name, **scored(robot, part), "ms": ms, **used})
+            draws = {"draws": "exact"} if name.startswith("DEnKF") else {}
+            rows.append({"data": data, "filter": name, **draws, **scored(robot, part), "ms": ms, **used})
             print(rows[-1], flush=True)
     return rows, {name: belief for name, (belief, _) in runs.items()}
 
@@ -181,16 +182,17 @@ def page(rows: list[dict], study: Study) -> str:
         "squared error of the velocity in units of the variance, over its expectation: above 1 a filter is too sure. "
         f"Held is the share of true velocities within the {LEVEL:.0%} intervals.",
     ]
-    titles = ("filter", "velocity, m/s", "tilt, deg", "drift, %", "NEES", "held", "ms a step")
+    titles = ("filter", "draws", "velocity, m/s", "tilt, deg", "drift, %", "NEES", "held", "ms a step")
     digits = {"velocity": 3, "tilt": 2, "drift": 1, "nees": 2, "held": 2, "ms": 0}
     for data in dict.fromkeys(row["data"] for row in rows):
         real = data.startswith("iCub")
         own = {"velocity": 3, "certain": 3, **digits} if real else digits
         lines += ["", f"## {data}", ""]
-        lines += head(*titles[:2], *(["velocity where the truth is sure, m/s"] if real else []), *titles[2:])
+        lines += head(*titles[:3], *(["velocity where the truth is sure, m/s"] if real else []), *titles[3:])
         for row in rows:
             if row["data"] == data:
-                lines.append(line(row["filter"], *(f"{row[k]:.{d}f}" if k in row else "" for k, d in own.items())))
+                numbers = (f"{row[k]:.{d}f}" if k in row else "" for k, d in own.items())
+                lines.append(line(row["filter"], row.get("draws", ""), *numbers))
     lines += [
         "",
         f"Simulated: {study.runs} runs of {study.seconds:g} s on each ground, scored from 1 s on; every run has biases "
@@ -199,7 +201,8 @@ def page(rows: list[dict], study: Study) -> str:
         "humanoid 100 N. Noises are chosen on further runs, by the likelihood of the true velocity: on the training's "
         "grounds for all simulated rows. iCub has those of the simulated humanoid on firm ground, whose rows were "
         "stamped as unevenly as iCub's. Milliseconds are those of the processor for a step of all "
-        f"{study.runs * len(GROUNDS)} runs of a simulated robot, or of iCub's, without compilation, one thread.",
+        f"{study.runs * len(GROUNDS)} runs of a simulated robot, or of iCub's, without compilation, one thread. "
+        "`--kinds` runs some filters again, with exact draws; rows of random draws are of a whole run before.",
         "",
         *head(
             "noises", "joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)"
