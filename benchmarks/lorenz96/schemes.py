@@ -51,7 +51,8 @@ class Case:
 CASES = [
     Case("perturbed", 40, 1.06, published=0.22, target=0.24),
     Case("sakov", 40, 1.01, published=0.18, target=0.20),
-    Case("etkf", 24, 1.013, published=0.18, target=0.21, rotate=True),
+    # Published at 1.013, with which 24 members lose the state in some seeds; 1.02 is chosen on seeds 100 to 107.
+    Case("etkf", 24, 1.02, published=0.18, target=0.21, rotate=True),
     Case("letkf", 7, 1.04, published=0.22, target=0.25, rotate=True),
 ]
 TITLES = ("scheme", "E", "inflation", "RMSE", "each seed", "spread", "published", "target", "met", "ms a cycle")
