@@ -206,8 +206,7 @@ class _RotationAndVectors(Space):
         outer, along = vectors.unsqueeze(-1) * turns.unsqueeze(-2), (turns * vectors).sum(-1)[..., None, None]
         shared = third * (turn - 2 * unit) - fall * turn - 2 * low * turn2
         low = skew(-0.5 * vectors - fall * again) + third.unsqueeze(-3) * (outer + outer.mT)
-        low = torch.addcmul(low, along, shared.unsqueeze(-3))
-        return self._matrix(block, low)
+        return self._matrix(block, torch.addcmul(low, along, shared.unsqueeze(-3)))
 
     def exp_and_jacobian(self, tangent):
         """Returns point and Jacobian; for a rotation alone from three functions of its angle."""
