@@ -94,6 +94,8 @@ class NoisyTransition(Transition):
         self.log_weight_key, self.space = unravel_key(log_weight_key), check_space("space", space)
         self.before, self.mean_key, self.forecast_mean_key = before, *map(unravel_key, (mean_key, forecast_mean_key))
         check_dims("dims", dims or (), once=True)
+        of_noise = [] if type(noise) is ConstantNoise else of_noise  # it looks at the state's width alone
+        self._means = self_made.intersection([*needed, *optional, *of_noise, *of_noise_optional])
         self.exact, self.noise_dim = is_exact(draws), noise.noise_dim if isinstance(noise, NoiseThrough) else None
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
 
@@ -118,21 +120,21 @@ class NoisyTransition(Transition):
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, entries = self.required(entries, key), dict(entries)
         log_weights = entries.get(self.log_weight_key)
-        entries[self.mean_key] = self._mean(state, log_weights)
+        entries[self.mean_key] = self._mean(self.mean_key, state, log_weights)
         if self.before:
             entries[key] = self._add(state, entries, call)
         written = run_module(self.module["transition"], entries, call.part("transition"))
         if not self.before:
             moved = written[out_key]
-            entries[self.forecast_mean_key] = self._mean(moved, log_weights)
+            entries[self.forecast_mean_key] = self._mean(self.forecast_mean_key, moved, log_weights)
             written = {**written, out_key: self._add(moved, entries, call)}
         return written
 
-    def _mean(self, members: torch.Tensor, log_weights: torch.Tensor | None) -> torch.Tensor:
-        """Returns the mean for the noise model; on a space, one that reads the state's width alone gets any member."""
+    def _mean(self, key: NestedKey, members: torch.Tensor, log_weights: torch.Tensor | None) -> torch.Tensor:
+        """Returns the mean for the parts, or any member where none reads its numbers."""
+        if key not in self._means:
+            return members[..., 0, :]
         if self.space is not None:
-            if isinstance(self.module["noise"], ConstantNoise):
-                return members[..., 0, :]
             return self.space.mean(members, None if log_weights is None else log_weights.exp())
         return members.mean(-2) if log_weights is None else weighted_mean(members, log_weights)
 
