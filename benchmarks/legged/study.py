@@ -52,6 +52,8 @@ KINDS = {
     "EKF": {"kind": "EKF"},
     "UKF": {"kind": "UKF"},
     "DEnKF, 32 members": {"kind": "DEnKF", "ensemble_size": 32},
+    "DEnKF, 32 members, significance": {"kind": "DEnKF", "ensemble_size": 32, "threshold": 2.0},  # of 1, 1.5, 2 and 3
+    "DEnKF, 48 members": {"kind": "DEnKF", "ensemble_size": 48},
     "DEnKF, 64 members": {"kind": "DEnKF", "ensemble_size": 64},
 }
 

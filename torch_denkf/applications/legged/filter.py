@@ -66,7 +66,7 @@ def legged_filter(
         joints: names of the joints in the order of the readings; ``None`` for all hinges and slides of the model.
         dt: time step in seconds, or the key of an entry ``[*B, 1]``.
         kind: the belief: an ensemble, or a mean and a covariance.
-        ensemble_size: E.
+        ensemble_size: E. Of a robot with F feet, 36 + 6 F members are drawn exactly; far fewer need a ``threshold``.
         threshold: of the ensemble's significance, see :class:`~torch_denkf.modules.EnsembleAnalysis`; ``None`` to
             believe all correlations.
         noises: of the sensors and feet.
