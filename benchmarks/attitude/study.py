@@ -63,7 +63,7 @@ class Study:
     seconds: float = 20.0  # of a simulated run
     updates: int = 25  # of the learned noise
     seed: int = 0
-    only: str = ""  # run filters alone whose name has this, with the settings of attitude.csv; other rows stay
+    only: str = ""  # run filters alone whose name begins so, with the settings of attitude.csv; other rows stay
     data: tuple[Literal["simulated", "iCub"], ...] = ("simulated", "iCub")  # rows of the others stay, with only
     smoke: bool = False  # one short run: does it run?
 
@@ -144,7 +144,7 @@ def library_rows(
     smoke: bool = False,
     only: str = "",
 ) -> Iterator[dict]:
-    """Yields rows of the library's filters and smoothers; an empty one for each whose name has not ``only``.
+    """Yields rows of the library's filters and smoothers; an empty one for each whose name does not begin so.
 
     Args:
         name: of the data.
@@ -154,12 +154,12 @@ def library_rows(
         rest_noise: of the velocity that is read to be zero, in m/s.
         learned: the noise of the accelerometer's direction that :func:`learned_noise` trained.
         smoke: a few of them.
-        only: a part of the names of those that run.
+        only: how the names of those begin that run.
     """
     gyro = GYRO_NOISES[name]
 
     def scored(reads: str, label: str, model: nn.Module, prefix: str = "belief", **setting) -> dict:
-        if only not in label:
+        if not label.startswith(only):
             return {}
         orientation, cov, ms = run(model, data, prefix)
         return {
@@ -283,6 +283,8 @@ def page(rows: list[dict], study: Study) -> str:
         "the standard deviation of one reading, in rad; of those that are told that the body stays about a place, the "
         "standard deviation of a velocity that is read to be zero, in m/s. The library's filters have one setting, "
         "chosen on simulated runs that are not in the table. All settings of the baselines are in it.",
+        "",
+        "Ensembles draw exactly; rows with *significance* are of random draws, and of a study before.",
         "",
         "Milliseconds are those of the processor for a step of all runs at once, without compilation, one thread.",
         "",
