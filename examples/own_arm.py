@@ -1,11 +1,12 @@
 """An arm of your own, from camera to policy, on one page: MuJoCo, a camera, encoders, and actions that run late.
 
-    python examples/own_arm.py             # 12 minutes of one core; pictures, filter and policy in runs/own-arm
+    python examples/own_arm.py             # pictures, filter and policy in runs/own-arm
 
-``Reach`` and ``XML`` stand for your arm: two joints, a camera of 60 x 60 pixels in each of 20 steps a second, encoders
-in every fourth; 30 % of both get lost, and nobody reads speeds. A scripted controller demonstrates. The filter learns motion
-and camera from that, and what the camera is worth from demonstrations that it did not learn from. Then PPO learns to reach
-a goal, from the belief of the moment when its action runs, 0.1 s later. Needs OpenGL without a screen (``MUJOCO_GL=egl``).
+``Reach`` and ``XML`` stand for your arm: two joints; a camera of 60 x 60 pixels in each of 20 steps a second, encoders
+in every fourth; 30 % of both get lost, and nobody reads speeds. A scripted controller demonstrates. The filter learns
+motion and camera from that, and what the camera is worth from demonstrations that it did not learn from. Then PPO
+learns to reach a goal, from the belief of the moment when its action runs, 0.1 s later. Needs OpenGL, no screen
+(``MUJOCO_GL=egl``). docs/how_to/own_arm.md has the numbers.
 """
 
 from __future__ import annotations
@@ -184,7 +185,9 @@ def make_filter(facts: dict[str, list[float]], error: dict[str, list[float]], me
     if "std" in error:
         lasting = FadingBias(error["std"], error["time"], trainable=False)
     return FusedFilter(
-        LearnedTransition(StochasticMLP(4 + 2, 4, (64, 64), output_gain=0.1), loc=loc, scale=scale, action_key="action"),
+        LearnedTransition(
+            StochasticMLP(4 + 2, 4, (64, 64), output_gain=0.1), loc=loc, scale=scale, action_key="action"
+        ),
         {
             "camera": FusedSensor(joints, error["white"], camera, observed_key="observed", sensor_error=lasting),
             "encoder": FusedSensor(joints, [ENCODER] * 2),
@@ -197,7 +200,7 @@ def make_filter(facts: dict[str, list[float]], error: dict[str, list[float]], me
 
 @torch.no_grad()
 def camera_errors(model: FusedFilter, rows: TensorDict, lasting: bool) -> dict[str, list[float]]:
-    """The camera's errors on rows ``[B, T]``, as white noise, or as white noise and what lasts from picture to picture."""
+    """The camera's errors on rows ``[B, T]``, as white noise, or as what lasts from picture to picture beside some."""
     off = model["camera_sensor"](rows.copy())["sensor", "camera", "ensemble"].mean(-2) - rows["state"][..., :2]
     off = torch.where(rows["observed"], off, torch.nan)
     if not lasting:
@@ -206,7 +209,9 @@ def camera_errors(model: FusedFilter, rows: TensorDict, lasting: bool) -> dict[s
     return {"white": white.clamp_min(0.01).tolist(), "std": bias.std.tolist(), "time": bias.log_time.exp().tolist()}
 
 
-def learn(rollouts: TensorDict, unseen: TensorDict, out: Path, updates: tuple[int, int, int]) -> tuple[FusedFilter, dict]:
+def learn(
+    rollouts: TensorDict, unseen: TensorDict, out: Path, updates: tuple[int, int, int]
+) -> tuple[FusedFilter, dict]:
     """Motion and camera on three quarters of the demonstrations; the camera's errors, then the whole, on the others.
 
     On pictures that it learned from the camera's errors are too small.
@@ -262,7 +267,9 @@ def late_env(model: FusedFilter, count: int, seed: int, key=("ahead", "belief", 
     """Arms whose actions run late; the filter, and what the policy sees: a belief and the goal."""
     keep = [("belief", "mean"), ("belief", "var")]
     belief = DEnKFTransform(model, ahead=BeliefAhead(model, LATE, keep=keep))
-    return make_env(count, seed, LateActions(LATE), belief, CatTensors([key, "goal"], "seen", del_keys=False, sort=False))
+    return make_env(
+        count, seed, LateActions(LATE), belief, CatTensors([key, "goal"], "seen", del_keys=False, sort=False)
+    )
 
 
 def ppo(model: FusedFilter, actor: ProbabilisticActor, batches: int, arms: int = 16) -> list[float]:
@@ -330,7 +337,13 @@ def main() -> None:
     args = parser.parse_args()
     arms = 16
     if args.smoke:
-        args.out, args.episodes, args.updates, args.batches, arms = args.out.with_name("own-arm-smoke"), 10, [2] * 3, 1, 2
+        args.out, args.episodes, args.updates, args.batches, arms = (
+            args.out.with_name("own-arm-smoke"),
+            10,
+            [2] * 3,
+            1,
+            2,
+        )
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)

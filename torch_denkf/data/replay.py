@@ -190,7 +190,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
             if rollout.ndim != 1 or rollout["next", "done"][:-1].any():
                 raise ValueError(
                     f"A rollout is one episode, [T]; that of number {number} is {list(rollout.shape)}, or ends before "
-                    "its last row: pass rollouts with break_when_any_done=True, or split them there."
+                    "its last row: roll out with break_when_any_done=True, or split it there."
                 )
             step = torch.arange(len(rollout)).unsqueeze(-1)
             times = {"step": step, "time": dt * step.double()}

@@ -35,9 +35,9 @@ class Stage:
         parameters: what is trained: parameters, or groups as torch's optimisers take them,
             ``[{"params": ..., "lr": ...}, ...]``. By default all parameters of ``loss`` (if that is a module, else of
             the trainer's model) that require gradients.
-        frozen: names of modules of the model, a filter's places, that stay as they are, such as ``["camera_sensor"]``: a
-            sensor that learned few demonstrations by heart reads them too well, so that the noise learned with it on
-            them is too small. Freeze it, and learn the noise on episodes that it has not seen.
+        frozen: names of modules of the model, a filter's places, that stay as they are, such as ``["camera_sensor"]``.
+            A sensor that learned few demonstrations by heart reads them too well, so that noise learned on them is too
+            small: freeze it, and learn the noise on episodes that it has not seen.
         lr: learning rate; the peak for ``"one_cycle"``, the start for ``"cosine"``.
         weight_decay: of AdamW, per unit of learning rate.
         schedule: ``"one_cycle"``, ``"cosine"`` (to zero), ``"constant"``, or ``schedule(optimiser, updates)``, which
@@ -186,7 +186,7 @@ def why_no_gain(stage: Stage, first: float, value: float, update: int) -> str:
     if stage.lengths is not None:
         longest = max(stage.lengths.values())
         causes.append(f"windows of {longest} steps are too short to show what the filter does later")
-    causes.append("the loss and the validation ask for different things, or the training batches are learned by heart: freeze sensors, frozen=, and learn noise on held-out episodes")
+    causes.append("the loss and the validation ask for different things, or the training batches are learned by heart")
     return f"Stage {stage.name!r} {said}. Likely: {'; '.join(causes)}."
 
 
