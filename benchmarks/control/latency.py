@@ -1,7 +1,7 @@
 """Robots whose actions run late: a policy on the belief ahead, on the belief of now, on readings; and an LSTM.
 
-``python -m benchmarks.control.latency``. A pendulum and an arm of two links. The policy is one of the true state without
-delay, by value iteration on a grid for the pendulum, a regulator for the arm: nothing is learned, and what it sees alone
+``python -m benchmarks.control.latency``. A pendulum and an arm of two links. The policy is one of the true state
+without delay, by value iteration for the pendulum, a regulator for the arm: nothing is learned, what it sees alone
 differs. The filter knows the robot. The LSTM is trained by PPO for each delay, and sees the actions under way.
 """
 
