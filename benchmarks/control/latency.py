@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -137,27 +138,16 @@ def regulator(state: Tensor) -> Tensor:
     return (-2.0 * state[..., :2] - 0.3 * state[..., 2:]).clamp(-1, 1)
 
 
-@dataclass(frozen=True)
-class Robot:
-    """A simulated robot, what its filter knows, and how it is controlled.
+class Robot(NamedTuple):
+    """A simulated robot, what its filter knows, and how it is controlled."""
 
-    Attributes:
-        world: many at once, of a noise, batch size and seed.
-        motion: states and actions to the next states.
-        start: mean and standard deviations of the first state.
-        shake: standard deviations of the motion.
-        policy: of the true state.
-        angles: readings to angles.
-        state: angles and speeds to the state.
-    """
-
-    world: Callable[..., LinearGaussianEnv]
-    motion: Callable[[Tensor], Tensor]
-    start: tuple[list[float], list[float]]
-    shake: list[float]
-    policy: Callable[[Tensor], Tensor]
-    angles: Callable[[Tensor], Tensor]
-    state: Callable[[Tensor, Tensor], Tensor]
+    world: Callable[..., LinearGaussianEnv]  # many at once, of a noise, batch size and seed
+    motion: Callable[[Tensor], Tensor]  # states and actions to the next states
+    start: tuple[list[float], list[float]]  # mean and standard deviations of the first state
+    shake: list[float]  # standard deviations of the motion
+    policy: Callable[[Tensor], Tensor]  # of the true state
+    angles: Callable[[Tensor], Tensor]  # of readings
+    state: Callable[[Tensor, Tensor], Tensor]  # of angles and speeds
 
 
 def swing(x: Tensor) -> Tensor:

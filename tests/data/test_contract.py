@@ -43,7 +43,7 @@ def test_rollouts_are_episodes_with_statistics_of_all_that_was_seen():
     """What a mask hides, pictures and readings, counts nowhere; the rows are the root's."""
     shape = [4, ROWS]
     seen, read = torch.rand(*shape, 1) < 0.5, torch.rand(*shape, 1) < 0.5
-    root = TensorDict({"state": torch.randn(*shape, 2), "action": torch.randn(*shape, 1)}, shape)
+    root = TensorDict({"state": torch.randn(*shape, 2), "action": torch.randn(*shape, 1).double()}, shape)
     root["pixels"] = torch.randint(256, (*shape, 3, 4, 4), dtype=torch.uint8) * seen[..., None, None]
     root["encoder"], root["observed"], root["encoder_observed"] = torch.randn(*shape, 2) * read, seen, read
     done = (torch.arange(ROWS) == ROWS - 1).reshape(1, ROWS, 1).expand(*shape, 1)
@@ -52,7 +52,7 @@ def test_rollouts_are_episodes_with_statistics_of_all_that_was_seen():
     check_contract(data)
     assert data[:]["state"].equal(root["state"].flatten(0, 1))
     assert data[:]["pixels"].equal(root["pixels"].flatten(0, 1) / 255)
-    numbers = {key: root[key].flatten(0, 1).numpy() for key in ("state", "action")}
+    numbers = {key: root[key].float().flatten(0, 1).numpy() for key in ("state", "action")}
     numbers["encoder"] = root["encoder"][read.squeeze(-1)].numpy()
     check_statistics(data.statistics, **numbers)
     pixels = root["pixels"][seen.squeeze(-1)].double() / 255

@@ -195,7 +195,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
             step = torch.arange(len(rollout)).unsqueeze(-1)
             times = {"step": step, "time": dt * step.double()}
             kept = rollout.exclude("next", "collector", "done", "terminated", "truncated", "is_init", "step_count")
-            parts.append(kept.cpu().update(times))
+            parts.append(kept.cpu().apply(lambda x: x.float() if x.is_floating_point() else x).update(times))
             episodes.append(Episode(str(number), sum(map(len, parts[:-1])), len(rollout)))
         rows = torch.cat(parts)
         pixels, pictures = rows.pop("pixels", None), None
