@@ -64,8 +64,9 @@ def test_rollouts_are_episodes_with_statistics_of_all_that_was_seen():
     }
     with pytest.raises(ValueError, match="ends before its last row"):
         EpisodeReplay.from_rollouts(rollouts.roll(1, 1), 0.1)
-    with pytest.raises(ValueError, match=r"uint8 \[T, C, H, W\]"):
-        EpisodeReplay.from_rollouts(rollouts.set("pixels", root["pixels"] / 255), 0.1)
+    for strange in (root["pixels"] / 255, root["pixels"].movedim(2, -1)):
+        with pytest.raises(ValueError, match=r"uint8 \[T, C, H, W\]"):
+            EpisodeReplay.from_rollouts(rollouts.set("pixels", strange), 0.1)
 
 
 # Samples --------------------------------------------------------------------------------------------------------------

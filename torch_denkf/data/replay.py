@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, Unpack, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -197,10 +197,10 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
             kept = rollout.exclude("next", "collector", "done", "terminated", "truncated", "is_init", "step_count")
             parts.append(kept.cpu().apply(lambda x: x.float() if x.is_floating_point() else x).update(times))
             episodes.append(Episode(str(number), sum(map(len, parts[:-1])), len(rollout)))
-        rows = torch.cat(parts)
+        rows = cast(TensorDictBase, torch.cat(parts))
         pixels, pictures = rows.pop("pixels", None), None
         if pixels is not None:
-            if pixels.dtype != torch.uint8 or pixels.ndim != 4:
+            if pixels.dtype != torch.uint8 or pixels.ndim != 4 or pixels.shape[1] > pixels.shape[3]:
                 raise ValueError(
                     f"'pixels' of a rollout are uint8 [T, C, H, W]; got {pixels.dtype} {list(pixels.shape)}. Leave "
                     "ToTensorImage out; PermuteTransform((-1, -3, -2)) brings the channels to the front."
