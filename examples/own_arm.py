@@ -337,13 +337,8 @@ def main() -> None:
     args = parser.parse_args()
     arms = 16
     if args.smoke:
-        args.out, args.episodes, args.updates, args.batches, arms = (
-            args.out.with_name("own-arm-smoke"),
-            10,
-            [2] * 3,
-            1,
-            2,
-        )
+        arms, args.out = 1, args.out.with_name("own-arm-smoke")
+        args.episodes, args.updates, args.batches = 10, [2] * 3, 1
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
