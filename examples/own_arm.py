@@ -231,6 +231,7 @@ def learn(
     options = {"device": "cpu", "validate_every": 50}
     FilterTrainer(first, stages, out=out / "parts", **options).fit(resume=False)
     for rows, name in ((seen, "pictures that it learned from"), (new, "other pictures")):
+        print(f"  the camera is off by {camera_errors(first, rows, False)['white']} rad on {name}")
         for lasting, kind in ((False, "white"), (True, "lasting")):
             model = make_filter(facts, camera_errors(first, rows, lasting))
             take_weights(model, first)
