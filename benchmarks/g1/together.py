@@ -25,13 +25,12 @@ from benchmarks.g1.readings import blackouts, read_codes
 from benchmarks.g1.recordings import ARM as JOINTS
 from benchmarks.g1.recordings import Recordings, rows_of
 from benchmarks.g1.sensors import read_code
-from benchmarks.g1.targets import ARM
 from torch_denkf import FusedFilter, FusedSensor
 from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import ConstantNoise, LearnedTransition, MappedNoise, MomentPrior, Select
 from torch_denkf.training import hold_last
 
-SIZE, RATE = ARM.size, 30  # joints; rows a second
+SIZE, RATE = len(JOINTS), 30  # joints; rows a second
 ENCODER = math.radians(0.1)  # standard deviation of an encoder's reading, rad
 COMMANDS = 8  # of the last rows, that the joints follow
 SAMPLES = 64  # of the camera's sensor
@@ -61,7 +60,7 @@ class Arm:
 
     def __init__(self, study: Together):
         self.study, self.surprise = study, SURPRISE
-        self.sensor = TrainedSensor(study, "glimpse", study.seed, study.sensor_budget)
+        self.sensor = TrainedSensor(study, study.seed, study.sensor_budget)
         self.roles = self.sensor.roles
 
     @cached_property
@@ -108,7 +107,7 @@ class Arm:
     def motion(self) -> Motion:
         """The motion, learned from true states."""
         torch.manual_seed(self.study.seed)
-        motion = Motion(self.sensor.trained[1], ARM)
+        motion = Motion(self.sensor.trained[1])
         pairs = [(state, state) for state, _ in self.known]
         out = self.study.out / "motions" / "together"
         return train_motion(motion, pairs, out=out, seed=self.study.seed, updates=self.study.motion_updates)

@@ -40,12 +40,11 @@ class Study(Collections):
     """A UR5 that one camera watches: joints, gripper and end effector, with every filter that is registered.
 
     collect: demos into --root. table: collect what is missing, train, test. pictures: videos and plots of what a table
-    left in --out. frontier: error against milliseconds a step of the filters that a table left there. limits: how far
-    simple filters get on its sensors' readings. members: DEnKFs that are trained with few members, by localisation.
-    What was broken off goes on where it stopped. See the README beside.
+    left in --out. frontier: error against milliseconds a step of the filters that a table left there. members: DEnKFs
+    that are trained with few members, by localisation. What was broken off goes on where it stopped. See the README.
     """
 
-    command: Positional[Literal["collect", "table", "pictures", "frontier", "limits", "members"]] = "table"
+    command: Positional[Literal["collect", "table", "pictures", "frontier", "members"]] = "table"
     filters: some_of(sorted(FILTERS)) = tuple(sorted(FILTERS))
     sensors: some_of(sorted(SENSORS)) = ("glimpse", "paper")
     trainings: some_of(TRAININGS) = TRAININGS
