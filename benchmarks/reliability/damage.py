@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,10 @@ class Wrong:
         """Without those that are not wrong here; none is drawn, as it might be one of them."""
         return Wrong({name: value for name, value in self.named.items() if name not in names})
 
+    def without(self, *names: str) -> Wrong:
+        """Without those that are not wrong here; others are drawn."""
+        return Wrong({name: value for name, value in self.named.items() if name not in names}, self.others)
+
     def each(self, change: Callable[[Any], Any]) -> Wrong:
         """With something made of every value."""
         return Wrong(
@@ -55,7 +59,17 @@ class Wrong:
 
 def drawn(values: st.SearchStrategy[Any]) -> Named:
     """Values under their own names."""
-    return values.map(lambda value: (" ".join(repr(value).split())[:80], value))
+    return values.map(lambda value: (_name(value), value))
+
+
+def of(*values: Any, drawn: st.SearchStrategy[Any] | None = None) -> Wrong:
+    """Returns values under their own names."""
+    others = st.nothing() if drawn is None else drawn.map(lambda value: (_name(value), value))
+    return Wrong({_name(value): value for value in values}, others)
+
+
+def _name(value: Any) -> str:
+    return " ".join(repr(value).split())[:80]
 
 
 # ------------------------------------------------------------------------------------------------------- numbers
@@ -322,22 +336,25 @@ def same(result: Any, expected: Any, *, rtol: float = 0.0, atol: float = 0.0) ->
     )
 
 
-def same_but(result: Any, expected: Any, rows: Iterable[int], masks: Iterable[str]) -> bool:
-    """Whether ``rows`` are marked as missing in one of ``masks``, and all other rows are as expected.
+def kept(result: Any, expected: Any, *, most: int = 1, rtol: float = 0.0) -> bool:
+    """Whether rows are as expected, but for some that are marked as missing, or lack at the end.
 
     Args:
         result: entries ``[N, ...]``.
-        expected: likewise.
-        rows: numbers of the damaged ones.
-        masks: names of boolean entries; where one is False the row's reading does not count.
+        expected: likewise, maybe longer; its boolean entries are masks, False where a row's reading does not count.
+        most: so many rows may be marked.
+        rtol: of the comparison.
     """
     one, other = leaves(result), leaves(expected)
-    rows = list(rows)
     if not other.keys() <= one.keys() or not finite(one):
         return False
-    if any(one[key].shape != other[key].shape for key in other):
-        return False
-    keep = torch.ones(len(next(iter(other.values()))), dtype=torch.bool)
-    keep[rows] = False
-    marked = any(bool((~one[name][rows]).any()) for name in masks if name in one)
-    return marked and all(torch.equal(one[key][keep], other[key][keep]) for key in other)
+    count = len(next(iter(one.values())))
+    differ = marked = torch.zeros(count, dtype=torch.bool)
+    for key, right in other.items():
+        found, right = one[key].reshape(count, -1), right[:count].reshape(min(count, len(right)), -1)
+        if found.shape != right.shape:
+            return False
+        differ = differ | ~found.double().isclose(right.double(), rtol=rtol, atol=rtol).all(-1)
+        if found.dtype == torch.bool:
+            marked = marked | (right & ~found).any(-1)
+    return count > 0 and bool((marked | ~differ).all()) and int(marked.sum()) <= most

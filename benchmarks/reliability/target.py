@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.case import SECONDS, Case
+from benchmarks.reliability.documents import FORMATS, Place, edited, places
 from torch_denkf._arguments import _signature
 
 Right = Callable[[Any], bool] | None  # whether a result is right; ``None`` where there may be none
@@ -123,6 +124,38 @@ class Folder:
         wrong = wrong if isinstance(wrong, d.Wrong) else d.Wrong(wrong)
         act = lambda change, folder: self.damaged(change, folder, file, **(options or {}))  # noqa: E731
         return Target(self.border, name, words, act, wrong, right, **{"needs": self.sound, **more})
+
+    def document(
+        self,
+        file: str,
+        right: Right,
+        words: tuple[str, ...] = (),
+        *,
+        skip: Callable[[Place], bool] = lambda place: False,
+        then: Callable[[d.Change], d.Change] = lambda change: change,
+        but: tuple[str, ...] = (),
+        **more: Any,
+    ) -> Iterator[Target]:
+        """Targets whose wrong values are those of each place of a document.
+
+        Args:
+            file: the document.
+            right: whether a result is right, where it is not refused.
+            words: of clear messages, beside the file's name and the place's.
+            skip: whether a place is left out.
+            then: wraps a change of the file, as to adapt a checksum.
+            but: names of values that may be right.
+            **more: of the targets.
+        """
+        form, root = FORMATS[Path(file).suffix], self.sound()
+        for place, leaf in places(form.load(root / file)):
+            if not skip(place):
+                wrong = form.wrong(place, leaf).without(*but)
+                changes = wrong.each(lambda value, at=place: then(edited(d.put(at, value))))
+                named, name = tuple(map(str, place)), f"{root.name}/{file}"
+                yield self.target(
+                    f"{name}, {'/'.join(named)}", changes, right, (Path(file).name, *named, *words), file, **more
+                )
 
     def arguments(self, name: str, **more: Any) -> Subject:
         """What it is read with, as arguments of something by this name."""

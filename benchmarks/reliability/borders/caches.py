@@ -98,7 +98,7 @@ ENTRIES = d.Wrong(
         "a file more": lambda entry: (entry / "more").write_text("x"),
     }
 )
-NO_FOLDER = d.Wrong({"in a file": "file/below", "in a device": "/dev/null/below", "a number": 3})
+NO_FOLDER = d.of("file/below", "/dev/null/below", 3)
 
 
 def _nowhere(name: str, cache: Any, folder: Path) -> TensorDict:

@@ -59,7 +59,7 @@ def _made() -> Iterator[Subject]:
     use = lambda smoother: smoother.sequence(SMOOTHERS[0].frames())  # noqa: E731
     moments, ensemble = (lambda: {"filter": linear_kalman()}), (lambda: {"filter": linear_denkf("etkf")})
     wrong = {"lag": d.COUNT.but("zero"), "filter": NO_FILTER}
-    iterated = {"sensor": d.Wrong({"text": "x"}), "variance_ceiling": None}
+    iterated = {"sensor": d.of("x"), "variance_ceiling": None}
     yield Subject(RTSSmoother, moments, use, wrong)
     yield Subject(EnRTS, ensemble, use, {**wrong, "damping": d.POSITIVE | {"beyond one": 1.5}})
     yield Subject(EnKS, ensemble, use, wrong)
