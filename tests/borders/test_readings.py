@@ -105,7 +105,7 @@ ALL = pytest.mark.parametrize("name", FILTERS)
 
 
 def make(name, **options) -> Filter:
-    """The same weights each time."""
+    """Makes a filter with the same weights each time."""
     torch.manual_seed(7)
     return FILTERS[name][0](**options)
 
