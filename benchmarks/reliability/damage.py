@@ -247,12 +247,6 @@ FILE = BYTES.each(written) | PLACES
 # ----------------------------------------------------------------------------------------------- what has entries
 
 MISSING = object()
-OF_TYPES = {"text": "x", "nothing": None, "a list": [], "a fraction": 1.5, "negative": -3}
-
-
-def types(*names: str, **more: Any) -> Wrong:
-    """Values of the wrong type, for a field that has another one."""
-    return Wrong({name: OF_TYPES[name] for name in names} | more)
 
 
 def put(path: tuple[Any, ...], value: Any) -> Change:
@@ -288,21 +282,6 @@ def fields(wrong: Mapping[Any, Wrong], *, missing: bool = True) -> Wrong:
             changes.others.map(lambda one, name=name: (f"{name} {one[0]}", one[1])),
         )
     return out
-
-
-def on_row(row: int, change: Callable[[Any], Any]) -> Callable[[list], list]:
-    """Changes one of several values; it goes where there is nothing left of it."""
-
-    def act(values: list) -> list:
-        changed = change(values[row])
-        return [*values[:row], *([] if changed is MISSING else [changed]), *values[row + 1 :]]
-
-    return act
-
-
-def in_lines(change: Callable[[list[str]], list[str]]) -> Change:
-    """Changes the lines of a text file."""
-    return lambda file: file.write_text("\n".join(change(file.read_text().splitlines())) + "\n")
 
 
 # --------------------------------------------------------------------------------------------------- comparisons

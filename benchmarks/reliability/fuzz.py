@@ -21,10 +21,10 @@ from benchmarks.common.tables import head, line
 from benchmarks.reliability.case import Case, Verdict, judge
 from benchmarks.reliability.target import Target
 
-#: Modules of benchmarks/reliability/borders.
+#: Modules of tests/borders, whose cases the tests run, too; then those of benchmarks/reliability/borders.
+TESTED = ("filters_made", "sub_models")
 BORDERS = (
-    "filters_made",
-    "sub_models",
+    *TESTED,
     "filters_fed",
     "spaces",
     "noises",
@@ -51,7 +51,8 @@ Row = dict[str, str]  # border, case, kind, what, and how to run it again
 
 def all_targets(borders: Sequence[str] = BORDERS) -> list[Target]:
     """What may be damaged, in an order of its own."""
-    modules = [import_module(f"benchmarks.reliability.borders.{name}") for name in borders]
+    places = {name: "tests" if name in TESTED else "benchmarks.reliability" for name in borders}
+    modules = [import_module(f"{place}.borders.{name}") for name, place in places.items()]
     return [target for module in modules for target in module.targets()]
 
 

@@ -24,9 +24,6 @@ from torch_denkf.modules import (
 
 EYE, ZERO, ONE = torch.eye(2), torch.zeros(2), torch.ones(2)
 NAN, INF = float("nan"), float("inf")
-ASYMMETRIC = torch.tensor([[1.0, 0.5], [0.0, 1.0]])
-INDEFINITE = torch.tensor([[1.0, 2.0], [2.0, 1.0]])
-BESIDE_ZERO = torch.tensor([[1.0, 0.1], [0.1, 0.0]])
 PARTS = {
     "transition": EYE,
     "process_noise_cov": EYE,

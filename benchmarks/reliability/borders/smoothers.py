@@ -11,8 +11,8 @@ import torch
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.borders import filters_fed as fed
 from benchmarks.reliability.borders.around import NO_FILTER
-from benchmarks.reliability.borders.filters_made import parts
 from benchmarks.reliability.target import Subject, Target, targets_of
+from tests.borders.filters_made import parts
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.gaussian_for_tests import linear_filter
 from torch_denkf.baselines import IEnKS

@@ -10,8 +10,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.borders.filters_made import IMAGE_SHAPE, SIGMA
 from benchmarks.reliability.target import Subject, Target, targets_of
+from tests.borders.filters_made import IMAGE_SHAPE, SIGMA
 from torch_denkf import modules as m
 from torch_denkf.applications.car import FlowSensor, UnicycleMotion, UnicycleNoise, UnicycleTransition
 from torch_denkf.applications.car.modules.member_gain import MemberGain
