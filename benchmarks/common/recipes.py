@@ -87,10 +87,6 @@ class Recipe:
         share = self.state_scale.isfinite().float().mean().item()
         return DEnKFLoss(model, state=share, transition=share, sensor=0.0, state_scale=self.state_scale)
 
-    def likelihood_loss(self, model: Filter) -> DEnKFLoss:
-        """The likelihood of the readings alone (Chen, Sanz-Alonso & Willett 2022)."""
-        return DEnKFLoss.ad_enkf(model, detach_every=8)
-
 
 class Particles(Recipe):
     """Weighted particles; the likelihood of a reading is a Gaussian or learned, ``learned`` being its bound."""
