@@ -71,6 +71,8 @@ def _dump_table(file: Path, columns: dict[str, list]) -> None:
     def column(name: str, values: list) -> pa.Array:
         kinds = [schema.field(name).type] if name in schema.names else []
         for kind in (*kinds, None):
+            if kind is not None and pa.types.is_integer(kind) and any(isinstance(value, float) for value in values):
+                continue  # a fraction would be cut off
             with suppress(pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError, OverflowError):
                 return pa.array(values, kind)
         return pa.array([str(value) for value in values])

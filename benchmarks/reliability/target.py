@@ -132,6 +132,7 @@ class Folder:
         words: tuple[str, ...] = (),
         *,
         skip: Callable[[Place], bool] = lambda place: False,
+        loose: Callable[[Place], bool] = lambda place: True,
         then: Callable[[d.Change], d.Change] = lambda change: change,
         but: tuple[str, ...] = (),
         **more: Any,
@@ -140,9 +141,10 @@ class Folder:
 
         Args:
             file: the document.
-            right: whether a result is right, where it is not refused.
+            right: whether a result is right, in a loose place.
             words: of clear messages, beside the file's name and the place's.
             skip: whether a place is left out.
+            loose: whether what stands in a place may be wrong without an error.
             then: wraps a change of the file, as to adapt a checksum.
             but: names of values that may be right.
             **more: of the targets.
@@ -154,7 +156,12 @@ class Folder:
                 changes = wrong.each(lambda value, at=place: then(edited(d.put(at, value))))
                 named, name = tuple(map(str, place)), f"{root.name}/{file}"
                 yield self.target(
-                    f"{name}, {'/'.join(named)}", changes, right, (Path(file).name, *named, *words), file, **more
+                    f"{name}, {'/'.join(named)}",
+                    changes,
+                    right if loose(place) else None,
+                    (Path(file).name, *named, *words),
+                    file,
+                    **more,
                 )
 
     def arguments(self, name: str, **more: Any) -> Subject:

@@ -133,7 +133,7 @@ def targets() -> Iterator[Target]:
     whole = d.SEALED.but("cut by a byte", "a byte flipped at the start").each(d.written)
     yield FOLDER.target(file, whole, FOLDER.equal, file=file)
     yield FOLDER.target(f"{file} in its place", d.PLACES, file=file, within=4)
-    yield from FOLDER.document(file, FOLDER.equal)
+    yield from FOLDER.document(file, None)
     for what, (name, change) in BAD_ENTRIES.items():
         yield FOLDER.one(what, edited(d.put((name,), change)), (name,), file=file)
     hostile = {"an object": lambda file: file.write_bytes(Bomb.npz("features"))}

@@ -111,12 +111,13 @@ def _folders(name: str) -> Iterator[Target]:
         yield folder.target(f"{name}, {file}", wrong.each(d.written), right, file=file)
         yield folder.target(f"{name}, {file} in its place", d.PLACES, file=file, within=4)
     config = ("format", "builder", "settings", "sha256")
-    yield from folder.document(CONFIG, right, skip=lambda place: place[0] not in config, then=signed)
+    loose = lambda place: place[0] == "settings"  # noqa: E731
+    yield from folder.document(CONFIG, right, skip=lambda place: place[0] not in config, loose=loose, then=signed)
     for setting, values in SETTINGS[name].items():
         wrong = values.each(lambda value, setting=setting: signed(edited(d.put(("settings", setting), value))))
         yield folder.target(f"{name}, {setting}", wrong, words=(CONFIG, setting), file=CONFIG)
     first, last = (sorted(load_file(FOLDERS[name] / WEIGHTS))[at] for at in (0, -1))
-    yield from folder.document(WEIGHTS, right, skip=lambda place: place[0] not in (first, last), then=signed)
+    yield from folder.document(WEIGHTS, None, skip=lambda place: place[0] not in (first, last), then=signed)
     yield folder.target(f"{name}, weights", d.Wrong(CHANGES).each(edited).each(signed), file=WEIGHTS)
     half = signed(edited(lambda tensors: {**tensors, first: tensors[first].half()}))
     near = partial(right, near=1e-2)
