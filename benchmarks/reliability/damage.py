@@ -160,6 +160,7 @@ def covariance(size: int) -> Wrong:
         "not symmetric": _with(eye, (0, -1), 0.5),
         "negative variance": _with(eye, (-1, -1), -1.0),
         "indefinite": 1.5 * torch.ones(size, size) - eye,
+        "zero beside a correlation": 0.1 * torch.ones(size, size) * (1 - eye) + eye * (torch.arange(size) > 0),
     }
 
 
