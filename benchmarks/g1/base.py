@@ -1,4 +1,4 @@
-"""What all filters of a sensor and a seed share: sensor, statistics, the hand's place."""
+"""Holds what all filters of a seed share: sensor, statistics, the hand's place."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class TrainedSensor:
 
     @cached_property
     def hand(self) -> HandPlace:
-        """Where the hand is in the picture, of the arm's joints."""
+        """Returns the hand's place in the picture, of the arm's joints."""
         data = self.recordings.data
         return HandPlace(data, rows_of(data, self.roles.sensor), data.storage[:]["state"][:, list(ARM)])
 

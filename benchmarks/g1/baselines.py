@@ -1,4 +1,4 @@
-"""What needs no filter: do the pictures say anything, and does a filter say more than its sensor?"""
+"""Estimates without a filter: do the pictures say anything, and does a filter say more than its sensor?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How slowly the errors of a sensor change, on episodes that train and choose filters: no test episode has a say."""
+"""Measures how slowly a sensor's errors change, on episodes that train and choose filters: none is tested on."""
 
 from __future__ import annotations
 

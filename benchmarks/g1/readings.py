@@ -1,4 +1,4 @@
-"""What a sensor reads of whole episodes, with failing cameras; and windows of that.
+"""Reads whole episodes by a sensor, with failing cameras; and windows of that.
 
 A sensor stays as it is when filters are trained. Its trunk's features of every frame are computed once, and its
 stochastic head runs on those: afterwards a filter costs no pictures.
@@ -124,7 +124,7 @@ def read_codes(
 def with_readings(
     sensors: Sequence[ImageSensor], codes: TensorDict, members: int, start: Tensor, seed: int = 0
 ) -> TensorDict:
-    """What a filter reads, of features ``[N, T]``: the same random numbers each time.
+    """Returns what a filter reads, of features ``[N, T]``: the same random numbers each time.
 
     ======================= =============== ===========================================================================
     ``sensor``: ensemble    [N,T,E,D]       samples of the sensor
@@ -162,7 +162,7 @@ def standardised(encoding: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
 
 @torch.no_grad()
 def black_readings(sensors: Sequence[ImageSensor], members: int) -> TensorDict:
-    """What the sensor reads in a black picture, and whether such a picture counts as observed, ``[1, 1]``."""
+    """Returns the reading of a black picture, and whether such a picture counts as observed, ``[1, 1]``."""
     generator = torch.Generator().manual_seed(1)
     pixels = GREY * torch.rand(1, *sensors[0].image_shape, generator=generator)
     samples, encoding = read_code(sensors, code_of(sensors, pixels).unsqueeze(0), members, generator)
@@ -172,7 +172,7 @@ def black_readings(sensors: Sequence[ImageSensor], members: int) -> TensorDict:
 
 
 def blackouts(lengths: Tensor, seed: int = 0) -> Tensor:
-    """Where the black frames begin, ``[N]``: in the middle half of each episode."""
+    """Draws where the black frames begin, ``[N]``: in the middle half of each episode."""
     share = torch.rand(len(lengths), generator=torch.Generator().manual_seed(seed))
     return (lengths * (0.25 + 0.5 * share)).long()
 

@@ -39,7 +39,7 @@ class Statistics:
 
     @classmethod
     def of(cls, sequences: list[Tensor], pixels: Tensor) -> Statistics:
-        """Of true numbers of episodes ``[T, 13]`` and of pictures, uint8."""
+        """Takes statistics of true numbers of episodes ``[T, 13]`` and of pictures, uint8."""
         flat, some = torch.cat(sequences), pixels[:: max(len(pixels) // 300, 1)].float() / 255
         rates = [one.diff(dim=0) for one in sequences]
         rate = torch.cat(rates).square().mean(0).sqrt().clamp_min(1e-4)

@@ -53,7 +53,7 @@ class Study(Recordings):
 
 
 class Base:
-    """What all filters of a seed share.
+    """Holds what all filters of a seed share.
 
     Args:
         study: the study.
@@ -75,11 +75,11 @@ class Base:
 
     @property
     def start(self) -> Tensor:
-        """Where the training episodes begin, ``[N, D]``."""
+        """Returns where the training episodes begin, ``[N, D]``."""
         return torch.stack([state[0] for state, _ in self.sequences])
 
     def _pictures(self, role: str) -> dict[str, TensorDict]:
-        """What the sensor reads of the episodes of a role in all pictures; encodings as they are."""
+        """Returns what the sensor reads of the episodes of a role in all pictures; encodings as they are."""
         trained, study = self.trained, self.study
         sensors, _ = trained.trained
         numbers, out = getattr(trained.roles, role), {}
@@ -107,7 +107,7 @@ class Base:
         return readings.copy().set("sensor", sensor)
 
     def _readings(self, role: str) -> dict[str, TensorDict]:
-        """What the sensor reads of the episodes of a role, in all conditions."""
+        """Returns what the sensor reads of the episodes of a role, in all conditions."""
         pictures = self._tune if role == "tune" else self._pictures(role)
         out = {condition: self._standardised(one) for condition, one in pictures.items()}
         for condition in set(CONDITIONS) - set(PICTURES):

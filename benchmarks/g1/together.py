@@ -52,7 +52,7 @@ class Together(Recordings):
 
 
 class Arm:
-    """What a camera reads of the arm, its motion, and how the sensors err.
+    """Holds what a camera reads of the arm, its motion, and how the sensors err.
 
     Args:
         study: where the recordings are.
@@ -85,7 +85,7 @@ class Arm:
 
     @torch.no_grad()
     def read(self, codes: TensorDict) -> TensorDict:
-        """What the camera's head makes of features."""
+        """Returns what the camera's head makes of features."""
         out, generator = codes.select("valid"), torch.Generator().manual_seed(0)
         samples, encoding = read_code(self.sensor.trained[0], codes["code"], SAMPLES, generator)
         out["camera"], out["encoding"] = samples[..., :SIZE].mean(-2), encoding
@@ -119,11 +119,11 @@ class Arm:
 
     @property
     def noise(self) -> MappedNoise:
-        """What the motion does not foresee of a row."""
+        """Returns the noise of the motion in a row."""
         return unforeseen(self.motion, self.pairs, self.surprise)
 
     def start(self, begins: bool = True) -> MomentPrior:
-        """Where episodes begin, or where the arm is at any time; at rest, or nearly."""
+        """Returns where episodes begin, or where the arm is at any time; at rest, or nearly."""
         poses = torch.stack([state[0] for state, _ in self.known]) if begins else torch.cat([s for s, _ in self.known])
         rate = self.motion.rate.square().diag()
         mean = torch.cat([poses.mean(0), torch.zeros(SIZE)])
@@ -135,7 +135,7 @@ class Arm:
         return [self.readings(role) for role in ("tune", "validation")]
 
     def errors(self, name: str, kind: str = "episodes") -> tuple[FadingBias | None, Tensor]:
-        """What lasts of a sensor's errors, ``"episodes"`` for a part that is an episode's, and what is white."""
+        """Estimates a sensor's bias, ``"episodes"`` for a part that is an episode's, and its white noise."""
         errors = [torch.where(one[f"{name}_observed"], one[name] - one["state"], torch.nan) for one in self.unseen]
         every = pad_sequence([error for one in errors for error in one], batch_first=True, padding_value=torch.nan)
         if kind == "white":
@@ -158,7 +158,7 @@ class Arm:
 
 @torch.no_grad()
 def unforeseen(motion: nn.Module, pairs: list[Tensor], surprise: float = SURPRISE) -> MappedNoise:
-    """What a motion does not foresee of a row of true states: of the rates, and through them of the joints."""
+    """Returns the noise of a motion from true states: of the rates, and through them of the joints."""
     missed = torch.cat([one[1:, SIZE:] - motion(one[:-1])[:, SIZE:] for one in pairs])
     root = surprise * torch.linalg.cholesky(missed.mT @ missed / len(missed))
     unit = ConstantNoise([1.0] * SIZE, in_key=("belief", "mean"), out_key=("forecast", "noise"))

@@ -60,7 +60,7 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came out of a case.
+    """Says what came out of a case.
 
     Attributes:
         kind: ``clear``: an error raised in this library that names what was damaged. ``right``: no error, and the

@@ -107,7 +107,7 @@ def indices(size: int) -> Wrong:
 
 
 def dims(size: int) -> Wrong:
-    """Likewise, of components that are read: each at most once."""
+    """Returns indices of components that are read: each at most once."""
     return indices(size) | {"twice the same": [0, 0]}
 
 
@@ -302,12 +302,12 @@ def leaves(result: Any) -> dict[str, Tensor]:
 
 
 def finite(result: Any) -> bool:
-    """Whether all numbers are finite."""
+    """Tells whether all numbers are finite."""
     return all(bool(value.isfinite().all()) for value in leaves(result).values())
 
 
 def same(result: Any, expected: Any, *, rtol: float = 0.0, atol: float = 0.0) -> bool:
-    """Whether two results have the same entries, with the same numbers."""
+    """Tells whether two results have the same entries, with the same numbers."""
     one, other = leaves(result), leaves(expected)
     return one.keys() == other.keys() and all(
         one[key].shape == other[key].shape
@@ -317,7 +317,7 @@ def same(result: Any, expected: Any, *, rtol: float = 0.0, atol: float = 0.0) ->
 
 
 def kept(result: Any, expected: Any, *, most: int = 1, rtol: float = 0.0) -> bool:
-    """Whether rows are as expected, but for some that are marked as missing, or lack at the end.
+    """Tells whether rows are as expected, but for some that are marked as missing, or lack at the end.
 
     Args:
         result: entries ``[N, ...]``.

@@ -49,14 +49,14 @@ Row = dict[str, str]  # border, case, kind, what, and how to run it again
 
 
 def all_targets(borders: Sequence[str] = BORDERS) -> list[Target]:
-    """What may be damaged, in an order of its own."""
+    """Returns what may be damaged, in an order of its own."""
     places = {name: "tests" if name in TESTED else "benchmarks.reliability" for name in borders}
     modules = [import_module(f"{place}.borders.{name}") for name, place in places.items()]
     return [target for module in modules for target in module.targets()]
 
 
 def row(case: Case, verdict: Verdict, again: str) -> Row:
-    """What came of a case, for the record."""
+    """Records what came of a case."""
     return {"border": case.border, "case": case.name, "kind": verdict.kind, "what": verdict.text, "again": again}
 
 

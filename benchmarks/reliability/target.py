@@ -1,4 +1,4 @@
-"""What is attacked: things with arguments, things with files, and the damage that each of them can take."""
+"""Lists what is attacked: things with arguments, things with files, and the damage that each of them can take."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Target:
         return replace(self, wrong=d.Wrong(named, self.wrong.others))
 
     def named(self) -> list[Case]:
-        """Those that are always tried."""
+        """Returns those that are always tried."""
         return [self.case(one) for one in self.wrong.named.items()]
 
     def some(self) -> st.SearchStrategy[Case]:
@@ -95,15 +95,15 @@ class Folder:
     read: Callable[..., Any]
 
     def reference(self, **options: Any) -> Any:
-        """What is read without damage, once for all."""
+        """Returns what is read without damage, once for all."""
         return _reference(self, tuple(options.items()))
 
     def equal(self, result: Any, **options: Any) -> bool:
-        """Whether a result is that."""
+        """Tells whether a result is that."""
         return d.same(result, self.reference(**options))
 
     def damaged(self, change: d.Change, folder: Path, file: str = "", **options: Any) -> Any:
-        """What a user reads of a changed copy."""
+        """Returns what a user reads of a changed copy."""
         root = d.copied(self.sound(), folder)
         change(root / file)
         return self.read(root, **options)
@@ -165,7 +165,7 @@ class Folder:
                 )
 
     def arguments(self, name: str, **more: Any) -> Subject:
-        """What it is read with, as arguments of something by this name."""
+        """Returns what it is read with, as arguments of something by this name."""
         return Subject(lambda **given: self.read(self.sound(), **given), name=name, **more)
 
     def one(self, name: str, change: d.Change, words: str | tuple[str, ...], **more: Any) -> Target:

@@ -84,6 +84,6 @@ def _cell(rows: Sequence[dict]) -> str:
 
 
 def _resized(row: dict, rows: Sequence[dict]) -> bool:
-    """Whether a row is one of the ensemble sizes that is not the filter's own: those have clean rows alone."""
+    """Tells whether a row is one of the ensemble sizes that is not the filter's own: those have clean rows alone."""
     same = {key: row[key] for key in NAMES if key != "condition"}
     return row["filter"] != "sensor" and not pick(rows, condition="black20", **same)

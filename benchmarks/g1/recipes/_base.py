@@ -1,4 +1,4 @@
-"""How to compose, train and tune a filter; the registry."""
+"""Composes, trains and tunes a filter; the registry."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class G1Recipe(ArmRecipe):
 
     @property
     def white(self) -> float:
-        """What R holds of the sensor's errors before training: all, where the state holds no bias."""
+        """Returns R's share of the sensor's errors before training: all, where the state holds no bias."""
         return WHITE if self.bias else 1.0
 
     @property
@@ -112,7 +112,7 @@ class G1Recipe(ArmRecipe):
 
     @property
     def process_std(self) -> Tensor:
-        """What motion and bias do not know before training: accelerations; biases stay as large."""
+        """Returns what motion and bias do not know before training: accelerations; biases stay as large."""
         slow = (1 - FADING**2) ** 0.5 * SLOW * self.error
         return torch.cat([SURPRISE * self.motion.acceleration, slow])[: len(self.noisy)]
 
@@ -142,6 +142,6 @@ class G1Recipe(ArmRecipe):
         return Filter(self.modules(), initial=self._initial(self.start, 0.3))
 
     def for_training(self, model: Filter) -> Filter:
-        """The same filter, sharing all parameters, for windows that begin near what the sensor says."""
+        """Returns the same filter, sharing all parameters, for windows that begin near what the sensor says."""
         parts = OrderedDict((name, model[name]) for name in model.module)
         return Filter(parts, initial=self._initial(2**0.5 * self.error, 1.0))

@@ -46,6 +46,6 @@ class DEnKF(G1Recipe):
 
 @register
 class DEnKFActions(DEnKF):
-    """The same, told the commands."""
+    """Reads the commands, too."""
 
     actions = True

@@ -123,7 +123,7 @@ def _tracked(**given: Any) -> Any:
 
 
 def _no_moments(points: torch.Tensor) -> bool:
-    """What functions of tensors promise where an element of a batch has no result: that it is NaN, and no other one.
+    """Checks what functions of tensors promise where an element of a batch has no result: that it alone is NaN.
 
     They look at no values, which under ``torch.compile`` and on a GPU would cost more than they do. Of sigma points
     without a covariance nothing finite may be left in their moments.

@@ -213,7 +213,7 @@ def _nothing(root: Path) -> None:
 
 
 def act(name: str, changes: dict[str, Any], change: d.Change, folder: Path) -> str:
-    """What a command says of a changed copy, with changed words."""
+    """Returns what a command says of a changed copy, with changed words."""
     root = copied(base(), folder)
     change(root)
     given = {option: value for option, value in {**COMMANDS[name], **changes}.items() if value is not LEFT_OUT}

@@ -32,7 +32,7 @@ def sound(compiled: bool) -> Path:
 
 
 def entries() -> dict[str, Any]:
-    """What a step takes."""
+    """Returns what a step takes."""
     return {
         "observation": torch.tensor([1.0, 2.0]),
         "observed": torch.ones(1, dtype=torch.bool),
