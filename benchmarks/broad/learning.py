@@ -31,7 +31,7 @@ from benchmarks.common.arguments import command, parse
 from torch_denkf.applications.imu.filter import ImuFilter, ImuSettings, moves
 from torch_denkf.applications.imu.log import block_size, imu_rows
 from torch_denkf.deployment.files import write_text
-from torch_denkf.functional.manifolds import SO3, rotation_matrix
+from torch_denkf.functional.manifolds import SO3
 
 __all__ = ["Equations", "Rows", "beliefs", "learn", "minimised"]
 
@@ -40,9 +40,9 @@ FREE = (
     *("gyro", "gyro_rate", "gyro_walk", "motion", "motion_unrest", "accelerometer", "gyro_scale", "gyro_skew"),
     *("magnetic_bias", "magnetic_walk", "magnetometer", "magnetometer_rate", "field_walk"),
     *("stray", "stray_unrest", "stray_time"),
-    *("lag_std", "heading", "heading_scale", "heading_floor", "tilt_scale", "tilt_floor"),
+    *("lag_std", "lever", "lever_walk", "heading", "heading_scale", "heading_floor", "tilt_scale", "tilt_floor"),
 )
-START = ImuSettings()
+START, LAG = ImuSettings(), 29  # its place in a tangent
 #: Kinds that are left out together.
 FOLDS = (
     ("attached magnet", "slow rotation", "fast translation"),
@@ -78,7 +78,7 @@ class Rows:
     def __init__(self, trial: Trial, settings: ImuSettings, every: int = 3, *, six: bool = False, short: bool = False):
         field = None if six else trial.magnetometer
         rows = imu_rows(settings, trial.gyro, trial.acceleration, field, rate=trial.rate)
-        names = ("gyro", "accelerometer", "magnetometer", "unrest", "disturbance")
+        names = ("gyro", "accelerometer", "magnetometer", "unrest", "disturbance", "lever")
         self.values = [np.ascontiguousarray(rows[name].numpy()) for name in names]
         self.rest = np.ascontiguousarray(rows["rest_observed"].numpy(), np.uint8)
         self.count, self.dt, self.state = len(rows), rows["dt"][0].item(), rows["start"][0].numpy().copy()
@@ -102,66 +102,29 @@ class Equations:
             subprocess.run(["cc", source, *options[:-1], "-o", file, options[-1]], check=True)
             self.library = ctypes.CDLL(str(file))
 
-    def __call__(
-        self, rows: Rows, s: ImuSettings, *, nine: bool = True, kept: ndarray | None = None
-    ) -> tuple[ndarray, ndarray, ndarray]:
-        """Orientations ``[N, 4]``, covariances ``[N, 9]`` about the body's axes, and states ``[N, 33]``.
+    def __call__(self, rows: Rows, s: ImuSettings, *, nine: bool = True) -> tuple[ndarray, ndarray, ndarray]:
+        """Returns orientations ``[N, 4]``, covariances ``[N, 9]`` about the world's axes, and states ``[N, 36]``.
 
         Args:
             rows: of the trial.
             s: the numbers.
             nine: whether the magnetometer is read.
-            kept: gets what a smoother needs, ``[N, 3 * 33 * 33 + 37]``.
         """
-        motion = ImuFilter(s)
         numbers = [s.gyro, s.gyro_rate, s.gyro_walk, 2 * sum(s.poles), s.motion, s.motion_unrest, s.accelerometer]
         numbers += [s.magnetometer, s.magnetometer_rate, s.magnetic_walk, s.field_walk, s.rest, s.gravity]
-        numbers += [s.stray, s.stray_unrest, s.stray_time]
-        start = motion.initial.std.double().numpy()
-        step = moves(s.poles, rows.dt).numpy().copy()
-        found = np.empty((rows.count, 4)), np.empty((rows.count, 9)), np.zeros((rows.count, 33))
-        own = [*rows.values, rows.rest]
+        numbers += [s.stray, s.stray_unrest, s.stray_time, s.lever_walk]
+        start, step = ImuFilter(s).initial.std.double().numpy(), moves(s.poles, rows.dt).numpy().copy()
+        found = np.empty((rows.count, 4)), np.empty((rows.count, 9)), np.zeros((rows.count, len(start)))
         given = [step, np.array(numbers), np.ascontiguousarray(start), rows.state, *found]
-        last = None if kept is None else _pointer(kept)
-        arrays = (*map(_pointer, own), int(nine), *map(_pointer, given), last)
+        arrays = (*map(_pointer, [*rows.values, rows.rest]), int(nine), *map(_pointer, given))
         self.library.filter(rows.count, ctypes.c_double(rows.dt), *arrays)
         return found
 
 
-def beliefs(
-    run: Equations, trial: Trial, settings: ImuSettings, *, six: bool = False, smooth: bool = False
-) -> tuple[Tensor, Tensor]:
-    """Returns means ``[N, 34]`` and covariances of the orientation ``[N, 3, 3]``, as filter and smoother write them."""
-    rows = Rows(trial, settings, six=six)
-    kept = np.zeros((rows.count, 3 * 33 * 33 + 37)) if smooth else None
-    quaternion, cov, states = map(torch.as_tensor, run(rows, settings, nine=not six, kept=kept))
-    mean, cov = torch.cat([quaternion, states[:, 3:]], -1), cov.unflatten(-1, (3, 3))
-    if kept is not None:
-        mean, cov = _smoothed(mean, torch.as_tensor(kept))
-    axes = rotation_matrix(mean[:, :4])
-    return mean, axes @ cov @ axes.mT
-
-
-def _smoothed(mean: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns smoothed means and covariances of rotations about the body's axes (Rauch, Tung & Striebel)."""
-    moves, ahead, after = kept[:, : 3 * 33 * 33].unflatten(-1, (3, 33, 33)).unbind(1)
-    forecast = torch.cat([kept[:, -37:-33], kept[:, -30:]], -1)
-    space, found, cov = SO3(), [mean[-1]], after[-1]
-    turns = [cov[:3, :3]]
-    for t in range(len(mean) - 2, -1, -1):
-        gain = torch.linalg.solve(ahead[t + 1], moves[t + 1] @ after[t]).mT
-        turn = space.log(space.compose(space.inverse(forecast[t + 1, :4]), found[-1][:4]))
-        step = gain @ torch.cat([turn, found[-1][4:] - forecast[t + 1, 4:]])
-        back = gain.clone()
-        back[:, :3] = torch.linalg.solve(space.right_jacobian(turn), gain[:, :3], left=False)
-        cov = after[t] - gain @ ahead[t + 1] @ gain.mT + back @ cov @ back.mT
-        jacobian = torch.eye(33, dtype=cov.dtype)
-        jacobian[:3, :3] = space.right_jacobian(step[:3])
-        cov = jacobian @ cov @ jacobian.mT
-        cov = (cov + cov.mT) / 2
-        found.append(torch.cat([space.plus(mean[t, :4], step[:3]), mean[t, 4:] + step[3:]]))
-        turns.append(cov[:3, :3])
-    return torch.stack(found[::-1]), torch.stack(turns[::-1])
+def beliefs(run: Equations, trial: Trial, settings: ImuSettings, *, six: bool = False) -> tuple[Tensor, Tensor]:
+    """Returns means ``[N, 37]`` and covariances of the orientation ``[N, 3, 3]``, as the filter writes them."""
+    quaternion, cov, states = map(torch.as_tensor, run(Rows(trial, settings, six=six), settings, nine=not six))
+    return torch.cat([quaternion, states[:, 3:]], -1), cov.unflatten(-1, (3, 3))
 
 
 def _pointer(array: ndarray) -> ctypes.c_void_p:
@@ -175,8 +138,7 @@ def measures(run: Equations, rows: Rows, s: ImuSettings, *, nine: bool = True) -
     error = SO3().compose(found, SO3().inverse(rows.truth)).numpy()
     error = error * np.where(error[:, :1] < 0, -1, 1)
     w, x, y, z = error.T
-    axes = _matrices(found.numpy())
-    world = np.degrees(1) ** 2 * axes @ cov[rows.scored].reshape(-1, 3, 3) @ axes.transpose(0, 2, 1)
+    world = np.degrees(1) ** 2 * cov[rows.scored].reshape(-1, 3, 3)
     total, heading = np.degrees(2 * np.arccos(np.clip(w, 0, 1))), np.degrees(2 * np.arctan2(z, w))
     tilt = np.degrees(2 * np.arccos(np.clip(np.hypot(w, z), 0, 1)))
     variance = s.heading_scale**2 * world[:, 2, 2] + s.heading_floor**2
@@ -193,16 +155,6 @@ def measures(run: Equations, rows: Rows, s: ImuSettings, *, nine: bool = True) -
         "heading_held": (one < 2.7055).mean(),
         "tilt_held": (two < 4.6052).mean(),
     }
-
-
-def _matrices(q: ndarray) -> ndarray:
-    w, x, y, z = q.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
 
 
 def minimised(
@@ -262,7 +214,7 @@ def learn(run: Equations, trials: Sequence[Trial], generations: int, seed: int) 
     """Learns the numbers from some trials."""
     plain = [Rows(trial, replace(START, lag=0.0)) for trial in trials]
     weights = [np.square(each.values[0]).sum() for each in plain]
-    lags = [run(each, replace(START, lag_std=0.01))[2][-1, 29] for each in plain]
+    lags = [run(each, replace(START, lag_std=0.01))[2][-1, LAG] for each in plain]
     lag = float(np.average(lags, weights=weights))
     rows = [Rows(trial, replace(START, lag=lag), short=True) for trial in trials]
     s = replace(START, lag=lag, latency=latency(run, rows, START))

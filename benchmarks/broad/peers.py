@@ -89,7 +89,9 @@ def slower(trial: Trial, times: int = 4) -> Trial:
         for name in ("gyro", "acceleration", "magnetometer")
     }
     at = slice(times - 1, count * times, times)
-    return replace(trial, **sensors, orientation=trial.orientation[at], scored=trial.scored[at], rate=trial.rate / times)
+    return replace(
+        trial, **sensors, orientation=trial.orientation[at], scored=trial.scored[at], rate=trial.rate / times
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -48,7 +48,7 @@ class Study:
     data: Path = Path("../shared/data/broad")  # folder with .npz files of BROAD
     out: Path | None = None  # folder for broad.csv, broad.json, broad.md and broad.png
     smoother: bool = True  # run the smoother, too
-    equations: bool = False  # the filter by equations.c, for learning: a second a trial; needs the C compiler cc
+    equations: bool = False  # the filter by equations.c instead, without smoother; needs the C compiler cc
     smoke: bool = False  # ten simulated seconds: does it run?
 
 
@@ -61,20 +61,17 @@ class Runner:
     """
 
     def __init__(self, smoother: bool = True, equations: bool = False):
-        self.smoother, self.equations = smoother, Equations() if equations else None
+        self.smoother, self.equations = smoother and not equations, Equations() if equations else None
 
     @torch.no_grad()
     def __call__(self, settings: ImuSettings, trials: Sequence[Trial]) -> list[dict[str, Orientations]]:
         """Returns orientations by method, for each trial."""
         if self.equations is not None:
-            ways = {OWN: {}, SIX: {"six": True}} | ({SMOOTH: {"smooth": True}} if self.smoother else {})
-            return [
-                {
-                    way: at_readings(settings, *beliefs(self.equations, trial, settings, **of), trial.gyro, trial.rate)
-                    for way, of in ways.items()
-                }
-                for trial in trials
-            ]
+            found = []
+            for trial in trials:
+                runs = {way: beliefs(self.equations, trial, settings, six=way == SIX) for way in (OWN, SIX)}
+                found.append({way: at_readings(settings, *run, trial.gyro, trial.rate) for way, run in runs.items()})
+            return found
         both = []
         for trial in trials:
             both.append(imu_rows(settings, trial.gyro, trial.acceleration, trial.magnetometer, rate=trial.rate))
@@ -89,7 +86,9 @@ class Runner:
             if self.smoother:
                 ways[SMOOTH] = "smoothed", 2 * place
             count = len(both[2 * place])
-            moments = {way: [out[key, name][row, :count] for name in ("mean", "cov")] for way, (key, row) in ways.items()}
+            moments = {
+                way: [out[key, name][row, :count] for name in ("mean", "cov")] for way, (key, row) in ways.items()
+            }
             found.append({way: at_readings(settings, *each, trial.gyro, trial.rate) for way, each in moments.items()})
         return found
 
@@ -169,7 +168,11 @@ def page(rows: Sequence[dict], smoke: bool = False) -> str:
         parts = own, *([row for row in own if ("_disturbed" in row["trial"]) == hit] for hit in (False, True))
         text.append(line(method, *(coverage(part, method in north) for part in parts)))
     own_coverage = " / ".join(HELD)
-    text += ["", f"Total error of each trial, degrees, and coverage ({own_coverage}) of the intervals of {OWN}{MOVED}, %.", ""]
+    text += [
+        "",
+        f"Total error of each trial, degrees, and coverage ({own_coverage}) of the intervals of {OWN}{MOVED}, %.",
+        "",
+    ]
     text += head("trial", *north, "coverage")
     for name in names:
         cells = [f"{pick(rows, trial=name, method=method)[0]['total']:.2f}" for method in north]

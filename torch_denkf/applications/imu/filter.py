@@ -19,10 +19,11 @@ from torch_denkf.submodel import Sensor, SubModel
 __all__ = ["SPACE", "ImuFilter", "ImuMotion", "ImuNoise", "ImuSettings", "MagnetometerNoise", "imu", "moves"]
 
 #: Orientation (errors in the world's axes); the gyro's bias and its matrix of errors; position, velocity and
-#: acceleration in the world's axes; the magnetometer's bias; the field northwards and upwards; the magnetometer's lag;
-#: the stray field in the world's axes.
-SPACE = Product(Opposite(SO3()), *map(Euclidean, (3, 9, 3, 3, 3, 3, 2, 1, 3)))
-BIAS = 4  # its place in a point
+#: acceleration in the body's axes; the magnetometer's bias; the field northwards and upwards; the magnetometer's lag;
+#: the stray field in the body's axes; the lever, likewise. Vectors in the body's axes turn with the orientation's error,
+#: so that an accelerometer says nothing of the heading to this filter.
+SPACE = Product(Opposite(SO3()), *map(Euclidean, (3, 9, 3, 3, 3, 3, 2, 1, 3, 3)))
+BIAS, FIELD = 4, 28  # their places in a point
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,9 @@ class ImuSettings:
         stray_time: in which it fades to 1/e, in s.
         lag: how much later the magnetometer reads than the gyro, in s.
         lag_std: standard deviation of that number.
+        lever: standard deviation of the lever at the start, about each axis, in m: whatever is held in a hand turns
+            about a joint, so that its acceleration follows from how it turns.
+        lever_walk: of the lever, in m/sqrt(s).
         tilt: standard deviation of the inclination at the start, in rad.
         heading: of the heading at the start, in rad.
         rest: of the gyro's mean over a block at rest, in rad/s.
@@ -86,6 +90,8 @@ class ImuSettings:
     stray_time: float = 1.0
     lag: float = 0.0
     lag_std: float = 0.003
+    lever: float = 0.1
+    lever_walk: float = 0.01
     tilt: float = 0.05
     heading: float = 0.1
     rest: float = 0.002
@@ -125,12 +131,13 @@ class ImuMotion(Motion):
 
     def move(self, state, gyro, moves, *, dt):
         """The state one step later."""
-        orientation, bias, errors, position, velocity, acceleration, *others, stray = SPACE.points(state)
-        rate = gyro - bias - (errors.unflatten(-1, (3, 3)) * gyro.unsqueeze(-2)).sum(-1)
-        turned = SO3().plus(orientation, rate * dt)
+        orientation, bias, errors, position, velocity, acceleration, *others, stray, lever = SPACE.points(state)
+        turn = SO3().exp((gyro - bias - (errors.unflatten(-1, (3, 3)) * gyro.unsqueeze(-2)).sum(-1)) * dt)
         matrix, before = moves.unflatten(-1, (3, 3)), torch.stack([position, velocity, acceleration], -2)
         moved = (matrix.unsqueeze(-1) * before.unsqueeze(-3)).sum(-2)
-        return torch.cat([turned, bias, errors, moved.flatten(-2), *others, stray * (-dt / self.stray_time).exp()], -1)
+        stray = stray * (-dt / self.stray_time).exp()
+        *moved, stray = (rotate(SO3().inverse(turn), vector) for vector in (*moved.unbind(-2), stray))
+        return torch.cat([SO3().compose(orientation, turn), bias, errors, *moved, *others, stray, lever], -1)
 
 
 def moves(poles: Sequence[float], dt: float) -> Tensor:
@@ -150,7 +157,7 @@ def moves(poles: Sequence[float], dt: float) -> Tensor:
 
 
 class ImuNoise(SubModel):
-    """Variances ``[*B, 33]`` that a step adds, learnable: of the gyro, the motion's acceleration and slow errors.
+    """Variances ``[*B, 36]`` that a step adds, learnable: of the gyro, the motion's acceleration and slow errors.
 
     Args:
         settings: the numbers before training.
@@ -161,7 +168,7 @@ class ImuNoise(SubModel):
         super().__init__(nn.Identity(), keys, [("forecast", "noise")])
         s = settings
         shares = [s.gyro, s.gyro_rate, s.gyro_walk, s.motion, s.motion_unrest, s.magnetic_walk, s.field_walk]
-        shares += [s.stray, s.stray_unrest]
+        shares += [s.stray, s.stray_unrest, s.lever_walk]
         self.log_std = nn.Parameter(torch.tensor(shares).log())
         self.register_buffer("damping", torch.tensor(2 * sum(s.poles)))
         self.register_buffer("stray_time", torch.tensor(s.stray_time))
@@ -169,10 +176,10 @@ class ImuNoise(SubModel):
     def compute(self, mean, gyro, unrest, disturbance, dt):
         """The variances of the step."""
         rate, variance = gyro.square().sum(-1, keepdim=True), (2 * self.log_std).exp()
-        white, by_rate, walk, motion, by_unrest, bias, field, stray, by_disturbance = variance.unbind(-1)
+        white, by_rate, walk, motion, by_unrest, bias, field, stray, by_disturbance, lever = variance.unbind(-1)
         turn, push = white + by_rate * rate, self.damping * (motion + by_unrest * unrest.square())
         new = (stray + by_disturbance * disturbance.square()) * -torch.expm1(-2 * dt / self.stray_time) / dt
-        sizes = ((turn, 3), (walk, 3), (0, 15), (push, 3), (bias, 3), (field, 2), (0, 1), (new, 3))
+        sizes = ((turn, 3), (walk, 3), (0, 15), (push, 3), (bias, 3), (field, 2), (0, 1), (new, 3), (lever, 3))
         columns = [(one + torch.zeros_like(dt)).expand(*dt.shape[:-1], count) for one, count in sizes]
         return (torch.cat(columns, -1) * dt).to(mean.dtype)
 
@@ -181,13 +188,14 @@ class _Accelerometer(SubModel):
     """Specific force in the body's axes ``[*B, E, 3]``."""
 
     def __init__(self, gravity: float):
-        super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
+        super().__init__(nn.Identity(), [("forecast", "ensemble"), "lever"], [("forecast", "observation")])
         self.register_buffer("up", torch.tensor([0.0, 0.0, gravity]))
 
-    def compute(self, state):
-        """Gravity, and the motion's acceleration."""
-        orientation, *_, acceleration = SPACE.points(state)[:6]
-        return rotate(SO3().inverse(orientation), acceleration + self.up)
+    def compute(self, state, lever):
+        """Gravity, and the acceleration of the joint and about it; ``lever`` ``[*B, 9]``, see :func:`imu_rows`."""
+        parts = SPACE.points(state)
+        about = (lever.unflatten(-1, (3, 3)).unsqueeze(-3) * parts[10].unsqueeze(-2)).sum(-1)
+        return rotate(SO3().inverse(parts[0]), self.up) + parts[5] + about
 
 
 class _Magnetometer(SubModel):
@@ -198,10 +206,9 @@ class _Magnetometer(SubModel):
 
     def compute(self, state, gyro):
         """The field in the axes of the body as they were, and the bias."""
-        parts = SPACE.points(state)
-        field = torch.nn.functional.pad(parts[7], (1, 0)) + parts[9]
-        field = rotate(SO3().inverse(parts[0]), field)
-        return field + parts[8] * torch.linalg.cross(gyro.unsqueeze(-2).expand_as(field), field) + parts[6]
+        orientation, *_, bias, field, lag, stray, _ = SPACE.points(state)
+        field = rotate(SO3().inverse(orientation), torch.nn.functional.pad(field, (1, 0))) + stray
+        return field + lag * torch.linalg.cross(gyro.unsqueeze(-2).expand_as(field), field) + bias
 
 
 class MagnetometerNoise(Sensor):
@@ -245,6 +252,7 @@ class ImuFilter(FusedFilter):
         start = [s.tilt] * 2 + [s.heading] + [s.gyro_bias] * 3
         start += [s.gyro_scale if row == column else s.gyro_skew for row in range(3) for column in range(3)]
         start += [s.motion_start] * 9 + [s.magnetic_bias] * 3 + [s.field] * 2 + [s.lag_std] + [s.stray] * 3
+        start += [s.lever] * 3
         force_noise = ConstantNoise([s.accelerometer] * 3, trainable=True, in_key="accelerometer")
         sensors = {
             "accelerometer": FusedSensor(_Accelerometer(s.gravity), force_noise),

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf._checks import check_number, check_shape
-from torch_denkf.applications.imu.filter import SPACE, ImuFilter, ImuSettings, moves
+from torch_denkf.applications.imu.filter import FIELD, SPACE, ImuFilter, ImuSettings, moves
 from torch_denkf.functional.manifolds import SO3, quaternion_of, rotate, rotation_matrix
 from torch_denkf.smoothers import RTSSmoother
 
@@ -26,8 +26,8 @@ class Orientations(NamedTuple):
         quaternion: ``[T, 4]``, w first, from the sensor's axes to the world's.
         std: standard deviations of rotations about the world's x, y and z, ``[T, 3]`` in rad: inclination about two
             axes, and heading.
-        mean: the filter's beliefs, a point of its space for each block, ``[N, 34]``.
-        cov: their covariances ``[N, 33, 33]``.
+        mean: the filter's beliefs, a point of its space for each block, ``[N, 37]``.
+        cov: their covariances ``[N, 36, 36]``.
     """
 
     quaternion: Tensor
@@ -67,10 +67,13 @@ def imu_rows(
     if not 5 < size < 20:
         raise ValueError(f"acceleration is in m/s^2, where gravity is 9.81; the median of its size is {size:.3g}.")
     count, dt = block_size(settings, rate), 1 / rate
+    faster = torch.cat([torch.zeros_like(gyro[:1]), gyro.diff(dim=0)]) * rate
     blocks = len(gyro) // count
     if not blocks:
         raise ValueError(f"a log needs at least {count} readings, one block of {settings.block} s; got {len(gyro)}.")
-    gyro, force = (value[: blocks * count].unflatten(0, (blocks, count)) for value in (gyro, acceleration))
+    gyro, faster, force = (
+        value[: blocks * count].unflatten(0, (blocks, count)) for value in (gyro, faster, acceleration)
+    )
     turns, to_end = SO3().exp(gyro * dt), [SO3().neutral(gyro).expand(blocks, 4)]
     for place in range(count - 1, 0, -1):
         to_end.append(SO3().compose(turns[:, place], to_end[-1]))
@@ -79,6 +82,10 @@ def imu_rows(
     rows = TensorDict({"gyro": SO3().log(total) / (count * dt), "dt": gyro.new_full((blocks, 1), count * dt)}, [blocks])
     rows["moves"] = moves(settings.poles, count * dt).to(gyro).expand(blocks, 9)
     rows["accelerometer"], rows["accelerometer_observed"] = _mean(rotate(back, force))
+    lever = []  # acceleration of a point that turns with the body, by its distance along each axis
+    for axis in torch.eye(3).to(gyro).expand(blocks, count, 3, 3).unbind(-2):
+        lever.append(rotate(back, gyro.cross(gyro.cross(axis, -1), -1) + faster.cross(axis, -1)).mean(1))
+    rows["lever"] = torch.stack(lever, -1).flatten(-2)
     if magnetometer is None:
         rows["magnetometer"] = torch.zeros_like(rows["gyro"])
         rows["magnetometer_observed"] = torch.zeros_like(rows["accelerometer_observed"])
@@ -141,7 +148,7 @@ def at_readings(settings: ImuSettings, mean: Tensor, cov: Tensor, gyro: Tensor, 
     blocks = len(mean) + 1  # the last may be short
     rates = torch.nn.functional.pad(gyro, (0, 0, 0, blocks * count - length)).unflatten(0, (blocks, count))
     before = torch.cat([mean[:1], mean])  # what the readings of a block start from
-    _, bias, errors = SPACE.points(before)[:3]
+    bias, errors = SPACE.points(before)[1:3]
     rates = rates - bias.unsqueeze(1) - rates @ errors.unflatten(-1, (3, 3)).mT
     turns = SO3().exp(rates / rate)
     steps = [turns[:, 0]]
@@ -207,7 +214,7 @@ def _start(rows: TensorDict) -> Tensor:
         axes = rotation_matrix(_level(up))
     state = SPACE.neutral(up)
     state[:4] = quaternion_of(axes)
-    state[28:30] = (axes @ field)[1:] if seen else 0
+    state[FIELD : FIELD + 2] = (axes @ field)[1:] if seen else 0
     return state
 
 
