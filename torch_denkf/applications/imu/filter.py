@@ -66,6 +66,8 @@ class ImuSettings:
         heading_floor: least standard deviation of the heading, in degrees.
         tilt_scale: factor on the standard deviations of the inclination.
         tilt_floor: least standard deviation of the inclination about each axis, in degrees.
+        place: the earth's field northwards and upwards there, in uT, if it is known. As far as the field that is
+            estimated is off, in two directions, it may be off eastwards, and the heading's standard deviation is larger.
     """
 
     gyro: float = 1e-3
@@ -102,14 +104,19 @@ class ImuSettings:
     heading_floor: float = 0.5
     tilt_scale: float = 0.7
     tilt_floor: float = 0.15
+    place: tuple[float, float] | None = None
 
     def __post_init__(self):
-        object.__setattr__(self, "poles", tuple(self.poles))  # of a file they are a list
         for each in fields(self):
-            for value in self.poles if each.name == "poles" else [getattr(self, each.name)]:
-                check_number(each.name, value, above=-math.inf if each.name in ("lag", "latency") else 0)
-        if len(self.poles) != 3:
-            raise ValueError(f"poles are three rates; got {len(self.poles)}.")
+            value = getattr(self, each.name)
+            if each.name in ("poles", "place") and value is not None:  # of a file they are lists
+                value = tuple(value)
+                object.__setattr__(self, each.name, value)
+                size = 3 if each.name == "poles" else 2
+                if len(value) != size:
+                    raise ValueError(f"{each.name} are {size} numbers; got {len(value)}.")
+            for number in value if isinstance(value, tuple) else [] if value is None else [value]:
+                check_number(each.name, number, above=-math.inf if each.name in ("lag", "latency", "place") else 0)
 
 
 class ImuMotion(Motion):
