@@ -44,18 +44,17 @@ static void left_jacobian(const double *v, double J[3][3]) {
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) J[i][j] = (i == j) + one * K[i][j] + two * square[i][j];
 }
-#define AT(i) (*(pass ? &P[j][i] : &P[i][j])) /* rows first, then columns */
 static void update(double P[N][N], double H[3][N], const double *r, const double *noise, double *q, double *x) {
-    double PH[N][3], S[3][3], I[3][3], K[N][3], change[N];
-    for (int i = 0; i < N; i++)
-        for (int a = 0; a < 3; a++) {
-            PH[i][a] = 0;
-            for (int j = 0; j < N; j++) PH[i][a] += P[i][j] * H[a][j];
-        }
+    double PH[3][N], S[3][3], I[3][3], K[N][3], change[N];
+    memset(PH, 0, sizeof PH);
+    for (int a = 0; a < 3; a++)
+        for (int j = 0; j < N; j++)
+            if (H[a][j] != 0)
+                for (int i = 0; i < N; i++) PH[a][i] += P[j][i] * H[a][j];
     for (int a = 0; a < 3; a++)
         for (int b = 0; b < 3; b++) {
             S[a][b] = a == b ? noise[a] : 0;
-            for (int j = 0; j < N; j++) S[a][b] += H[a][j] * PH[j][b];
+            for (int j = 0; j < N; j++) S[a][b] += H[a][j] * PH[b][j];
         }
     for (int a = 0; a < 3; a++)
         for (int b = 0; b < 3; b++) {
@@ -64,34 +63,47 @@ static void update(double P[N][N], double H[3][N], const double *r, const double
         }
     double size = S[0][0] * I[0][0] + S[0][1] * I[1][0] + S[0][2] * I[2][0];
     for (int i = 0; i < N; i++)
-        for (int a = 0; a < 3; a++) K[i][a] = (PH[i][0] * I[0][a] + PH[i][1] * I[1][a] + PH[i][2] * I[2][a]) / size;
+        for (int a = 0; a < 3; a++) K[i][a] = (PH[0][i] * I[0][a] + PH[1][i] * I[1][a] + PH[2][i] * I[2][a]) / size;
     for (int i = 0; i < N; i++)
-        for (int j = i; j < N; j++) {
-            P[i][j] -= K[i][0] * PH[j][0] + K[i][1] * PH[j][1] + K[i][2] * PH[j][2];
-            P[j][i] = P[i][j];
-        }
+        for (int j = 0; j < N; j++) P[i][j] -= K[i][0] * PH[0][j] + K[i][1] * PH[1][j] + K[i][2] * PH[2][j];
     for (int i = 0; i < N; i++) change[i] = K[i][0] * r[0] + K[i][1] * r[1] + K[i][2] * r[2];
     double turn[4], now[4], J[3][3];
     exponential(change, turn), product(turn, q, now), memcpy(q, now, sizeof now), left_jacobian(change, J);
     for (int i = 3; i < N; i++) x[i] += change[i];
-    for (int pass = 0; pass < 2; pass++)
-        for (int j = 0; j < N; j++) {
-            double v[3] = {AT(0), AT(1), AT(2)};
-            for (int i = 0; i < 3; i++) AT(i) = J[i][0] * v[0] + J[i][1] * v[1] + J[i][2] * v[2];
-        }
+    for (int j = 0; j < N; j++) {
+        double v[3] = {P[0][j], P[1][j], P[2][j]};
+        for (int i = 0; i < 3; i++) P[i][j] = J[i][0] * v[0] + J[i][1] * v[1] + J[i][2] * v[2];
+    }
+    for (int j = 0; j < N; j++) {
+        double v[3] = {P[j][0], P[j][1], P[j][2]};
+        for (int i = 0; i < 3; i++) P[j][i] = J[i][0] * v[0] + J[i][1] * v[1] + J[i][2] * v[2];
+    }
 }
 
-/* Moves the vectors of the body's axes, and turns them by D's inverse. */
-static void moved(double *x, const double *moves, double fades, double D[3][3]) {
-    double s[9], v[4][3];
-    memcpy(s, x + POSITION, sizeof s);
-    for (int i = 0; i < 3; i++) {
-        for (int k = 0; k < 3; k++) v[k][i] = moves[3 * k] * s[i] + moves[3 * k + 1] * s[3 + i] + moves[3 * k + 2] * s[6 + i];
-        v[3][i] = fades * x[STRAY + i];
+/* Moves errors, or columns of a covariance, by the turn D: e are the errors of the turn that those of the gyro make. */
+static void moved(double P[N][N], const double *x, const double *w, double dt, const double *moves, double fades,
+                  double D[3][3], double J[3][3], double A[3][3]) {
+    static double e[3][N], phi[3][N], v[4][3][N];
+    for (int l = 0; l < 3; l++) {
+        int m = GYRO + 3 * l;
+        for (int j = 0; j < N; j++)
+            e[l][j] = -dt * (P[BIAS + l][j] + w[0] * P[m][j] + w[1] * P[m + 1][j] + w[2] * P[m + 2][j]);
     }
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < N; j++) {
+            P[i][j] += A[i][0] * e[0][j] + A[i][1] * e[1][j] + A[i][2] * e[2][j];
+            phi[i][j] = J[i][0] * e[0][j] + J[i][1] * e[1][j] + J[i][2] * e[2][j];
+            double s[3] = {P[POSITION + i][j], P[POSITION + 3 + i][j], P[PUSH + i][j]};
+            for (int k = 0; k < 3; k++) v[k][i][j] = moves[3 * k] * s[0] + moves[3 * k + 1] * s[1] + moves[3 * k + 2] * s[2];
+            v[3][i][j] = fades * P[STRAY + i][j];
+        }
     for (int k = 0; k < 4; k++)
-        for (int i = 0; i < 3; i++)
-            x[(k < 3 ? POSITION + 3 * k : STRAY) + i] = D[0][i] * v[k][0] + D[1][i] * v[k][1] + D[2][i] * v[k][2];
+        for (int i = 0; i < 3; i++) {
+            int at = k < 3 ? POSITION + 3 * k : STRAY, next = (i + 1) % 3, last = (i + 2) % 3;
+            for (int j = 0; j < N; j++)
+                P[at + i][j] = D[0][i] * v[k][0][j] + D[1][i] * v[k][1][j] + D[2][i] * v[k][2][j]
+                               + x[at + next] * phi[last][j] - x[at + last] * phi[next][j];
+        }
 }
 
 /* p: gyro, gyro_rate, gyro_walk, damping, motion, motion_unrest, accelerometer, magnetometer, magnetometer_rate,
@@ -109,34 +121,28 @@ void filter(int count, double dt, const double *gyro, const double *force, const
         const double *w = gyro + 3 * t;
         double speed = w[0] * w[0] + w[1] * w[1] + w[2] * w[2];
         if (t) {
-            double angles[3], back[3];
+            double angles[3], back[3], mixed[4][3];
             for (int i = 0; i < 3; i++) {
                 const double *m = x + GYRO + 3 * i;
                 angles[i] = (w[i] - x[BIAS + i] - m[0] * w[0] - m[1] * w[1] - m[2] * w[2]) * dt, back[i] = -angles[i];
             }
             exponential(angles, turn), product(q, turn, now), memcpy(q, now, sizeof now), matrix(turn, D);
             matrix(q, R), left_jacobian(back, J), times(R, J, A);
-            moved(x, moves, fades, D);
-            for (int pass = 0; pass < 2; pass++)
-                for (int j = 0; j < N; j++) {
-                    double e[3], phi[3], own[3], column[N];
-                    for (int i = 0; i < N; i++) column[i] = AT(i);
-                    moved(column, moves, fades, D);
-                    for (int l = 0; l < 3; l++) {
-                        const double *m = column + GYRO + 3 * l;
-                        e[l] = -dt * (column[BIAS + l] + w[0] * m[0] + w[1] * m[1] + w[2] * m[2]);
-                    }
-                    for (int i = 0; i < 3; i++) {
-                        column[i] += A[i][0] * e[0] + A[i][1] * e[1] + A[i][2] * e[2];
-                        phi[i] = J[i][0] * e[0] + J[i][1] * e[1] + J[i][2] * e[2];
-                    }
-                    for (int k = 0; k < 4; k++) {
-                        int v = k < 3 ? POSITION + 3 * k : STRAY;
-                        cross(x + v, phi, own);
-                        for (int i = 0; i < 3; i++) column[v + i] += own[i];
-                    }
-                    for (int i = 0; i < N; i++) AT(i) = column[i];
+            for (int i = 0; i < 3; i++) {
+                double v[3] = {x[POSITION + i], x[POSITION + 3 + i], x[PUSH + i]};
+                for (int k = 0; k < 3; k++) mixed[k][i] = moves[3 * k] * v[0] + moves[3 * k + 1] * v[1] + moves[3 * k + 2] * v[2];
+                mixed[3][i] = fades * x[STRAY + i];
+            }
+            for (int k = 0; k < 4; k++)
+                for (int i = 0; i < 3; i++)
+                    x[(k < 3 ? POSITION + 3 * k : STRAY) + i] = D[0][i] * mixed[k][0] + D[1][i] * mixed[k][1] + D[2][i] * mixed[k][2];
+            moved(P, x, w, dt, moves, fades, D, J, A);
+            for (int i = 0; i < N; i++)
+                for (int j = 0; j < i; j++) {
+                    double v = P[i][j];
+                    P[i][j] = P[j][i], P[j][i] = v;
                 }
+            moved(P, x, w, dt, moves, fades, D, J, A); /* of the transpose */
             double stray = p[13] * p[13] + p[14] * p[14] * disturbance[t] * disturbance[t];
             for (int i = 0; i < 3; i++) {
                 P[i][i] += (p[0] * p[0] + p[1] * p[1] * speed) * dt;

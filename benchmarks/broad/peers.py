@@ -1,4 +1,4 @@
-"""The peers: VQF (``pip install vqf``), Madgwick's and Mahony's filters (``pip install ahrs``), each left out if absent.
+"""The peers: VQF (``pip install vqf``), Madgwick's and Mahony's filters (``pip install ahrs``), where installed.
 
     python -m benchmarks.broad.peers --out benchmarks/broad/peers.json
 

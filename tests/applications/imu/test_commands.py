@@ -99,10 +99,9 @@ def test_damaged_logs_raise_or_are_right(what, message, tmp_path, capsys):
     truth, values = body_log(800)
     values = {"t": np.arange(800)[:, None] / 100.0, **{name: value.numpy() for name, value in values.items()}}
     values = changed(values, what)
-    names = "t,gx,gy,gz,ax,ay,az,mx,my,mz".split(",")[: sum(value.shape[1] for value in values.values())]
-    np.savetxt(
-        tmp_path / "log.csv", np.concatenate([*values.values()], -1), delimiter=",", header=",".join(names), comments=""
-    )
+    table = np.concatenate([*values.values()], -1)
+    names = ",".join(["t", "gx", "gy", "gz", "ax", "ay", "az", "mx", "my", "mz"][: table.shape[1]])
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=names, comments="")
     status = main(["orient", "--log", str(tmp_path / "log.csv"), "--out", str(tmp_path / "out")])
     if message is not None:
         assert status == 2

@@ -20,8 +20,8 @@ __all__ = ["SPACE", "ImuFilter", "ImuMotion", "ImuNoise", "ImuSettings", "Magnet
 
 #: Orientation (errors in the world's axes); the gyro's bias and its matrix of errors; position, velocity and
 #: acceleration in the body's axes; the magnetometer's bias; the field northwards and upwards; the magnetometer's lag;
-#: the stray field in the body's axes; the lever, likewise. Vectors in the body's axes turn with the orientation's error,
-#: so that an accelerometer says nothing of the heading to this filter.
+#: the stray field in the body's axes; the lever, likewise. In the world's axes, the error of the heading would stand in
+#: what the accelerometer reads of acceleration, and the filter would learn a heading from it that nothing reads.
 SPACE = Product(Opposite(SO3()), *map(Euclidean, (3, 9, 3, 3, 3, 3, 2, 1, 3, 3)))
 BIAS, FIELD = 4, 28  # their places in a point
 
@@ -66,8 +66,8 @@ class ImuSettings:
         heading_floor: least standard deviation of the heading, in degrees.
         tilt_scale: factor on the standard deviations of the inclination.
         tilt_floor: least standard deviation of the inclination about each axis, in degrees.
-        place: the earth's field northwards and upwards there, in uT, if it is known. As far as the field that is
-            estimated is off, in two directions, it may be off eastwards, and the heading's standard deviation is larger.
+        place: the earth's field northwards and upwards there, in uT, if it is known. As far as the estimated field is
+            off in these directions it may be off eastwards, too: the heading's standard deviation is so much larger.
     """
 
     gyro: float = 1e-3
