@@ -27,7 +27,7 @@ from torch_denkf.functional.manifolds import SO3
 GAINS = Path(__file__).parent / "peers.json"
 #: rad/s; proportional in 1/s and integral in 1/s^2. The defaults of ahrs are 0.041 and (1, 0.3).
 GRIDS: dict[str, list] = {
-    "Madgwick": [0.01, 0.02, 0.041, 0.08],
+    "Madgwick": [0.01, 0.02, 0.041, 0.08, 0.16],
     "Mahony": [[0.1, 0.001], [0.3, 0.001], [0.3, 0.01], [1.0, 0.01], [1.0, 0.3]],
 }
 PACKAGES = {"VQF": "vqf", "Madgwick": "ahrs", "Mahony": "ahrs"}
