@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.broad.learning import Equations, beliefs, minimised
+from benchmarks.broad.learning import Equations, beliefs, factor, minimised
 from benchmarks.broad.study import OWN, SIX, Runner, settings_for
 from benchmarks.broad.task import kind_of, read_trials, scores, simulated_trial
 from torch_denkf.applications.imu.filter import ImuSettings
@@ -68,6 +68,12 @@ def test_the_equations_in_c_are_the_filter():
             assert away.abs().max() < 1e-12
             torch.testing.assert_close(own[method].mean[:, 4:], mean[:, 4:], atol=1e-6, rtol=0)  # m, uT
             torch.testing.assert_close(own[method].cov[:, :3, :3], cov, atol=1e-6 * cov.max().item(), rtol=0)
+
+
+def test_the_factor_suffices_for_nine_rows_of_ten_of_trials_that_count_the_same():
+    short, long = np.arange(10.0), np.full(990, 3.5)
+    found = factor([short, long])
+    assert ((short <= found).mean() + (long <= found).mean()) / 2 == pytest.approx(0.9)
 
 
 def test_the_strategy_finds_a_minimum():
