@@ -71,9 +71,9 @@ def test_the_equations_in_c_are_the_filter():
 
 
 def test_the_factor_suffices_for_nine_rows_of_ten_of_trials_that_count_the_same():
-    short, long = np.arange(10.0), np.full(990, 3.5)
+    short, long = np.arange(1000.0), np.full(9, 3.5)
     found = factor([short, long])
-    assert ((short <= found).mean() + (long <= found).mean()) / 2 == pytest.approx(0.9)
+    assert ((short <= found).mean() + (long <= found).mean()) / 2 == pytest.approx(0.9, abs=2e-3)
 
 
 def test_the_strategy_finds_a_minimum():

@@ -162,7 +162,7 @@ def test_it_is_the_error_state_kalman_filter(axes):
 # ------------------------------------------------------------------------------------- data of the model itself
 
 
-def drawn_rows(settings, runs=240, steps=60, seed=0):
+def drawn_rows(settings, runs=200, steps=45, seed=0):
     """Rows and states of bodies that move, and whose sensors err, as the filter expects."""
     torch.manual_seed(seed)
     model, dt = imu(**dataclasses.asdict(settings)).double(), 0.035
