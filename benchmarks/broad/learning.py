@@ -8,7 +8,8 @@ other numbers are found by an evolution strategy that lowers, averaged over the 
 inclination error, in degrees, plus 0.3 times the negative logarithm of Student's density of heading and inclination;
 and on every second trial, with 6 axes, the inclination error plus 0.2 times the total error. Factors on the standard
 deviations then make the 90 % intervals hold 90 % of the rows; they are larger as far as factors of all other kinds are
-too small for a kind. The numbers for all other sensors, ``all``, are geometric means of the three sets.
+too small for a kind. The numbers for other kinds, ``all``, are geometric means of the three sets; ``anywhere``, the
+library's, are those with factors where the place's field is not known.
 """
 
 from __future__ import annotations
@@ -238,8 +239,12 @@ def learn(run: Equations, trials: Sequence[Trial], generations: int, seed: int, 
         return value if math.isfinite(value) else 1e3
 
     s = _with(s, minimised(loss, _numbers(s), 0.2, generations, seed))
-    s = replace(s, latency=latency(run, rows, s))
-    found = [measures(run, each, s) for each in rows]
+    return calibrated(run, trials, replace(s, latency=latency(run, rows, s)))
+
+
+def calibrated(run: Equations, trials: Sequence[Trial], s: ImuSettings) -> ImuSettings:
+    """Returns the numbers with factors on the standard deviations that make the intervals hold 90 %."""
+    found = [measures(run, Rows(trial, s, short=True), s) for trial in trials]
     kinds = [trial.kind for trial in trials]
     for name in ("heading", "tilt"):
         needs = [each[f"{name}_need"] for each in found]
@@ -259,6 +264,12 @@ def factor(needs: Sequence[ndarray]) -> float:
     return float(values[order][np.searchsorted(weights[order].cumsum(), LEVEL * len(needs))])
 
 
+def _means(sets: Sequence[ImuSettings]) -> dict:
+    """Returns geometric means of all numbers, but for the place."""
+    names = [name for name in asdict(sets[0]) if name != "place"]
+    return {name: np.exp(np.mean(np.log([getattr(each, name) for each in sets]), 0)).tolist() for name in names}
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Learns, and writes."""
     options = parse(Learning, arguments)
@@ -266,18 +277,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.smoke:
         print(learn(run, [simulated_trial()], 1, options.seed, START))
         return
-    trials, numbers, sets = read_trials(options.data), {}, []
+    trials, numbers, sets, anywhere = read_trials(options.data), {}, [], []
     before = {} if options.start is None else json.loads(options.start.read_text())["numbers"]
     for fold in FOLDS:
         rest = [each for each in trials if each.kind not in fold]
         start = ImuSettings(**before[fold[0]]) if before else START
-        sets.append(asdict(learn(run, rest, options.generations, options.seed, start)))
-        numbers |= dict.fromkeys(fold, sets[-1])
-        print(fold, sets[-1], flush=True)
-    numbers["all"] = {
-        name: np.exp(np.mean(np.log(np.abs([each[name] for each in sets])), 0)).tolist() for name in sets[0]
-    }
-    numbers["all"]["place"] = np.mean([each["place"] for each in sets], 0).tolist()
+        sets.append(learn(run, rest, options.generations, options.seed, start))
+        anywhere.append(calibrated(run, rest, replace(sets[-1], place=None)))
+        numbers |= dict.fromkeys(fold, asdict(sets[-1]))
+        print(fold, sets[-1], anywhere[-1], flush=True)
+    place = np.mean([each.place for each in sets], 0).tolist()  # type: ignore[arg-type]
+    numbers["all"] = {**_means(sets), "place": place}
+    numbers["anywhere"] = _means(anywhere)
     page = {"command": command("broad.learning"), "seed": options.seed, "numbers": numbers}
     if options.out is not None:
         write_text(options.out, json.dumps(page, indent=1) + "\n")
