@@ -243,6 +243,29 @@ def test_within_a_block_the_gyro_turns_exactly():
     torch.testing.assert_close(ahead[:, 2], torch.full_like(angle, 0.1), atol=1e-3, rtol=0)
 
 
+@torch.no_grad()
+def test_an_accelerometer_says_nothing_of_the_heading():
+    _, log = body_log(600)
+    del log["magnetometer"]
+    log["gyro"] -= torch.tensor([0.01, -0.02, 0.005])  # its bias
+    model = imu(heading=0.5, gyro_bias=1e-9, gyro_walk=1e-9, gyro_scale=1e-9, gyro_skew=1e-9).double()
+    variance = model.sequence(imu_rows(model.settings, **log, rate=100.0))["belief", "cov"][:, 2, 2]
+    assert variance.min() > 0.97 * 0.5**2  # vectors in the world's axes: 0.21 * 0.5**2
+
+
+def test_a_field_unlike_that_of_the_place_widens_the_heading():
+    _, log = body_log(400)
+    model = imu().double()
+    found = orientations(model, **log, rate=100.0)
+    field = found.mean[-1, 28:30]
+    model.settings = dataclasses.replace(model.settings, place=(field - torch.tensor([2.0, -1.0])).tolist())
+    wider = orientations(model, **log, rate=100.0).std
+    more = (wider.square() - found.std.square())[-1]
+    torch.testing.assert_close(more, torch.tensor([0.0, 0.0, 2.5 / field[0].item() ** 2], dtype=more.dtype))
+    with pytest.raises(ValueError, match="place are 2 numbers"):
+        imu(place=(16.0,))
+
+
 def test_a_log_that_is_not_one():
     _, log = body_log(100)
     with pytest.raises(ValueError, match=r"m/s\^2.*median of its size is 1\."):
