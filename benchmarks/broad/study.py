@@ -38,7 +38,7 @@ METHODS = (
     *(name + moved for moved in ("", MOVED) for name in (OWN, VQF, SIX, VQF_SIX)),
     *(SMOOTH + MOVED, "Madgwick", "Mahony", "gyro alone"),
 )
-TOGETHER = 6  # trials in a batch: about 3 GB
+TOGETHER = 6  # trials in a batch: about 5 GB
 
 
 @dataclass(frozen=True)
