@@ -1,4 +1,4 @@
-"""What all data sets share: shapes of samples, splits, options; and what filters make of their samples."""
+"""Tests what all data sets share: shapes of samples, splits, options; and what filters make of their samples."""
 
 import pytest
 import torch
