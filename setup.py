@@ -68,7 +68,8 @@ setup(
         # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
         "bench": [
             "matplotlib",
-            "vqf==2.1.2",  # the peer of benchmarks/broad
+            "vqf==2.1.2",  # the peers of benchmarks/broad
+            "ahrs==0.4.0",
             "filterpy==2.0.0",
             "dapper==1.7.1",
             "cuthbert==0.1.1",

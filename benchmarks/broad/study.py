@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from importlib.util import find_spec
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
@@ -14,8 +12,9 @@ import torch
 from torch import Tensor
 
 from benchmarks.broad.learning import Equations, beliefs
+from benchmarks.broad.peers import GAINS, PACKAGES, gradient_filter, has, vqf
 from benchmarks.broad.pictures import draw
-from benchmarks.broad.task import Trial, read_trials, scores, simulated_trial
+from benchmarks.broad.task import Trial, first_orientation, read_trials, scores, simulated_trial
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import Columns, head, line, pick, write_page
 from torch_denkf.applications.imu.filter import ImuFilter, ImuSettings
@@ -24,21 +23,22 @@ from torch_denkf.deployment.files import write_text
 from torch_denkf.functional.manifolds import SO3
 from torch_denkf.smoothers import RTSSmoother
 
-HAS_VQF = find_spec("vqf") is not None
 NUMBERS = Path(__file__).parent / "numbers.json"
 HELD = ("heading", "inclination")
-SCORES = ("total", "heading", "inclination", "heading_held", "inclination_held", "heading_std", "seconds")
+SCORES = ("total", "heading", "inclination", "heading_held", "inclination_held", "heading_std")
 COLUMNS = Columns(
     names=("trial", "kind", "method", "numbers", *SCORES),
     text=("trial", "kind", "method", "numbers"),
     whole=(),
     order=lambda row: (row["trial"], METHODS.index(row["method"])),
 )
-OWN, SIX, SMOOTH = "filter", "filter, 6 axes", "smoother"
-STAMPED = ", readings as stamped"  # without the learned latency
-VQF, VQF_SIX, LATE = "VQF", "VQF, 6 axes", "VQF, moved on by the learned latency"
-GYRO = "gyro alone"
-METHODS = (OWN, OWN + STAMPED, SIX, SIX + STAMPED, SMOOTH, VQF, LATE, VQF_SIX, GYRO)
+OWN, SMOOTH, SIX, VQF, VQF_SIX = "imu", "smoother (RTS) of imu", "imu, 6 axes", "VQF", "VQF, 6 axes"
+MOVED = ", latency removed"  # moved on by the learned latency; all others are as stamped
+METHODS = (
+    *(name + moved for moved in ("", MOVED) for name in (OWN, VQF, SIX, VQF_SIX)),
+    *(SMOOTH + MOVED, "Madgwick", "Mahony", "gyro alone"),
+)
+TOGETHER = 6  # trials in a batch: about 5 GB
 
 
 @dataclass(frozen=True)
@@ -48,39 +48,49 @@ class Study:
     data: Path = Path("../shared/data/broad")  # folder with .npz files of BROAD
     out: Path | None = None  # folder for broad.csv, broad.json, broad.md and broad.png
     smoother: bool = True  # run the smoother, too
-    equations: bool = False  # the filter by equations.c, a second a trial; a test compares it with the library's
-    compile: bool = True  # the filter's steps: a minute, and a twentieth of the time
+    equations: bool = False  # the filter by equations.c instead, without smoother; needs the C compiler cc
     smoke: bool = False  # ten simulated seconds: does it run?
 
 
 class Runner:
-    """Runs one filter with the numbers of any settings: it is compiled once.
+    """Runs the filter, 9 and 6 axes, and the smoother on trials: all that share their numbers in one batch.
 
     Args:
-        compiled: whether it is compiled at all.
-        equations: whether the equations in C run in its place.
+        smoother: whether the smoother runs, too.
+        equations: whether the equations in C run in the library's place.
     """
 
-    def __init__(self, compiled: bool, equations: bool = False):
-        self.equations = Equations() if equations else None
-        self.model = ImuFilter(ImuSettings()).double()
-        if compiled:
-            self.model.compile(chunk=1)
-        self.smoother = RTSSmoother(self.model)
+    def __init__(self, smoother: bool = True, equations: bool = False):
+        self.smoother, self.equations = smoother and not equations, Equations() if equations else None
 
     @torch.no_grad()
-    def __call__(self, settings: ImuSettings, trial: Trial, *, six: bool = False, smooth: bool = False) -> Orientations:
-        """The orientations of a trial."""
+    def __call__(self, settings: ImuSettings, trials: Sequence[Trial]) -> list[dict[str, Orientations]]:
+        """Returns orientations by method, for each trial."""
         if self.equations is not None:
-            mean, cov = beliefs(self.equations, trial, settings, six=six, smooth=smooth)
-            return at_readings(settings, mean, cov, trial.gyro, trial.rate)
-        self.model.load_state_dict(ImuFilter(settings).double().state_dict())
-        field = None if six else trial.magnetometer
-        rows = imu_rows(settings, trial.gyro, trial.acceleration, field, rate=trial.rate)
-        prefix = "smoothed" if smooth else "belief"
-        keys = [(prefix, "mean"), (prefix, "cov")]
-        out = self.smoother.sequence(rows, keep=[]) if smooth else self.model.sequence(rows, keep=keys)
-        return at_readings(settings, out[prefix, "mean"], out[prefix, "cov"], trial.gyro, trial.rate)
+            found = []
+            for trial in trials:
+                runs = {way: beliefs(self.equations, trial, settings, six=way == SIX) for way in (OWN, SIX)}
+                found.append({way: at_readings(settings, *run, trial.gyro, trial.rate) for way, run in runs.items()})
+            return found
+        both = []
+        for trial in trials:
+            both.append(imu_rows(settings, trial.gyro, trial.acceleration, trial.magnetometer, rate=trial.rate))
+            both.append(imu_rows(settings, trial.gyro, trial.acceleration, rate=trial.rate))
+        longest = max(map(len, both))  # shorter ones repeat their last row
+        batch = torch.stack([rows[torch.arange(longest).clamp_max(len(rows) - 1)] for rows in both])
+        model, keep = ImuFilter(settings).double(), [("belief", "mean"), ("belief", "cov")]
+        out = (RTSSmoother(model) if self.smoother else model).sequence(batch, keep=keep)
+        found = []
+        for place, trial in enumerate(trials):
+            ways = {OWN: ("belief", 2 * place), SIX: ("belief", 2 * place + 1)}
+            if self.smoother:
+                ways[SMOOTH] = "smoothed", 2 * place
+            count = len(both[2 * place])
+            moments = {
+                way: [out[key, name][row, :count] for name in ("mean", "cov")] for way, (key, row) in ways.items()
+            }
+            found.append({way: at_readings(settings, *each, trial.gyro, trial.rate) for way, each in moments.items()})
+        return found
 
 
 def settings_for(kind: str, numbers: dict[str, dict]) -> tuple[str, ImuSettings]:
@@ -89,48 +99,48 @@ def settings_for(kind: str, numbers: dict[str, dict]) -> tuple[str, ImuSettings]
     return name, ImuSettings(**numbers[name])
 
 
-def rows_of(trial: Trial, numbers: dict[str, dict], runner: Runner, smoother: bool) -> Iterator[tuple[dict, Tensor]]:
-    """Rows of all methods on one trial, and the orientations."""
-    name, settings = settings_for(trial.kind, numbers)
-    told = {"trial": trial.name, "kind": trial.kind}
+def rows_of(
+    trial: Trial, own: dict[str, Orientations], numbers: str, settings: ImuSettings, gains: dict[str, dict]
+) -> Iterator[dict]:
+    """Yields the rows of all methods on one trial.
 
-    def scored(method: str, quaternion: Tensor, std: Tensor | None = None, **more) -> tuple[dict, Tensor]:
-        return {**told, "method": method, **more, **scores(trial, quaternion, std)}, quaternion
+    Args:
+        trial: with readings and truth.
+        own: the filter's orientations by method, moved on by the latency.
+        numbers: name of their numbers.
+        settings: of the filter.
+        gains: of Madgwick's and Mahony's filter, by kind.
+    """
 
-    own = {"numbers": f"without {name}" if name == trial.kind else name}
-    for method, six in ((OWN, False), (SIX, True)):
-        began = time.process_time()
-        found = runner(settings, trial, six=six)
-        seconds = time.process_time() - began
-        yield scored(method, found.quaternion, found.std, **own, seconds=seconds)
-        still = replace(settings, latency=0.0)
-        stamped = at_readings(still, found.mean, found.cov, trial.gyro, trial.rate)
-        yield scored(method + STAMPED, stamped.quaternion, stamped.std, **own)
-    if smoother:
-        found = runner(settings, trial, smooth=True)
-        yield scored(SMOOTH, found.quaternion, found.std, **own)
-    if HAS_VQF:
-        nine, six_axes, seconds = vqf(trial)
-        yield scored(VQF, nine, seconds=seconds)
-        yield scored(LATE, SO3().plus(nine, trial.gyro * settings.latency), **own)
-        yield scored(VQF_SIX, six_axes)
-    yield scored(GYRO, by_gyro(trial, settings))
+    def scored(method: str, quaternion: Tensor, std: Tensor | None = None) -> dict:
+        told = {"trial": trial.name, "kind": trial.kind, "method": method, "numbers": numbers}
+        return {**told, **scores(trial, quaternion, std)}
+
+    def both(method: str, quaternion: Tensor) -> Iterator[dict]:
+        yield scored(method, quaternion)
+        yield scored(method + MOVED, moved(quaternion, settings.latency))
+
+    def moved(quaternion: Tensor, by: float) -> Tensor:
+        return SO3().plus(quaternion, trial.gyro * by)
+
+    for method, found in own.items():
+        yield scored(method + MOVED, found.quaternion, found.std)
+        if method != SMOOTH:
+            yield scored(method, moved(found.quaternion, -settings.latency), found.std)
+    if has(VQF):
+        for method, quaternion in zip((VQF, VQF_SIX), vqf(trial), strict=True):
+            yield from both(method, quaternion)
+    start = first_orientation(trial)
+    for name, gain in gains.items():
+        if has(name):
+            best = gain.get(trial.kind, gain["all"])
+            yield scored(name, gradient_filter(name, best, trial, start))
+    yield scored("gyro alone", by_gyro(trial, start))
 
 
-def vqf(trial: Trial) -> tuple[Tensor, Tensor, float]:
-    """Orientations of VQF with its default settings, 9 and 6 axes, and its seconds."""
-    from vqf import VQF as Filter
-
-    began = time.process_time()
-    sensors = (trial.gyro, trial.acceleration, trial.magnetometer)
-    out = Filter(1 / trial.rate).updateBatch(*(value.numpy().copy() for value in sensors))
-    return torch.as_tensor(out["quat9D"]), torch.as_tensor(out["quat6D"]), time.process_time() - began
-
-
-def by_gyro(trial: Trial, settings: ImuSettings) -> Tensor:
-    """Orientations by the gyro alone, from what the first readings of all sensors say."""
-    start = imu_rows(settings, trial.gyro[:100], trial.acceleration[:100], trial.magnetometer[:100], rate=trial.rate)
-    found = torch.cat([start["start"][:1, :4], SO3().exp(trial.gyro[1:] / trial.rate)])
+def by_gyro(trial: Trial, start: Tensor) -> Tensor:
+    """Returns orientations by the gyro alone, from what the first readings of all sensors say."""
+    found = torch.cat([start.unsqueeze(0), SO3().exp(trial.gyro[1:] / trial.rate)])
     reach = 1
     while reach < len(found):  # products of all before, twice as many each time
         found = torch.cat([found[:reach], SO3().compose(found[:-reach], found[reach:])])
@@ -139,34 +149,34 @@ def by_gyro(trial: Trial, settings: ImuSettings) -> Tensor:
 
 
 def page(rows: Sequence[dict], smoke: bool = False) -> str:
-    """The tables, in Markdown."""
+    """Returns the tables, in Markdown."""
     names = list(dict.fromkeys(row["trial"] for row in rows))
     methods = [method for method in METHODS if pick(rows, method=method)]
-    text = [
-        "# Orientation on BROAD",
-        "",
-        f"Mean over {len(names)} trials, degrees; coverage of the 90 % intervals.",
-        "",
-    ]
-    text += head(
-        "method", "total", "heading", "inclination", "worst total", "heading held", "inclination held", "CPU s"
-    )
+    north = [method for method in methods if "6 axes" not in method]
+    text = [f"# Orientation on BROAD\n\nMean over {len(names)} trials, root mean square errors in degrees.\n"]
+    text += head("method", "total", "heading", "inclination", "worst total")
     for method in methods:
         own = pick(rows, method=method)
-        cells = [f"{mean(own, name):.2f}" for name in ("total", "heading", "inclination")]
-        worst = f"{max(row['total'] for row in own):.2f}"
-        held = [f"{100 * mean(own, f'{name}_held'):.0f} %" if f"{name}_held" in own[0] else "" for name in HELD]
-        seconds = f"{mean(own, 'seconds'):.1f}" if "seconds" in own[0] else ""
-        if "6 axes" in method:  # north is unknown
-            cells[:2], worst, held[:1] = ["", ""], "", [""]
-        text.append(line(method, *cells, worst, *held, seconds))
-    north = [method for method in methods if "6 axes" not in method]
-    text += ["", "Total error of each trial, degrees, and the coverage of the filter's intervals, %.", ""]
-    text += head("trial", *north, "heading held", "inclination held")
+        cells = [mean(own, "total"), mean(own, "heading"), mean(own, "inclination"), max(row["total"] for row in own)]
+        known = (True, True, True, True) if method in north else (False, False, True, False)
+        text.append(line(method, *(f"{cell:.2f}" if shown else "" for cell, shown in zip(cells, known, strict=True))))
+    with_std = [method for method in methods if pick(rows, method=method)[0].get("heading_held") is not None]
+    text += ["", "Coverage of the 90 % intervals, %, averaged over trials; heading and inclination.", ""]
+    text += head("method", "all trials", "undisturbed", "disturbed")
+    for method in with_std:
+        own = pick(rows, method=method)
+        parts = own, *([row for row in own if ("_disturbed" in row["trial"]) == hit] for hit in (False, True))
+        text.append(line(method, *(coverage(part, method in north) for part in parts)))
+    own_coverage = " / ".join(HELD)
+    text += [
+        "",
+        f"Total error of each trial, degrees, and coverage ({own_coverage}) of the intervals of {OWN}{MOVED}, %.",
+        "",
+    ]
+    text += head("trial", *north, "coverage")
     for name in names:
         cells = [f"{pick(rows, trial=name, method=method)[0]['total']:.2f}" for method in north]
-        own = pick(rows, trial=name, method=OWN)[0]
-        text.append(line(name, *cells, *(f"{100 * own[f'{each}_held']:.0f}" for each in HELD)))
+        text.append(line(name, *cells, coverage(pick(rows, trial=name, method=OWN + MOVED))))
     text += ["", "Inclination of each trial, degrees.", "", *head("trial", *methods)]
     for name in names:
         cells = [f"{pick(rows, trial=name, method=method)[0]['inclination']:.2f}" for method in methods]
@@ -174,6 +184,12 @@ def page(rows: Sequence[dict], smoke: bool = False) -> str:
     data = "simulated" if smoke else "Laidig et al. 2021, CC BY 4.0"
     text += ["", *made_by("broad"), f"* Data: {data}. Numbers: `numbers.json`, see the README.", ""]
     return "\n".join(text)
+
+
+def coverage(rows: Sequence[dict], north: bool = True) -> str:
+    """Returns the mean coverage of rows, in percent."""
+    shown = HELD if north else HELD[1:]
+    return " / ".join(f"{100 * mean(rows, f'{each}_held'):.0f}" for each in shown) if rows else ""
 
 
 def mean(rows: Sequence[dict], name: str) -> float:
@@ -184,25 +200,34 @@ def mean(rows: Sequence[dict], name: str) -> float:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the study."""
     study = parse(Study, arguments)
-    if not HAS_VQF:
-        print('VQF, the peer, is left out: pip install "torch_denkf[bench]"')
+    for name in PACKAGES:
+        if not has(name):
+            print(f'{name} is left out: pip install {PACKAGES[name]}, or "torch_denkf[bench]"')
     numbers = json.loads(NUMBERS.read_text())["numbers"]
+    gains = json.loads(GAINS.read_text())["gains"]
     trials = [simulated_trial()] if study.smoke else read_trials(study.data)
-    runner = Runner(study.compile and not study.smoke, study.equations)
-    rows: list[dict] = []
-    worst: tuple[float, Trial, Tensor] | None = None
+    runner = Runner(study.smoother, study.equations)
+    groups: dict[ImuSettings, list[tuple[Trial, str]]] = {}
     for trial in trials:
-        for row, quaternion in rows_of(trial, numbers, runner, study.smoother):
-            rows.append(row)
-            if row["method"] == OWN and (worst is None or row["total"] > worst[0]):
-                worst = row["total"], trial, quaternion
-            print(trial.name, row["method"], {name: round(row[name], 2) for name in SCORES if name in row}, flush=True)
+        name, settings = settings_for(trial.kind, numbers)
+        groups.setdefault(settings, []).append((trial, f"without {name}" if name == trial.kind else name))
+    rows: list[dict] = []
+    worst: tuple[float, Trial, Orientations] | None = None
+    for settings, group in groups.items():
+        for some in [group[first : first + TOGETHER] for first in range(0, len(group), TOGETHER)]:
+            for (trial, name), own in zip(some, runner(settings, [trial for trial, _ in some]), strict=True):
+                for row in rows_of(trial, own, name, settings, gains):
+                    rows.append(row)
+                    found = {score: round(row[score], 2) for score in SCORES if score in row}
+                    print(trial.name, row["method"], found, flush=True)
+                total = next(row["total"] for row in pick(rows, trial=trial.name, method=OWN + MOVED))
+                if worst is None or total > worst[0]:
+                    worst = total, trial, own[OWN]
+    rows.sort(key=COLUMNS.order)
     if study.out is not None:
         study.out.mkdir(parents=True, exist_ok=True)
         COLUMNS.write(rows, study.out / "broad.csv")
         write_text(study.out / "broad.json", json.dumps(rows, indent=1) + "\n")
         assert worst is not None
-        _, settings = settings_for(worst[1].kind, numbers)
-        found = runner(settings, worst[1])
-        draw(worst[1], found, vqf(worst[1])[0] if HAS_VQF else None, study.out / "broad.png")
+        draw(worst[1], worst[2], vqf(worst[1])[0] if has(VQF) else None, study.out / "broad.png")
     write_page(page(rows, study.smoke), None if study.out is None else study.out / "broad.md")

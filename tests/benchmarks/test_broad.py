@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.broad.learning import Equations, beliefs, minimised
-from benchmarks.broad.study import Runner, settings_for
+from benchmarks.broad.learning import Equations, beliefs, factor, minimised
+from benchmarks.broad.study import OWN, SIX, Runner, settings_for
 from benchmarks.broad.task import kind_of, read_trials, scores, simulated_trial
 from torch_denkf.applications.imu.filter import ImuSettings
 from torch_denkf.applications.imu.log import imu_rows
 from torch_denkf.functional.manifolds import SO3
+
+SENSORS = ("gyro", "acceleration", "magnetometer", "orientation", "scored")
 
 
 def test_errors_are_those_of_the_benchmark():
@@ -54,16 +56,24 @@ def test_no_trials(tmp_path):
 
 @torch.no_grad()
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
-@pytest.mark.parametrize(("nine", "smooth"), [(True, False), (True, True), (False, False)])
-def test_the_equations_in_c_are_filter_and_smoother(nine, smooth):
+def test_the_equations_in_c_are_the_filter():
     trial, settings = simulated_trial(seconds=8.0), replace(ImuSettings(), lag=0.01, lag_std=0.01, magnetometer=0.5)
-    found = Runner(False)(settings, trial, six=not nine, smooth=smooth)
     assert imu_rows(settings, trial.gyro, trial.acceleration, rate=trial.rate)["rest_observed"].sum() > 3
-    mean, cov = beliefs(Equations(), trial, settings, six=not nine, smooth=smooth)
-    own = found.mean[:, :4]
-    assert ((own * mean[:, :4]).sum(-1).abs() - 1).abs().max() < 1e-12
-    torch.testing.assert_close(found.mean[:, 4:], mean[:, 4:], atol=1e-5 if smooth else 1e-6, rtol=0)  # m, uT
-    torch.testing.assert_close(found.cov[:, :3, :3], cov, atol=1e-6 * cov.max().item(), rtol=0)
+    shorter = replace(trial, **{name: getattr(trial, name)[:500] for name in SENSORS})
+    found = Runner(smoother=False)(settings, [shorter, trial])  # in one batch
+    for each, own in zip([shorter, trial], found, strict=True):
+        for method, six in ((OWN, False), (SIX, True)):
+            mean, cov = beliefs(Equations(), each, settings, six=six)
+            away = (own[method].mean[:, :4] * mean[:, :4]).sum(-1).abs() - 1
+            assert away.abs().max() < 1e-12
+            torch.testing.assert_close(own[method].mean[:, 4:], mean[:, 4:], atol=1e-6, rtol=0)  # m, uT
+            torch.testing.assert_close(own[method].cov[:, :3, :3], cov, atol=1e-6 * cov.max().item(), rtol=0)
+
+
+def test_the_factor_suffices_for_nine_rows_of_ten_of_trials_that_count_the_same():
+    short, long = np.arange(1000.0), np.full(9, 3.5)
+    found = factor([short, long])
+    assert ((short <= found).mean() + (long <= found).mean()) / 2 == pytest.approx(0.9, abs=2e-3)
 
 
 def test_the_strategy_finds_a_minimum():

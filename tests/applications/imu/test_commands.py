@@ -49,3 +49,67 @@ def test_logs_that_are_none(tmp_path, capsys):
     )
     with pytest.raises(ValueError, match="to be even"):
         read_log(tmp_path / "c.csv")
+
+
+def changed(values, what):
+    """A damaged log."""
+    values = {name: value.copy() for name, value in values.items()}
+    if what == "units in g":
+        values["acceleration"] /= 9.81
+    elif what == "degrees a second":
+        values["gyro"] *= 180 / np.pi
+    elif what == "magnetometer in gauss":
+        values["magnetometer"] *= 0.01
+    elif what == "NaN gyro":
+        values["gyro"][250] = np.nan
+    elif what == "constant stamps":
+        values["t"][:] = 3.0
+    elif what == "stamps that go back":
+        values["t"][250:] -= 2.0
+    elif what == "NaN stamp":
+        values["t"][250] = np.nan
+    elif what == "two axes of a magnetometer":
+        values["magnetometer"] = values["magnetometer"][:, :2]
+    elif what == "NaN accelerometer and magnetometer":
+        values["acceleration"][50:60] = values["magnetometer"][200:260] = np.nan
+    elif what == "NaN magnetometer":
+        values["magnetometer"][:] = np.nan
+    elif what == "no magnetometer":
+        del values["magnetometer"]
+    return values
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("units in g", "acceleration is in m/s^2"),
+        ("degrees a second", "multiply them by pi / 180"),
+        ("magnetometer in gauss", "magnetometer is in uT"),
+        ("NaN gyro", "gyro has readings that are not finite"),
+        ("constant stamps", "to be even"),
+        ("stamps that go back", "to be even"),
+        ("NaN stamp", "to be even"),
+        ("two axes of a magnetometer", "has mx, my but not all three"),
+        ("NaN accelerometer and magnetometer", None),
+        ("NaN magnetometer", None),
+        ("no magnetometer", None),
+    ],
+)
+def test_damaged_logs_raise_or_are_right(what, message, tmp_path, capsys):
+    truth, values = body_log(800)
+    values = {"t": np.arange(800)[:, None] / 100.0, **{name: value.numpy() for name, value in values.items()}}
+    values = changed(values, what)
+    table = np.concatenate([*values.values()], -1)
+    names = ",".join(["t", "gx", "gy", "gz", "ax", "ay", "az", "mx", "my", "mz"][: table.shape[1]])
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=names, comments="")
+    status = main(["orient", "--log", str(tmp_path / "log.csv"), "--out", str(tmp_path / "out")])
+    if message is not None:
+        assert status == 2
+        assert message in capsys.readouterr().err
+        return
+    assert status == 0
+    table = np.genfromtxt(tmp_path / "out" / "orientation.csv", delimiter=",", names=True)
+    found = truth.new_tensor(np.stack([table[name] for name in "wxyz"], -1))
+    away = SO3().log(SO3().compose(found, SO3().inverse(truth)))[300:].rad2deg()
+    away = away if what.startswith("NaN acc") else away - away.mean(0)  # without a magnetometer the heading is relative
+    assert away.abs().max() < 4

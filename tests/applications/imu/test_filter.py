@@ -83,10 +83,10 @@ def left_jacobian(v):
 
 
 def reference(rows, s):
-    """An error-state Kalman filter; the rotation's error stands in the world's axes."""
+    """An error-state Kalman filter; the rotation's error stands in the world's axes, vectors in the body's."""
     start = np.array([s.tilt] * 2 + [s.heading] + [s.gyro_bias] * 3)
     errors = [s.gyro_scale if i == j else s.gyro_skew for i in range(3) for j in range(3)]
-    rest = [s.motion_start] * 9 + [s.magnetic_bias] * 3 + [s.field] * 2 + [s.lag_std] + [s.stray] * 3
+    rest = [s.motion_start] * 9 + [s.magnetic_bias] * 3 + [s.field] * 2 + [s.lag_std] + [s.stray] * 3 + [s.lever] * 3
     cov = np.diag(np.concatenate([start, errors, rest]) ** 2)
     turn, x = matrix(rows["start"][0, :4].numpy()), rows["start"][0, 4:].numpy().copy()
     found = []
@@ -95,47 +95,45 @@ def reference(rows, s):
         gyro, dt = row["gyro"], row["dt"].item()
         if t:
             angles = (gyro - x[:3] - x[3:12].reshape(3, 3) @ gyro) * dt
-            f = np.eye(33)
-            spread = turn @ left_jacobian(angles) * dt  # of the gyro's errors, to a turn in the world's axes
-            f[:3, 3:6] = -spread
-            f[:3, 6:15] = -spread @ np.kron(np.eye(3), gyro)
-            step = np.kron(row["moves"].reshape(3, 3), np.eye(3))
-            f[15:24, 15:24] = step
-            fades = np.exp(-dt / s.stray_time)
-            f[30:, 30:] *= fades
-            x[27:] *= fades
-            turn, x[12:21] = turn @ rotation(angles), step @ x[12:21]
-            q = np.zeros(33)
+            back, f = rotation(-angles), np.eye(36)
+            turn = turn @ rotation(angles)
+            step, fades = np.kron(row["moves"].reshape(3, 3), back), np.exp(-dt / s.stray_time)
+            f[15:24, 15:24], f[30:33, 30:33] = step, fades * back
+            x[12:21], x[27:30] = step @ x[12:21], fades * back @ x[27:30]
+            spread = left_jacobian(-angles) * dt  # of the gyro's errors, to a turn in the body's axes
+            for at, of in ((0, -turn), *((k, -skew(x[k - 3 : k])) for k in (15, 18, 21, 30))):
+                f[at : at + 3, 3:6] = of @ spread
+                f[at : at + 3, 6:15] = of @ spread @ np.kron(np.eye(3), gyro)
+            q = np.zeros(36)
             q[:3] = s.gyro**2 + s.gyro_rate**2 * (gyro @ gyro)
             q[3:6] = s.gyro_walk**2
             q[21:24] = 2 * sum(s.poles) * (s.motion**2 + s.motion_unrest**2 * row["unrest"] ** 2)
-            q[24:27], q[27:29] = s.magnetic_walk**2, s.field_walk**2
+            q[24:27], q[27:29], q[33:] = s.magnetic_walk**2, s.field_walk**2, s.lever_walk**2
             stray = s.stray**2 + s.stray_unrest**2 * row["disturbance"].item() ** 2
-            q[30:] = stray * (1 - fades**2) / dt
+            q[30:33] = stray * (1 - fades**2) / dt
             cov = f @ cov @ f.T + np.diag(q * dt)
 
         def update(read, predicted, h, variance):
             nonlocal turn, x, cov
             gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + variance * np.eye(3))
             change = gain @ (read - predicted)
-            reset = np.eye(33)
+            reset = np.eye(36)
             reset[:3, :3] = left_jacobian(change[:3])
-            keep = np.eye(33) - gain @ h
+            keep = np.eye(36) - gain @ h
             cov = reset @ (keep @ cov @ keep.T + variance * gain @ gain.T) @ reset.T
             turn, x = rotation(change[:3]) @ turn, x + change[3:]
 
-        up = x[18:21] + np.array([0, 0, s.gravity])
-        h = np.zeros((3, 33))
-        h[:, :3], h[:, 21:24] = turn.T @ skew(up), turn.T
-        update(row["accelerometer"], turn.T @ up, h, s.accelerometer**2)
+        up, lever, h = np.array([0, 0, s.gravity]), row["lever"].reshape(3, 3), np.zeros((3, 36))
+        h[:, :3], h[:, 21:24], h[:, 33:] = turn.T @ skew(up), np.eye(3), lever
+        update(row["accelerometer"], turn.T @ up + x[18:21] + lever @ x[30:], h, s.accelerometer**2)
         if row["magnetometer_observed"]:
-            field, h, lag = np.array([0, *x[24:26]]) + x[27:], np.zeros((3, 33)), np.eye(3) + x[26] * skew(gyro)
+            field, h, lag = np.array([0, *x[24:26]]), np.zeros((3, 36)), np.eye(3) + x[26] * skew(gyro)
             h[:, :3], h[:, 24:27], h[:, 27:29] = lag @ turn.T @ skew(field), np.eye(3), (lag @ turn.T)[:, 1:]
-            h[:, 29], h[:, 30:] = skew(gyro) @ turn.T @ field, lag @ turn.T
+            h[:, 29], h[:, 30:33] = skew(gyro) @ (turn.T @ field + x[27:30]), lag
             noise = s.magnetometer**2 + s.magnetometer_rate**2 * (gyro @ gyro)
-            update(row["magnetometer"], lag @ turn.T @ field + x[21:24], h, noise)
+            update(row["magnetometer"], lag @ (turn.T @ field + x[27:30]) + x[21:24], h, noise)
         if row["rest_observed"]:
-            h = np.zeros((3, 33))
+            h = np.zeros((3, 36))
             h[:, 3:6] = np.eye(3)
             update(gyro, x[:3], h, s.rest**2)
         found.append((turn, x.copy(), cov))
@@ -164,7 +162,7 @@ def test_it_is_the_error_state_kalman_filter(axes):
 # ------------------------------------------------------------------------------------- data of the model itself
 
 
-def drawn_rows(settings, runs=60, steps=100, seed=0):
+def drawn_rows(settings, runs=200, steps=45, seed=0):
     """Rows and states of bodies that move, and whose sensors err, as the filter expects."""
     torch.manual_seed(seed)
     model, dt = imu(**dataclasses.asdict(settings)).double(), 0.035
@@ -175,6 +173,7 @@ def drawn_rows(settings, runs=60, steps=100, seed=0):
     rows["moves"] = moves(settings.poles, dt).expand(runs, steps, 9).contiguous()
     rows["unrest"] = torch.full_like(rows["dt"], 0.5)
     rows["disturbance"] = torch.full_like(rows["dt"], 0.3)
+    rows["lever"] = torch.randn(runs, steps, 9, dtype=torch.float64)
     rows["rest_observed"] = torch.zeros(runs, steps, 1, dtype=torch.bool)
     middle = SPACE.neutral(rows["dt"])
     middle[28:30] = torch.tensor([16.0, -41.0])
@@ -184,12 +183,12 @@ def drawn_rows(settings, runs=60, steps=100, seed=0):
     states, accelerometer, magnetometer = [], [], []
     for t in range(steps):
         if t == 0:
-            state = SPACE.plus(rows["start"][:, 0], std * torch.randn(runs, 33, dtype=torch.float64))
+            state = SPACE.plus(rows["start"][:, 0], std * torch.randn(runs, 36, dtype=torch.float64))
         else:
             now = rows[:, t].clone()
             now["belief", "ensemble"], now["belief", "mean"] = state.unsqueeze(1), state
             state, variance = transition(now)["forecast", "ensemble"].squeeze(1), noise(now)["forecast", "noise"]
-            state = SPACE.plus(state, variance.sqrt() * torch.randn(runs, 33, dtype=torch.float64))
+            state = SPACE.plus(state, variance.sqrt() * torch.randn(runs, 36, dtype=torch.float64))
         now = TensorDict({"forecast": {"ensemble": state.unsqueeze(1)}, **rows[:, t]}, [runs])
         for name, to in (("accelerometer", accelerometer), ("magnetometer", magnetometer)):
             value = model[name].module.module(now.clone()).get(("forecast", "observation")).squeeze(1)
@@ -242,6 +241,29 @@ def test_within_a_block_the_gyro_turns_exactly():
     later = orientations(imu(gyro_bias=1e-9, latency=0.05).double(), gyro, force, rate=rate).quaternion
     ahead = SO3().log(SO3().compose(SO3().inverse(found.quaternion), later))
     torch.testing.assert_close(ahead[:, 2], torch.full_like(angle, 0.1), atol=1e-3, rtol=0)
+
+
+@torch.no_grad()
+def test_an_accelerometer_says_nothing_of_the_heading():
+    _, log = body_log(600)
+    del log["magnetometer"]
+    log["gyro"] -= torch.tensor([0.01, -0.02, 0.005])  # its bias
+    model = imu(heading=0.5, gyro_bias=1e-9, gyro_walk=1e-9, gyro_scale=1e-9, gyro_skew=1e-9).double()
+    variance = model.sequence(imu_rows(model.settings, **log, rate=100.0))["belief", "cov"][:, 2, 2]
+    assert variance.min() > 0.97 * 0.5**2  # vectors in the world's axes: 0.21 * 0.5**2
+
+
+def test_a_field_unlike_that_of_the_place_widens_the_heading():
+    _, log = body_log(400)
+    model = imu().double()
+    found = orientations(model, **log, rate=100.0)
+    field = found.mean[-1, 28:30]
+    model.settings = dataclasses.replace(model.settings, place=(field - torch.tensor([2.0, -1.0])).tolist())
+    wider = orientations(model, **log, rate=100.0).std
+    more = (wider.square() - found.std.square())[-1]
+    torch.testing.assert_close(more, torch.tensor([0.0, 0.0, 2.5 / field[0].item() ** 2], dtype=more.dtype))
+    with pytest.raises(ValueError, match="place are 2 numbers"):
+        imu(place=(16.0,))
 
 
 def test_a_log_that_is_not_one():

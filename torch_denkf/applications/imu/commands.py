@@ -88,7 +88,11 @@ def read_log(file: Path) -> tuple[dict[str, ndarray], float]:
     log = {name: each for name, each in _COLUMNS.items() if set(each) <= set(names)}
     if "t" not in names or "gyro" not in log or "acceleration" not in log:
         raise ValueError(f"{file} needs the columns t, gx, gy, gz, ax, ay, az; it has {', '.join(names) or 'none'}")
+    partial = [c for name, each in _COLUMNS.items() if name not in log for c in each if c in names]
+    if partial:
+        raise ValueError(f"{file} has {', '.join(partial)} but not all three; add the others, or leave them out")
     steps = np.diff(table["t"])
-    if not len(steps) or not 0 < steps.max() < 1.5 * np.median(steps):
+    middle = np.median(steps) if len(steps) else 0.0
+    if not (middle > 0 and steps.min() > 0.5 * middle and steps.max() < 1.5 * middle):
         raise ValueError(f"the times t of {file} are to be even, in s; fill gaps by interpolation, or cut the log")
     return {n: np.stack([table[c] for c in each], -1) for n, each in log.items()}, 1 / steps.mean()

@@ -19,10 +19,11 @@ from torch_denkf.submodel import Sensor, SubModel
 __all__ = ["SPACE", "ImuFilter", "ImuMotion", "ImuNoise", "ImuSettings", "MagnetometerNoise", "imu", "moves"]
 
 #: Orientation (errors in the world's axes); the gyro's bias and its matrix of errors; position, velocity and
-#: acceleration in the world's axes; the magnetometer's bias; the field northwards and upwards; the magnetometer's lag;
-#: the stray field in the world's axes.
-SPACE = Product(Opposite(SO3()), *map(Euclidean, (3, 9, 3, 3, 3, 3, 2, 1, 3)))
-BIAS = 4  # its place in a point
+#: acceleration in the body's axes; the magnetometer's bias; the field northwards and upwards; the magnetometer's lag;
+#: the stray field in the body's axes; the lever, likewise. In the world's axes, the error of the heading would stand in
+#: what the accelerometer reads of acceleration, and the filter would learn a heading from it that nothing reads.
+SPACE = Product(Opposite(SO3()), *map(Euclidean, (3, 9, 3, 3, 3, 3, 2, 1, 3, 3)))
+BIAS, FIELD = 4, 28  # their places in a point
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,9 @@ class ImuSettings:
         stray_time: in which it fades to 1/e, in s.
         lag: how much later the magnetometer reads than the gyro, in s.
         lag_std: standard deviation of that number.
+        lever: standard deviation of the lever at the start, about each axis, in m: whatever is held in a hand turns
+            about a joint, so that its acceleration follows from how it turns.
+        lever_walk: of the lever, in m/sqrt(s).
         tilt: standard deviation of the inclination at the start, in rad.
         heading: of the heading at the start, in rad.
         rest: of the gyro's mean over a block at rest, in rad/s.
@@ -62,6 +66,8 @@ class ImuSettings:
         heading_floor: least standard deviation of the heading, in degrees.
         tilt_scale: factor on the standard deviations of the inclination.
         tilt_floor: least standard deviation of the inclination about each axis, in degrees.
+        place: the earth's field northwards and upwards there, in uT, if it is known. As far as the estimated field is
+            off in these directions it may be off eastwards, too: the heading's standard deviation is so much larger.
     """
 
     gyro: float = 1e-3
@@ -86,6 +92,8 @@ class ImuSettings:
     stray_time: float = 1.0
     lag: float = 0.0
     lag_std: float = 0.003
+    lever: float = 0.1
+    lever_walk: float = 0.01
     tilt: float = 0.05
     heading: float = 0.1
     rest: float = 0.002
@@ -96,14 +104,19 @@ class ImuSettings:
     heading_floor: float = 0.5
     tilt_scale: float = 0.7
     tilt_floor: float = 0.15
+    place: tuple[float, float] | None = None
 
     def __post_init__(self):
-        object.__setattr__(self, "poles", tuple(self.poles))  # of a file they are a list
         for each in fields(self):
-            for value in self.poles if each.name == "poles" else [getattr(self, each.name)]:
-                check_number(each.name, value, above=-math.inf if each.name in ("lag", "latency") else 0)
-        if len(self.poles) != 3:
-            raise ValueError(f"poles are three rates; got {len(self.poles)}.")
+            value = getattr(self, each.name)
+            if each.name in ("poles", "place") and value is not None:  # of a file they are lists
+                value = tuple(value)
+                object.__setattr__(self, each.name, value)
+                size = 3 if each.name == "poles" else 2
+                if len(value) != size:
+                    raise ValueError(f"{each.name} are {size} numbers; got {len(value)}.")
+            for number in value if isinstance(value, tuple) else [] if value is None else [value]:
+                check_number(each.name, number, above=-math.inf if each.name in ("lag", "latency", "place") else 0)
 
 
 class ImuMotion(Motion):
@@ -125,12 +138,13 @@ class ImuMotion(Motion):
 
     def move(self, state, gyro, moves, *, dt):
         """The state one step later."""
-        orientation, bias, errors, position, velocity, acceleration, *others, stray = SPACE.points(state)
-        rate = gyro - bias - (errors.unflatten(-1, (3, 3)) * gyro.unsqueeze(-2)).sum(-1)
-        turned = SO3().plus(orientation, rate * dt)
+        orientation, bias, errors, position, velocity, acceleration, *others, stray, lever = SPACE.points(state)
+        turn = SO3().exp((gyro - bias - (errors.unflatten(-1, (3, 3)) * gyro.unsqueeze(-2)).sum(-1)) * dt)
         matrix, before = moves.unflatten(-1, (3, 3)), torch.stack([position, velocity, acceleration], -2)
         moved = (matrix.unsqueeze(-1) * before.unsqueeze(-3)).sum(-2)
-        return torch.cat([turned, bias, errors, moved.flatten(-2), *others, stray * (-dt / self.stray_time).exp()], -1)
+        stray = stray * (-dt / self.stray_time).exp()
+        *moved, stray = (rotate(SO3().inverse(turn), vector) for vector in (*moved.unbind(-2), stray))
+        return torch.cat([SO3().compose(orientation, turn), bias, errors, *moved, *others, stray, lever], -1)
 
 
 def moves(poles: Sequence[float], dt: float) -> Tensor:
@@ -150,7 +164,7 @@ def moves(poles: Sequence[float], dt: float) -> Tensor:
 
 
 class ImuNoise(SubModel):
-    """Variances ``[*B, 33]`` that a step adds, learnable: of the gyro, the motion's acceleration and slow errors.
+    """Variances ``[*B, 36]`` that a step adds, learnable: of the gyro, the motion's acceleration and slow errors.
 
     Args:
         settings: the numbers before training.
@@ -161,7 +175,7 @@ class ImuNoise(SubModel):
         super().__init__(nn.Identity(), keys, [("forecast", "noise")])
         s = settings
         shares = [s.gyro, s.gyro_rate, s.gyro_walk, s.motion, s.motion_unrest, s.magnetic_walk, s.field_walk]
-        shares += [s.stray, s.stray_unrest]
+        shares += [s.stray, s.stray_unrest, s.lever_walk]
         self.log_std = nn.Parameter(torch.tensor(shares).log())
         self.register_buffer("damping", torch.tensor(2 * sum(s.poles)))
         self.register_buffer("stray_time", torch.tensor(s.stray_time))
@@ -169,10 +183,10 @@ class ImuNoise(SubModel):
     def compute(self, mean, gyro, unrest, disturbance, dt):
         """The variances of the step."""
         rate, variance = gyro.square().sum(-1, keepdim=True), (2 * self.log_std).exp()
-        white, by_rate, walk, motion, by_unrest, bias, field, stray, by_disturbance = variance.unbind(-1)
+        white, by_rate, walk, motion, by_unrest, bias, field, stray, by_disturbance, lever = variance.unbind(-1)
         turn, push = white + by_rate * rate, self.damping * (motion + by_unrest * unrest.square())
         new = (stray + by_disturbance * disturbance.square()) * -torch.expm1(-2 * dt / self.stray_time) / dt
-        sizes = ((turn, 3), (walk, 3), (0, 15), (push, 3), (bias, 3), (field, 2), (0, 1), (new, 3))
+        sizes = ((turn, 3), (walk, 3), (0, 15), (push, 3), (bias, 3), (field, 2), (0, 1), (new, 3), (lever, 3))
         columns = [(one + torch.zeros_like(dt)).expand(*dt.shape[:-1], count) for one, count in sizes]
         return (torch.cat(columns, -1) * dt).to(mean.dtype)
 
@@ -181,13 +195,14 @@ class _Accelerometer(SubModel):
     """Specific force in the body's axes ``[*B, E, 3]``."""
 
     def __init__(self, gravity: float):
-        super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
+        super().__init__(nn.Identity(), [("forecast", "ensemble"), "lever"], [("forecast", "observation")])
         self.register_buffer("up", torch.tensor([0.0, 0.0, gravity]))
 
-    def compute(self, state):
-        """Gravity, and the motion's acceleration."""
-        orientation, *_, acceleration = SPACE.points(state)[:6]
-        return rotate(SO3().inverse(orientation), acceleration + self.up)
+    def compute(self, state, lever):
+        """Gravity, and the acceleration of the joint and about it; ``lever`` ``[*B, 9]``, see :func:`imu_rows`."""
+        parts = SPACE.points(state)
+        about = (lever.unflatten(-1, (3, 3)).unsqueeze(-3) * parts[10].unsqueeze(-2)).sum(-1)
+        return rotate(SO3().inverse(parts[0]), self.up) + parts[5] + about
 
 
 class _Magnetometer(SubModel):
@@ -198,10 +213,9 @@ class _Magnetometer(SubModel):
 
     def compute(self, state, gyro):
         """The field in the axes of the body as they were, and the bias."""
-        parts = SPACE.points(state)
-        field = torch.nn.functional.pad(parts[7], (1, 0)) + parts[9]
-        field = rotate(SO3().inverse(parts[0]), field)
-        return field + parts[8] * torch.linalg.cross(gyro.unsqueeze(-2).expand_as(field), field) + parts[6]
+        orientation, *_, bias, field, lag, stray, _ = SPACE.points(state)
+        field = rotate(SO3().inverse(orientation), torch.nn.functional.pad(field, (1, 0))) + stray
+        return field + lag * torch.linalg.cross(gyro.unsqueeze(-2).expand_as(field), field) + bias
 
 
 class MagnetometerNoise(Sensor):
@@ -245,6 +259,7 @@ class ImuFilter(FusedFilter):
         start = [s.tilt] * 2 + [s.heading] + [s.gyro_bias] * 3
         start += [s.gyro_scale if row == column else s.gyro_skew for row in range(3) for column in range(3)]
         start += [s.motion_start] * 9 + [s.magnetic_bias] * 3 + [s.field] * 2 + [s.lag_std] + [s.stray] * 3
+        start += [s.lever] * 3
         force_noise = ConstantNoise([s.accelerometer] * 3, trainable=True, in_key="accelerometer")
         sensors = {
             "accelerometer": FusedSensor(_Accelerometer(s.gravity), force_noise),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -9,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf._checks import check_number, check_shape
-from torch_denkf.applications.imu.filter import SPACE, ImuFilter, ImuSettings, moves
+from torch_denkf.applications.imu.filter import FIELD, SPACE, ImuFilter, ImuSettings, moves
 from torch_denkf.functional.manifolds import SO3, quaternion_of, rotate, rotation_matrix
 from torch_denkf.smoothers import RTSSmoother
 
@@ -26,8 +27,8 @@ class Orientations(NamedTuple):
         quaternion: ``[T, 4]``, w first, from the sensor's axes to the world's.
         std: standard deviations of rotations about the world's x, y and z, ``[T, 3]`` in rad: inclination about two
             axes, and heading.
-        mean: the filter's beliefs, a point of its space for each block, ``[N, 34]``.
-        cov: their covariances ``[N, 33, 33]``.
+        mean: the filter's beliefs, a point of its space for each block, ``[N, 37]``.
+        cov: their covariances ``[N, 36, 36]``.
     """
 
     quaternion: Tensor
@@ -66,11 +67,17 @@ def imu_rows(
     size = acceleration.norm(dim=-1).nanmedian().item()
     if not 5 < size < 20:
         raise ValueError(f"acceleration is in m/s^2, where gravity is 9.81; the median of its size is {size:.3g}.")
+    size = math.nan if magnetometer is None else magnetometer.norm(dim=-1).nanmedian().item()
+    if size < 5 or size > 500:
+        raise ValueError(f"magnetometer is in uT, where the earth's field has 25 to 65; the median is {size:.3g}.")
     count, dt = block_size(settings, rate), 1 / rate
+    faster = torch.cat([torch.zeros_like(gyro[:1]), gyro.diff(dim=0)]) * rate
     blocks = len(gyro) // count
     if not blocks:
         raise ValueError(f"a log needs at least {count} readings, one block of {settings.block} s; got {len(gyro)}.")
-    gyro, force = (value[: blocks * count].unflatten(0, (blocks, count)) for value in (gyro, acceleration))
+    gyro, faster, force = (
+        value[: blocks * count].unflatten(0, (blocks, count)) for value in (gyro, faster, acceleration)
+    )
     turns, to_end = SO3().exp(gyro * dt), [SO3().neutral(gyro).expand(blocks, 4)]
     for place in range(count - 1, 0, -1):
         to_end.append(SO3().compose(turns[:, place], to_end[-1]))
@@ -79,6 +86,10 @@ def imu_rows(
     rows = TensorDict({"gyro": SO3().log(total) / (count * dt), "dt": gyro.new_full((blocks, 1), count * dt)}, [blocks])
     rows["moves"] = moves(settings.poles, count * dt).to(gyro).expand(blocks, 9)
     rows["accelerometer"], rows["accelerometer_observed"] = _mean(rotate(back, force))
+    lever = []  # acceleration of a point that turns with the body, by its distance along each axis
+    for axis in torch.eye(3).to(gyro).expand(blocks, count, 3, 3).unbind(-2):
+        lever.append(rotate(back, gyro.cross(gyro.cross(axis, -1), -1) + faster.cross(axis, -1)).mean(1))
+    rows["lever"] = torch.stack(lever, -1).flatten(-2)
     if magnetometer is None:
         rows["magnetometer"] = torch.zeros_like(rows["gyro"])
         rows["magnetometer_observed"] = torch.zeros_like(rows["accelerometer_observed"])
@@ -125,11 +136,12 @@ def orientations(
         smooth: whether all later readings count, too (Rauch-Tung-Striebel).
 
     Raises:
-        ValueError: see :func:`imu_rows`.
+        ValueError: see :func:`imu_rows`; or if the gyro's readings are in degrees a second.
     """
     settings, dtype = model.settings, next(model.parameters()).dtype
     values = [None if value is None else value.to(dtype) for value in (gyro, acceleration, magnetometer)]
     rows = imu_rows(settings, *values, rate=rate)  # type: ignore[arg-type]
+    _check_unit_of(values[0], values[1], rate)  # type: ignore[arg-type]
     prefix = "smoothed" if smooth else "belief"
     out = (RTSSmoother(model) if smooth else model).sequence(rows, keep=[(prefix, "mean"), (prefix, "cov")])
     return at_readings(settings, out[prefix, "mean"], out[prefix, "cov"], values[0], rate)  # type: ignore[arg-type]
@@ -141,7 +153,7 @@ def at_readings(settings: ImuSettings, mean: Tensor, cov: Tensor, gyro: Tensor, 
     blocks = len(mean) + 1  # the last may be short
     rates = torch.nn.functional.pad(gyro, (0, 0, 0, blocks * count - length)).unflatten(0, (blocks, count))
     before = torch.cat([mean[:1], mean])  # what the readings of a block start from
-    _, bias, errors = SPACE.points(before)[:3]
+    bias, errors = SPACE.points(before)[1:3]
     rates = rates - bias.unsqueeze(1) - rates @ errors.unflatten(-1, (3, 3)).mT
     turns = SO3().exp(rates / rate)
     steps = [turns[:, 0]]
@@ -156,10 +168,37 @@ def at_readings(settings: ImuSettings, mean: Tensor, cov: Tensor, gyro: Tensor, 
     degree = torch.pi / 180
     scale = variance.new_tensor([settings.tilt_scale] * 2 + [settings.heading_scale])
     floor = variance.new_tensor([settings.tilt_floor] * 2 + [settings.heading_floor]) * degree
-    std = (variance * scale.square() + floor.square()).sqrt()
+    std = (variance * scale.square() + floor.square() + astray(settings, mean)).sqrt()
     std = torch.cat([std[:1], std]).unsqueeze(1).repeat(1, count, 1)
     std[:-1, -1] = std[1:, 0].clone()
     return Orientations(found.flatten(0, 1)[:length], std.flatten(0, 1)[:length], mean, cov)
+
+
+def _check_unit_of(gyro: Tensor, acceleration: Tensor, rate: float) -> None:
+    """Raises if the mean force of seconds is no gravity in the axes that the gyro keeps, and is in degrees a second."""
+    count = max(round(rate), 1)
+    seconds = len(gyro) // count
+    force = torch.where(acceleration.isfinite().all(-1, keepdim=True), acceleration, 0)
+    turns = gyro[: seconds * count].norm(dim=-1).reshape(seconds, count).mean(1) > 0.5
+
+    def size(gyro: Tensor) -> float:
+        kept = rotate(_running_product(SO3().exp(gyro / rate)), force)[: seconds * count]
+        return kept.unflatten(0, (seconds, count)).mean(1).norm(dim=-1)[turns].median().item()
+
+    if turns.any() and size(gyro) < 7 and size(gyro * torch.pi / 180) > 9:
+        raise ValueError(
+            "gyro is in rad/s; by these readings gravity turns with the body, and would not if they were in degrees/s: "
+            "multiply them by pi / 180."
+        )
+
+
+def astray(settings: ImuSettings, mean: Tensor) -> Tensor:
+    """Returns the variance of the heading ``[N, 3]`` that a field unlike the place's says, zero of the inclination."""
+    field = mean[:, FIELD : FIELD + 2]
+    if settings.place is None or not field.any():  # or 6 axes
+        return mean.new_zeros(3)
+    away = (field - field.new_tensor(settings.place)).square().mean(-1) / field[:, 0].square().clamp_min(1.0)
+    return torch.nn.functional.pad(away.unsqueeze(-1), (2, 0))
 
 
 def block_size(settings: ImuSettings, rate: float) -> int:
@@ -207,7 +246,7 @@ def _start(rows: TensorDict) -> Tensor:
         axes = rotation_matrix(_level(up))
     state = SPACE.neutral(up)
     state[:4] = quaternion_of(axes)
-    state[28:30] = (axes @ field)[1:] if seen else 0
+    state[FIELD : FIELD + 2] = (axes @ field)[1:] if seen else 0
     return state
 
 
