@@ -27,6 +27,7 @@ __all__ = [
     "reads_of",
     "run_module",
     "run_modules",
+    "runs_as_written",
     "writes",
 ]
 
@@ -84,13 +85,17 @@ def linearise(
     module: TensorDictModuleBase, entries: Entries, call: Call
 ) -> tuple[Entries, Tensor, tuple[Space, Space] | None] | None:
     """Returns what a module says of itself, see :meth:`SubModel.linearised`; ``None`` where only autograd knows."""
-    hooked = module._forward_hooks or module._forward_pre_hooks
-    if hooked or not isinstance(module, SubModel) or type(module).forward is not SubModel.forward:
+    if not (isinstance(module, SubModel) and runs_as_written(module)):
         return None
     try:
         return module.linearised(entries, call)
     except (KeyError, *EXPLAINED):  # a run says what is wrong
         return None
+
+
+def runs_as_written(module: TensorDictModuleBase) -> bool:
+    """Tells whether a sub-model has neither forward hooks nor a ``forward`` of its own."""
+    return type(module).forward is SubModel.forward and not (module._forward_hooks or module._forward_pre_hooks)
 
 
 def run_modules(modules: Iterable[tuple[str, TensorDictModuleBase]], entries: Entries, call: Call) -> Entries:

@@ -187,6 +187,8 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         """
         parts, episodes = [], []
         for number, rollout in enumerate(rollouts):
+            if rollout.ndim == 1:  # split_trajectories pads, and marks what it does not
+                rollout = rollout[rollout.get(("collector", "mask"), ...)]
             if rollout.ndim != 1 or rollout["next", "done"][:-1].any():
                 raise ValueError(
                     f"A rollout is one episode, [T]; that of number {number} is {list(rollout.shape)}, or ends before "
@@ -195,7 +197,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
             step = torch.arange(len(rollout)).unsqueeze(-1)
             times = {"step": step, "time": dt * step.double()}
             kept = rollout.exclude("next", "collector", "done", "terminated", "truncated", "is_init", "step_count")
-            parts.append(kept.cpu().apply(lambda x: x.float() if x.is_floating_point() else x).update(times))
+            parts.append(kept.detach().cpu().apply(lambda x: x.float() if x.is_floating_point() else x).update(times))
             episodes.append(Episode(str(number), sum(map(len, parts[:-1])), len(rollout)))
         rows = cast(TensorDictBase, torch.cat(parts))
         pixels, pictures = rows.pop("pixels", None), None
@@ -207,7 +209,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
                 )
             pictures = partial(float_pictures, pixels)
         data = cls(rows, episodes, for_tests=hashed_tests(test_share), pictures=pictures, **options)
-        numbers = {key: value for key, value in rows.items() if isinstance(value, Tensor) and value.ndim == 2}
+        numbers = {key: value for key, value in rows.items(True, True) if isinstance(value, Tensor) and value.ndim == 2}
         data._numbers = [key for key, value in numbers.items() if value.is_floating_point() and key != "time"]
         data._stored = pixels
         return data
@@ -309,7 +311,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         if self._stored is None:
             return None
         seen = self._all_rows.get("observed", None)
-        return picture_statistics(self._stored, index if seen is None else index[seen.squeeze(-1)[index]])
+        return picture_statistics(self._stored, index if seen is None else index[seen.any(-1)[index]])
 
     def _is_downloaded(self) -> bool:
         return self.root is None or self.root.is_dir()

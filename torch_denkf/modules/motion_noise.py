@@ -17,7 +17,7 @@ from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules.noise import ConstantNoise
 from torch_denkf.modules.process_noise import NoiseThrough
 from torch_denkf.modules.tensors import check_dims
-from torch_denkf.running import check_module, reads, run_module
+from torch_denkf.running import check_module, reads, run_module, runs_as_written
 from torch_denkf.submodel import Call, Entries, Transition
 
 __all__ = ["NoisyTransition"]
@@ -94,9 +94,7 @@ class NoisyTransition(Transition):
         self.log_weight_key, self.space = unravel_key(log_weight_key), check_space("space", space)
         self.before, self.mean_key, self.forecast_mean_key = before, *map(unravel_key, (mean_key, forecast_mean_key))
         check_dims("dims", dims or (), once=True)
-        of_noise = [] if type(noise) is ConstantNoise else of_noise  # it looks at the state's width alone
-        self._means = self_made.intersection([*needed, *optional, *of_noise, *of_noise_optional])
-        self.exact, self.noise_dim = is_exact(draws), noise.noise_dim if isinstance(noise, NoiseThrough) else None
+        self.exact = is_exact(draws)
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
 
     def draw_noise(self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_):
@@ -106,6 +104,13 @@ class NoisyTransition(Transition):
             return None
         size = min(size, self.noise_dim or size)
         return torch.randn(*batch_size, members, size, device=device, dtype=dtype, generator=generator)
+
+    @property
+    def noise_dim(self) -> int | None:
+        """Returns N, of noise that enters through a matrix; ``None`` where the noise module does more than that."""
+        noise = self.module["noise"]
+        mapped = isinstance(noise, NoiseThrough) and type(noise).on_entries is NoiseThrough.on_entries
+        return noise.noise_dim if mapped and runs_as_written(noise) else None
 
     def noise_sizes(self, ensemble, *_):
         """Returns E, and the state's size."""
@@ -132,7 +137,8 @@ class NoisyTransition(Transition):
 
     def _mean(self, key: NestedKey, members: torch.Tensor, log_weights: torch.Tensor | None) -> torch.Tensor:
         """Returns the mean for the parts, or any member where none reads its numbers."""
-        if key not in self._means:
+        parts = [part for part in self.module.values() if type(part) is not ConstantNoise]  # it reads a dtype alone
+        if not any(key in keys for part in parts for keys in reads(part)):
             return members[..., 0, :]
         if self.space is not None:
             return self.space.mean(members, None if log_weights is None else log_weights.exp())

@@ -151,11 +151,11 @@ class NoiseThrough(Wrapper):
     """Runs another noise module and writes G Q G^T in its place, in the same entry; a sub-class gives G.
 
     Attributes:
-        noise_dim: N, of the noise inside.
+        noise_dim: N, of the noise inside, where it is known; an ensemble then draws no more.
     """
 
     place = "noise"
-    noise_dim: int
+    noise_dim: int | None = None
 
     def on_entries(self, entries, call):
         """Returns the covariance."""

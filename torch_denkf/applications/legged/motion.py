@@ -218,7 +218,7 @@ class LeggedMotion(Motion):
         rows = [
             nn.functional.pad(base, (0, count)),
             eye[9:15].expand(*batch, 6, 15 + count),
-            torch.cat([feet, stands.to(eye).diag_embed()], -1),
+            torch.cat([feet, stands.to(eye).diag_embed().expand(*batch, count, count)], -1),
         ]
         return torch.cat(rows, -2)
 

@@ -38,9 +38,10 @@ def made_once(key: Hashable, make: Callable[[], Tensor]) -> Tensor:
         return _MADE[key]
     made = make()
     if type(made) is Tensor and not torch.compiler.is_compiling() and not torch.compiler.is_exporting():
-        with suppress(NotImplementedError, RuntimeError):  # torch.func's wrappers, of one call alone, have no storage
+        # torch.func's wrappers, of one call alone, have no storage; what inference mode makes, no gradient may meet.
+        with suppress(NotImplementedError, RuntimeError), torch.inference_mode(False):
             made.untyped_storage()
-            _MADE[key] = made
+            _MADE[key] = made = made.clone()
     return made
 
 
