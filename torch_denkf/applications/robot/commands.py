@@ -27,9 +27,9 @@ class Fuse(Command):
     out: Path  # folder for path.csv, path.tum, path.geojson, path.png, bands.png, report.md and ekf.yaml
     config: Path | None = None  # YAML of robot_localization, whose topics are topics or streams; by default by the log
     kind: Literal["ekf", "ukf"] = "ekf"  # the extended Kalman filter, or the unscented one
-    steps: int = 8  # of each of three stages of learning; 0 leaves the noises as they are
+    steps: int = 6  # of each of three stages of learning; 0 leaves the noises as they are
     gaps: int = 0  # hide the poses in so many stretches, and say how far off the path is there
-    gap_seconds: float = 15.0  # of a stretch
+    gap_seconds: float = 15.0  # of a stretch, and of those that are hidden to learn
 
     name, example = "fuse", "denkf fuse drive.csv --out runs/drive"
 
@@ -40,8 +40,15 @@ class Fuse(Command):
 
         from torch_denkf._checks import check_count, check_number
         from torch_denkf.applications.robot import robot_model
-        from torch_denkf.applications.robot.learning import learn_noises
-        from torch_denkf.applications.robot.log import default_settings, log_streams, read_log, rows_of_log, start_of
+        from torch_denkf.applications.robot.learning import RATE, learn_noises, spread_over
+        from torch_denkf.applications.robot.log import (
+            default_settings,
+            drift_settings,
+            log_streams,
+            read_log,
+            rows_of_log,
+            start_of,
+        )
         from torch_denkf.applications.robot.report import draw, gap_errors, sensor_lines, write_path
         from torch_denkf.smoothers import RTSSmoother
 
@@ -53,18 +60,23 @@ class Fuse(Command):
         for text in model.unheeded:
             say(f"not honoured: {text}")
         log = read_log(self.log, model.config, streams)
+        if self.steps:
+            model = robot_model(drift_settings(log, model), kind=self.kind)
         model = start_of(log, model)
         full = rows_of_log(log, model)
         begin, end = float(full["stamp"][0]), float(full["stamp"][-1])
         middles = begin + (end - begin) * (np.arange(self.gaps) + 1) / (self.gaps + 1)
-        rows = rows_of_log(log, model, np.stack([middles, middles], 1) + np.array([-0.5, 0.5]) * self.gap_seconds)
+        hidden = np.stack([middles, middles], 1) + np.array([-0.5, 0.5]) * self.gap_seconds
+        rows = rows_of_log(log, model, hidden)
         self.out.mkdir(parents=True, exist_ok=True)
         with alone_in(self.out):
             lines = [f"# {self.log.name}", "", f"`{self.command_line}`", ""]
             if self.steps:
-                learned = learn_noises(model, rows, steps=self.steps)
+                few = rows_of_log(log, model, hidden, min(RATE, model.config.frequency))
+                learned = learn_noises(model, few, steps=self.steps, window=self.gap_seconds)
+                spread_over(model, few, rows)
                 lines.append(
-                    f"Log-likelihood of a row that was held out: {learned.before:.3f} with the noises as they were, "
+                    f"Log-likelihood of what was held out: {learned.before:.3f} with the noises at first, "
                     f"{learned.after:.3f} with those learned" + (", interrupted." if learned.interrupted else ".")
                 )
             with torch.no_grad():

@@ -13,15 +13,16 @@ from tensordict import TensorDict
 
 from torch_denkf.applications.robot.config import Config
 from torch_denkf.applications.robot.model import RobotModel
-from torch_denkf.applications.robot.motion import ANGLES
+from torch_denkf.applications.robot.motion import ANGLES, STATES
 from torch_denkf.applications.robot.readings import Seen, seen_by
 from torch_denkf.data.recordings.offsets import ClockOffset, Delay, delays_between, solved
 from torch_denkf.data.recordings.quantities import find
 from torch_denkf.data.recordings.streams import Stream, streams_of
 
-__all__ = ["RobotLog", "default_settings", "log_streams", "read_log", "rows_of_log", "start_of"]
+__all__ = ["RobotLog", "default_settings", "drift_settings", "log_streams", "read_log", "rows_of_log", "start_of"]
 
 _KMH = (3.1, 4.2)  # of a speed to that by fixes, in m/s
+_SHARE = 0.05  # of a speed, or of a reading's spread: size of a drift before it is learned
 _AWAY = 5.0  # m, from the first fix to the one that tells the heading
 
 
@@ -93,6 +94,34 @@ def read_log(file: Path, config: Config, streams: Mapping[str, Stream]) -> Robot
     return RobotLog(seen, offsets, origin)
 
 
+def drift_settings(log: RobotLog, model: RobotModel) -> dict:
+    """The settings, with drifts of all readings that vary, from which they are learned; those that are given stay.
+
+    Velocities are held for a step, and without process noise in the settings it follows from how they change in 1 s.
+    A pose drifts by what the log says of its noise; a forward speed by a share, other readings by one of their spread.
+    """
+    settings = {"held_velocities": True, **model.config.given}
+    walks = [1e-2] * 3 + [1e-4] * 3 + [1e-2] * 9  # the variance that a second adds
+    for sensor in model.config.sensors:
+        drifts = [0.0] * len(STATES)
+        for group in sensor.groups:
+            seen = log.seen[f"{sensor.name}_{group}"]
+            back = 6 if sensor.differential and group == "pose" else 0
+            for at, place in enumerate(model.reads[f"{sensor.name}_{group}"]):
+                column = np.unwrap(seen.values[:, at]) if place in ANGLES else seen.values[:, at]
+                if np.ptp(column) == 0:
+                    continue
+                if 6 <= place < 12:
+                    later = np.interp(seen.times + 1.0, seen.times, column)
+                    walks[place] = float(np.square(later - column).mean())
+                drifts[place - back] = _SHARE if place == STATES.index("vx") else _SHARE * float(column.std())
+                if place < 3:
+                    drifts[place] = float(np.sqrt(np.median(seen.noise[:, at, at])))
+        settings.setdefault(f"{sensor.name}_drifts", drifts)
+    settings.setdefault("process_noise_covariance", walks)
+    return settings
+
+
 def _in(scale: float) -> bool:
     return _KMH[0] < abs(scale) < _KMH[1]
 
@@ -104,18 +133,21 @@ def _found(topic: str, streams: Mapping[str, Stream], file: Path) -> str:
     raise ValueError(f"{file} has no stream {topic!r}; it has {list(streams)}: see denkf log {file}")
 
 
-def rows_of_log(log: RobotLog, model: RobotModel, hidden: np.ndarray | None = None) -> TensorDict:
+def rows_of_log(
+    log: RobotLog, model: RobotModel, hidden: np.ndarray | None = None, frequency: float | None = None
+) -> TensorDict:
     """Makes rows ``[T]`` of all poses, of fast ones of every so many, and of ``frequency`` where none is near.
 
-    Readings of other sensors that are as fast stand in the row that is nearest to them, as their mean; those of slow
-    ones have rows of their own.
+    Readings of other sensors that are as fast stand in the row that is nearest to them, as their mean; in the one
+    before them if the model holds velocities for a step. Those of slow ones have rows of their own.
 
     Args:
         log: the readings.
         model: whose sensors read them.
         hidden: intervals in s ``[N, 2]`` in which poses are not observed, after the first row.
+        frequency: of rows, Hz; by default the model's.
     """
-    rate = model.config.frequency
+    rate = model.config.frequency if frequency is None else frequency
     poses = {name for name in log.seen if name.endswith("_pose") and model.reads[name][0] < 6}
     streams = {name: seen.every(int(_rate(seen) / rate)) if name in poses else seen for name, seen in log.seen.items()}
     own = {name: name in poses or _rate(seen) < 0.7 * rate for name, seen in streams.items()}
@@ -130,9 +162,9 @@ def rows_of_log(log: RobotLog, model: RobotModel, hidden: np.ndarray | None = No
         ticks = ticks[(near > 0.5 / rate) & (ticks > begin)]
     times = np.unique(np.concatenate([[begin], exact, ticks]))
     rows = {"stamp": times[:, None], "dt": np.diff(times, prepend=begin)[:, None]}
-    edges = (times[1:] + times[:-1]) / 2
+    edges = times[1:] if model.config.held else (times[1:] + times[:-1]) / 2
     for name, seen in streams.items():
-        place = np.searchsorted(times, seen.times) if own[name] else np.searchsorted(edges, seen.times)
+        place = np.searchsorted(times, seen.times) if own[name] else np.searchsorted(edges, seen.times, "right")
         inside = (seen.times >= begin) & (seen.times <= times[-1] + 0.5 / rate)
         place, values, noise = place[inside], seen.values[inside], seen.noise[inside]
         count = np.bincount(place, minlength=len(times))
