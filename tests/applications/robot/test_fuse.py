@@ -70,7 +70,7 @@ def test_messages_of_ros():
     config = read_config(settings | {"imu0_remove_gravitational_acceleration": True})
     (sensor,) = config.sensors
     pose, twist, force = (
-        seen_by(sensor, group, config, table, None, False) for group in ("pose", "twist", "acceleration")
+        seen_by(sensor, group, config, table, None, 1.0) for group in ("pose", "twist", "acceleration")
     )
     np.testing.assert_allclose(pose.values[0], [roll, pitch, yaw], atol=1e-12)
     np.testing.assert_allclose(twist.values[0], [0.3])
@@ -90,7 +90,7 @@ def test_differential_poses_are_velocities_of_the_body():
     values = np.c_[place, np.sin(angle / 2), np.cos(angle / 2), zero, zero]
     table = Readings(np.arange(4) * 0.1, values, columns)
     config = read_config({"odom0": "/o", "odom0_config": flags(0, 1, 5), "odom0_differential": True})
-    seen = seen_by(config.sensors[0], "pose", config, table, None, False)
+    seen = seen_by(config.sensors[0], "pose", config, table, None, 1.0)
     np.testing.assert_allclose(seen.values, [[2.0, 0.0, 1.0]] * 3, atol=1e-9)
     model = robot_model({"odom0": "/o", "odom0_config": flags(0, 1, 5), "odom0_differential": True})
     assert model.reads["odom0_pose"] == (6, 7, 11)

@@ -23,8 +23,9 @@ __all__ = ["Fuse"]
 class Fuse(Command):
     """Filter and smooth a log; say of each sensor how far it is believed; learn the noises; write path and settings."""
 
-    log: tyro.conf.Positional[Path]  # text, Parquet, or a ROS bag
+    log: tyro.conf.Positional[tuple[Path, ...]]  # text, Parquet, or ROS bags, of one clock
     out: Path  # folder for path.csv, path.tum, path.geojson, path.png, bands.png, report.md and ekf.yaml
+    also: tuple[Path, ...] = ()  # further logs of the same robot to learn from
     config: Path | None = None  # YAML of robot_localization, whose topics are topics or streams; by default by the log
     kind: Literal["ekf", "ukf"] = "ekf"  # the extended Kalman filter, or the unscented one
     steps: int = 6  # of each of three stages of learning; 0 leaves the noises as they are
@@ -55,11 +56,11 @@ class Fuse(Command):
         check_count("--steps", self.steps, least=0)
         check_count("--gaps", self.gaps, least=0)
         check_number("--gap-seconds", self.gap_seconds, above=0)
-        streams = log_streams(self.log)
+        streams = log_streams(*self.log)
         model = robot_model(default_settings(streams) if self.config is None else self.config, kind=self.kind)
         for text in model.unheeded:
             say(f"not honoured: {text}")
-        log = read_log(self.log, model.config, streams)
+        log = read_log(" and ".join(map(str, self.log)), model.config, streams)
         if self.steps:
             model = robot_model(drift_settings(log, model), kind=self.kind)
         model = start_of(log, model)
@@ -70,10 +71,15 @@ class Fuse(Command):
         rows = rows_of_log(log, model, hidden)
         self.out.mkdir(parents=True, exist_ok=True)
         with alone_in(self.out):
-            lines = [f"# {self.log.name}", "", f"`{self.command_line}`", ""]
+            lines = [f"# {', '.join(each.name for each in self.log)}", "", f"`{self.command_line}`", ""]
             if self.steps:
-                few = rows_of_log(log, model, hidden, min(RATE, model.config.frequency))
-                learned = learn_noises(model, few, steps=self.steps, window=self.gap_seconds)
+                rate = model.config.frequency
+                few = rows_of_log(log, model, hidden, min(RATE, rate))
+                others = []
+                for file in self.also:
+                    other = read_log(file, model.config, log_streams(file))
+                    others.append((start_of(other, model), rows_of_log(other, model, None, min(RATE, rate))))
+                learned = learn_noises(model, few, others=others, steps=self.steps, window=self.gap_seconds)
                 spread_over(model, few, rows)
                 lines.append(
                     f"Log-likelihood of what was held out: {learned.before:.3f} with the noises at first, "

@@ -44,7 +44,13 @@ class Learned(NamedTuple):
 
 
 def learn_noises(
-    model: RobotModel, rows: TensorDict, *, steps: int = 8, window: float = 15.0, shown: bool = True
+    model: RobotModel,
+    rows: TensorDict,
+    *,
+    others: Sequence[tuple[RobotModel, TensorDict]] = (),
+    steps: int = 6,
+    window: float = 15.0,
+    shown: bool = True,
 ) -> Learned:
     """Learns how large noises and drifts are, so that the fixes of a log are likely where they are hidden.
 
@@ -57,6 +63,7 @@ def learn_noises(
     Args:
         model: its parameters change.
         rows: of the log ``[T]``, see :func:`~torch_denkf.applications.robot.log.rows_of_log`.
+        others: further logs to learn from: the model with the initial belief of each, and its rows.
         steps: of a stage.
         window: s; at most a sixth of the log.
         shown: whether progress is.
@@ -64,12 +71,14 @@ def learn_noises(
     Raises:
         ValueError: if the log is too short.
     """
-    filter = model.filter
-    stamp = rows["stamp"][:, 0]
-    window = min(window, float(stamp[-1] - stamp[0]) / (_HELD_OUT + 2))
-    length = round(3 * window * len(rows) / max(float(stamp[-1] - stamp[0]), 1e-9))
+    filter, logs = model.filter, [(model, rows), *others]
+    seconds = [float(each["stamp"][-1] - each["stamp"][0]) for _, each in logs]
+    window = min(window, min(seconds) / (_HELD_OUT + 2))
+    length = min(round(3 * window * len(each) / max(took, 1e-9)) for (_, each), took in zip(logs, seconds, strict=True))
     if length < 3 * _HELD_OUT:
-        raise ValueError(f"the log has {len(rows)} rows, too few to cut it into {_HELD_OUT} segments: pass --steps 0")
+        least = min(len(each) for _, each in logs)
+        raise ValueError(f"the log has {least} rows, too few to cut it into {_HELD_OUT} segments: pass --steps 0")
+    rows = torch.cat([each for _, each in logs])
     sensors = [part.log_scale for part in filter.modules() if isinstance(part, LearnedScale)]
     sensors += [] if model.drifts is None else list(model.drifts.parameters())
     motion = [part.log_scale for part in filter.modules() if isinstance(part, RobotNoise)]
@@ -94,7 +103,8 @@ def learn_noises(
     with progress_bar("learning noises", 3 * (steps + 1), unit=" steps", shown=shown) as bar:
         try:
             for _ in range(3):
-                train, test = _segments(model, rows, window, length)
+                cut = [_segments(*each, window, length) for each in logs]
+                train, test = (torch.cat(parts) for parts in zip(*cut, strict=True))
                 optimiser = torch.optim.Adam(every, lr=_RATE)
                 for step in range(steps + 1):
                     with torch.no_grad():
@@ -110,11 +120,11 @@ def learn_noises(
                     (-_likelihood(model, train)).backward()
                     nn.utils.clip_grad_norm_(every, 10.0)
                     optimiser.step()
-                _load(model, every, best)
+                _load(logs, every, best)
                 stages.append(reached)
         except KeyboardInterrupt:  # what was learned is kept
             interrupted = True
-    _load(model, every, best)
+    _load(logs, every, best)
     for hook in hooks:
         hook.remove()
     return Learned(before if before is not None else float("nan"), reached, stages, interrupted)
@@ -164,12 +174,15 @@ def _start_from(model: RobotModel, rows: TensorDict, name: str, varies: Tensor) 
         scale.copy_(torch.where(varies, start, scale))
 
 
-def _load(model: RobotModel, parameters: Sequence[Tensor], values: Sequence[Tensor]) -> None:
+def _load(
+    logs: Sequence[tuple[RobotModel, TensorDict]], parameters: Sequence[Tensor], values: Sequence[Tensor]
+) -> None:
     with torch.no_grad():
         for parameter, value in zip(parameters, values, strict=True):
             parameter.copy_(value)
-        if model.drifts is not None:  # the initial belief knows as little of them
-            model.filter.initial.cov[len(STATES) :, len(STATES) :] = model.drifts.variance.diag()
+        for model, _ in logs:
+            if model.drifts is not None:  # the initial belief knows as little of them
+                model.filter.initial.cov[len(STATES) :, len(STATES) :] = model.drifts.variance.diag()
 
 
 def _segments(model: RobotModel, rows: TensorDict, window: float, length: int) -> tuple[TensorDict, TensorDict]:

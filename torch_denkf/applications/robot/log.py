@@ -14,14 +14,13 @@ from tensordict import TensorDict
 from torch_denkf.applications.robot.config import Config
 from torch_denkf.applications.robot.model import RobotModel
 from torch_denkf.applications.robot.motion import ANGLES, STATES
-from torch_denkf.applications.robot.readings import Seen, seen_by
+from torch_denkf.applications.robot.readings import Seen, from_north, seen_by
 from torch_denkf.data.recordings.offsets import ClockOffset, Delay, delays_between, solved
 from torch_denkf.data.recordings.quantities import find
 from torch_denkf.data.recordings.streams import Stream, streams_of
 
 __all__ = ["RobotLog", "default_settings", "drift_settings", "log_streams", "read_log", "rows_of_log", "start_of"]
 
-_KMH = (3.1, 4.2)  # of a speed to that by fixes, in m/s
 _SHARE = 0.05  # of a speed, or of a reading's spread: size of a drift before it is learned
 _AWAY = 5.0  # m, from the first fix to the one that tells the heading
 
@@ -41,11 +40,11 @@ class RobotLog:
     origin: tuple[float, float] | None
 
 
-def log_streams(file: Path) -> dict[str, Stream]:
-    """The streams of a log; raises as :func:`~torch_denkf.data.recordings.streams.streams_of`."""
+def log_streams(*files: Path) -> dict[str, Stream]:
+    """The streams of a log in one or several files; raises as :func:`~torch_denkf.data.recordings.streams.streams_of`."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of float32, which no number becomes here, and of repeats, which are left out
-        return streams_of(file)
+        return streams_of(*files)
 
 
 def default_settings(streams: Mapping[str, Stream]) -> dict:
@@ -57,12 +56,13 @@ def default_settings(streams: Mapping[str, Stream]) -> dict:
         for name, stream in streams.items():
             if find(stream.readings.columns, what) or (kind == "pose" and find(stream.readings.columns, "east")):
                 settings[f"{kind}{number}"] = name
-                settings[f"{kind}{number}_config"] = [place in places for place in range(15)]
+                north = [5] if kind == "pose" and any(map(from_north, stream.readings.columns)) else []
+                settings[f"{kind}{number}_config"] = [place in (*places, *north) for place in range(15)]
                 number += 1
     return settings
 
 
-def read_log(file: Path, config: Config, streams: Mapping[str, Stream]) -> RobotLog:
+def read_log(file: Path | str, config: Config, streams: Mapping[str, Stream]) -> RobotLog:
     """Reads the streams that the settings name, takes out their delays, and brings them into m, s and rad.
 
     Raises:
@@ -84,13 +84,10 @@ def read_log(file: Path, config: Config, streams: Mapping[str, Stream]) -> Robot
         table = tables[topic]
         if not sensor.delay and topic in offsets:
             table = table._replace(times=table.times + offsets[topic].seconds)
-        kmh = any(
-            delay.what == "way"
-            and ((delay.late == topic and _in(delay.scale)) or (delay.early == topic and _in(1 / delay.scale)))
-            for delay in delays
-        )
+        ways = [delay for delay in delays if delay.what == "way" and topic in (delay.late, delay.early)]
+        scale = max([abs(each.scale if each.late == topic else 1 / each.scale) for each in ways], default=1.0)
         for group in sensor.groups:
-            seen[f"{sensor.name}_{group}"] = seen_by(sensor, group, config, table, origin, kmh)
+            seen[f"{sensor.name}_{group}"] = seen_by(sensor, group, config, table, origin, scale)
     return RobotLog(seen, offsets, origin)
 
 
@@ -122,11 +119,7 @@ def drift_settings(log: RobotLog, model: RobotModel) -> dict:
     return settings
 
 
-def _in(scale: float) -> bool:
-    return _KMH[0] < abs(scale) < _KMH[1]
-
-
-def _found(topic: str, streams: Mapping[str, Stream], file: Path) -> str:
+def _found(topic: str, streams: Mapping[str, Stream], file: Path | str) -> str:
     for name in streams:
         if name.strip("/") == topic.strip("/"):
             return name

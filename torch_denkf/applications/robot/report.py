@@ -67,7 +67,7 @@ def _drift(model: RobotModel, name: str, at: int) -> tuple[float, float] | None:
     if place is None or model.drifts is None:
         return None
     drifts, place = model.drifts, place - len(STATES)
-    return float(drifts.log_std[place].exp()), float(drifts.log_time[place].exp())
+    return drifts.log_std[place].exp().item(), drifts.log_time[place].exp().item()
 
 
 def _chi_square(dof: int) -> float:
@@ -126,10 +126,10 @@ def write_path(folder: Path, model: RobotModel, log: RobotLog, out: TensorDict) 
     Returns:
         The names of the files.
     """
-    mean, std = out["smoothed", "mean"].numpy(), out["smoothed", "var"].sqrt().numpy()
+    mean, std = (out["smoothed", name][:, : len(STATES)].numpy() for name in ("mean", "var"))
     stamp, names = out["stamp"].numpy(), ["path.csv", "path.tum", "ekf.yaml"]
     kept = np.append(np.diff(stamp[:, 0]) > 0, True)  # the last row of each time
-    stamp, mean, std = stamp[kept], mean[kept], std[kept]
+    stamp, mean, std = stamp[kept], mean[kept], np.sqrt(std[kept])
     head = ",".join(["time", *STATES, *(f"std_{state}" for state in STATES)])
     np.savetxt(folder / "path.csv", np.c_[stamp, mean, std], "%.9f", ",", header=head, comments="")
     half = mean[:, 3:6] / 2

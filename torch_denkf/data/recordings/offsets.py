@@ -163,8 +163,11 @@ def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[De
                 found = tried[best]
                 if what == "heading" or pair[1].level.ndim == 1:  # a chord of some seconds is shorter than a way
                     longer = _delay(*pair, what, limit, _SPANS[1])
+                    both = found, longer
                     if found is None or (longer is not None and longer[1] < _BETTER * found[1]):
                         found = longer
+                    if None not in both:  # the better one by chance: they cannot know more than they agree on
+                        found = (found[0], float(np.hypot(found[1], (both[0][0] - both[1][0]) / 2)), *found[2:])
                 if found is not None and abs(found[3]) >= _AGREE:
                     out.append(Delay(late, early, what, *found))
     return out
