@@ -166,8 +166,10 @@ def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[De
                     both = found, longer
                     if found is None or (longer is not None and longer[1] < _BETTER * found[1]):
                         found = longer
-                    if None not in both:  # the better one by chance: they cannot know more than they agree on
-                        found = (found[0], float(np.hypot(found[1], (both[0][0] - both[1][0]) / 2)), *found[2:])
+                    if None not in both:  # the better one by chance: what their intervals do not explain counts, too
+                        (one_at, one_std, *_), (other_at, other_std, *_) = both
+                        apart = (one_at - other_at) ** 2 - max(one_std, other_std) ** 2
+                        found = (found[0], float(np.sqrt(found[1] ** 2 + max(apart, 0.0) / 4)), *found[2:])
                 if found is not None and abs(found[3]) >= _AGREE:
                     out.append(Delay(late, early, what, *found))
     return out
