@@ -123,7 +123,8 @@ def read_config(config: Mapping[str, Any] | str | Path) -> Config:
     while len(given) == 1 and isinstance(next(iter(given.values())), Mapping):
         given = next(iter(given.values()))
     heeded = {"two_d_mode", "process_noise_covariance", "initial_estimate_covariance", "initial_state"}
-    heeded |= {"dynamic_process_noise_covariance", "gravitational_acceleration", "alpha", "kappa", "beta", "held_velocities"}
+    heeded |= {"dynamic_process_noise_covariance", "gravitational_acceleration", "alpha", "kappa", "beta"}
+    heeded.add("held_velocities")
     sensors = []
     for name in given:
         if re.fullmatch(rf"({'|'.join(_KINDS)})\d+", name):

@@ -218,7 +218,7 @@ def fix_error(model: RobotModel, name: str, out: TensorDict) -> tuple[Tensor, Te
         name: of the sensor.
         out: with its readings and ``("smoothed", "mean")`` and ``("smoothed", "cov")``.
     """
-    read, jacobian = model.reading(name).jacobian(out["smoothed", "mean"].unsqueeze(-2))
+    read, jacobian = model.reading(name).jacobian(out["smoothed", "mean"].unsqueeze(-2), out[name])
     jacobian = jacobian.squeeze(-3)[..., :2, :]
     scale = scale_of(model, name)[:2].exp()
     noise = out[f"{name}_noise"][..., :2, :2] * scale * scale.unsqueeze(-1)

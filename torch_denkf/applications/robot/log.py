@@ -41,7 +41,7 @@ class RobotLog:
 
 
 def log_streams(*files: Path) -> dict[str, Stream]:
-    """The streams of a log in one or several files; raises as :func:`~torch_denkf.data.recordings.streams.streams_of`."""
+    """The streams of a log of some files; raises as :func:`~torch_denkf.data.recordings.streams.streams_of`."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of float32, which no number becomes here, and of repeats, which are left out
         return streams_of(*files)

@@ -51,16 +51,16 @@ class RobotModel:
 
 
 class Drifted(SubModel):
-    """The states that a sensor reads, each with its slow error: added to it, or a share of a forward speed.
+    """The states that a sensor reads, each with its slow error: added to it, or a share of the forward speed as read.
 
     Args:
-        name: of the sensor.
+        name: of the sensor, and of its readings ``[*B, O]``.
         dims: the states, ``[O]``.
         slow: places of their errors in the state; ``None`` for none.
     """
 
     def __init__(self, name: str, dims: Sequence[int], slow: Sequence[int | None]):
-        super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
+        super().__init__(nn.Identity(), [("forecast", "ensemble"), name], [("forecast", "observation")])
         self.name, self.slow = name, tuple(slow)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
         self.register_buffer("places", torch.tensor([0 if at is None else at for at in slow]), persistent=False)
@@ -68,19 +68,17 @@ class Drifted(SubModel):
         shares = [place == STATES.index("vx") and at is not None for place, at in zip(dims, slow, strict=True)]
         self.register_buffer("shares", torch.tensor(shares), persistent=False)
 
-    def compute(self, ensemble):
+    def compute(self, ensemble, reading):
         """The predicted reading."""
-        state, slow = (ensemble[..., each] for each in (self.dims, self.places))
-        return state + torch.where(self.has, slow * torch.where(self.shares, state, 1.0), 0.0)
+        return self.jacobian(ensemble, reading)[0]
 
-    def jacobian(self, ensemble):
-        """The same, and its Jacobian."""
-        state, slow = (ensemble[..., each].unsqueeze(-1) for each in (self.dims, self.places))
+    def jacobian(self, ensemble, reading):
+        """The same, and its Jacobian: linear, since a share is one of what was read, not of the state."""
+        factor = torch.where(self.shares, reading.nan_to_num(), 1.0).to(ensemble.dtype) * self.has
+        predicted = ensemble[..., self.dims] + factor.unsqueeze(-2) * ensemble[..., self.places]
         every = torch.arange(ensemble.shape[-1], device=ensemble.device)
-        own, other = (each.unsqueeze(-1) == every for each in (self.dims, self.places))
-        shares, has = self.shares.unsqueeze(-1), self.has.unsqueeze(-1)
-        by_state = own * torch.where(shares, 1.0 + slow, 1.0)
-        return self.compute(ensemble), by_state + (other & has) * torch.where(shares, state, 1.0)
+        own, other = ((each.unsqueeze(-1) == every).to(ensemble.dtype) for each in (self.dims, self.places))
+        return predicted, (own + factor.unsqueeze(-1) * other).unsqueeze(-3).expand(*predicted.shape, -1)
 
 
 def _initial(mean: Tensor, cov: Tensor, drifts: Drifts | None) -> MomentPrior:
@@ -120,8 +118,9 @@ def robot_model(
     """Makes the filter that a configuration of robot_localization describes.
 
     Messages of an odometry are two sensors, its pose and its twist, and those of an inertial sensor three; each is
-    believed by the covariance that stands in its row, and by its drifts, if it has some. With ``two_d_mode`` each reads also zeros, of variance 1e-6, of
-    what does not move in the plane. Poses of ``..._differential`` and ``..._relative`` sensors are those of the rows.
+    believed by the covariance that stands in its row, and by its drifts. With ``two_d_mode`` each reads also zeros, of
+    variance 1e-6, of what does not move in the plane. Poses of ``..._differential`` and ``..._relative`` sensors are
+    those of the rows.
 
     Args:
         config: a YAML file, or its content. Four parameters of a sensor are this library's own: ``odom0_delay``, in s;
@@ -146,7 +145,9 @@ def robot_model(
         ((6, 7, 11), ('use_control: there is no control here',))
     """
     settings = read_config(config)
-    sensors, reads, sizes, times = {}, {}, [], []
+    sensors, reads = {}, {}
+    sizes: list[float] = []
+    times: list[float] = []
     for sensor in settings.sensors:
         for group, places in sensor.groups.items():
             if settings.two_d:

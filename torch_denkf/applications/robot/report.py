@@ -46,10 +46,11 @@ def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]
             offset = log.offsets[sensor.topic].seconds if sensor.topic in log.offsets else -sensor.delay
             said = given if log.seen[name].stated else ["none"] * size
             with torch.no_grad():
-                predicted = model.reading(name).compute(out["smoothed", "mean"][seen].unsqueeze(-2)).squeeze(-2)
+                mean = out["smoothed", "mean"][seen].unsqueeze(-2)
+                predicted = model.reading(name).compute(mean, out[name][seen]).squeeze(-2)
             bias = predicted[:, :size] - out["smoothed", "mean"][seen][:, places]
             sized = [_drift(model, name, at) for at in range(size)]
-            drift = [each and f"{each[0]:.3g} for {each[1]:.3g} s" or "none" for each in sized]
+            drift = ["none" if each is None else f"{each[0]:.3g} for {each[1]:.3g} s" for each in sized]
             kept = residual.mean(0) if model.drifts is None else bias.mean(0)
             cells = [kept, (residual - bias).std(0), said, given * scale, drift]
             texts = ["; ".join(each if isinstance(each, str) else f"{each:.3g}" for each in cell) for cell in cells]

@@ -163,13 +163,12 @@ def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[De
                 found = tried[best]
                 if what == "heading" or pair[1].level.ndim == 1:  # a chord of some seconds is shorter than a way
                     longer = _delay(*pair, what, limit, _SPANS[1])
-                    both = found, longer
-                    if found is None or (longer is not None and longer[1] < _BETTER * found[1]):
-                        found = longer
-                    if None not in both:  # the better one by chance: what their intervals do not explain counts, too
-                        (one_at, one_std, *_), (other_at, other_std, *_) = both
-                        apart = (one_at - other_at) ** 2 - max(one_std, other_std) ** 2
+                    if found is not None and longer is not None:
+                        # The better one by chance: what their intervals do not explain counts, too.
+                        apart = (found[0] - longer[0]) ** 2 - max(found[1], longer[1]) ** 2
+                        found = longer if longer[1] < _BETTER * found[1] else found
                         found = (found[0], float(np.sqrt(found[1] ** 2 + max(apart, 0.0) / 4)), *found[2:])
+                    found = longer if found is None else found
                 if found is not None and abs(found[3]) >= _AGREE:
                     out.append(Delay(late, early, what, *found))
     return out

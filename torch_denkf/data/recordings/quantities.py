@@ -19,7 +19,7 @@ _NAMES = {
     "longitude": r".*longitude|.*\b(lon|lng|long)",
     "east": rf"east(ing)?|{_AXIS}x|.*p_rs_r_x",
     "north": rf"north(ing)?|{_AXIS}y|.*p_rs_r_y",
-    "turn rate": r".*(yaw_?rate|yaw_?vel|turn(_?rate)?|gyro(_?z)?|omega(_?z)?|\b[wg]z|angular(_velocity)?[._]z|w_rs_s_z)",
+    "turn rate": r".*(yaw_?(rate|vel)|turn(_?rate)?|gyro(_?z)?|omega(_?z)?|\b[wg]z|angular(_velocity)?[._]z|w_rs_s_z)",
     "heading": r".*(heading|compass|yaw|theta|course|\bcog|track|psi)",
     "speed": r".*(speed|velocity|\bsog|\bvx|\bv|(twist[._])?linear[._]x|v_forward)",
     "acceleration": r".*(\bax|acc(el(eration)?)?_?x|linear_acceleration[._]x|a_rs_s_x)",
@@ -45,7 +45,7 @@ def find(columns: Sequence[str], *wanted: str) -> list[int] | None:
 
 
 def speed_unit(name: str, scale: float = 1.0) -> str | None:
-    """The unit of a speed, by the name of its column or else by how much larger it is than one in m/s; ``None`` for m/s.
+    """The unit of a speed, by its column's name or by how much larger it is than one in m/s; ``None`` for m/s.
 
     Examples:
         >>> speed_unit("SOG [kn]"), speed_unit("speed_kmh"), speed_unit("speed", 3.7), speed_unit("speed", 1.1)
