@@ -238,6 +238,19 @@ def test_two_files_of_a_boat(tmp_path):
         log_streams()
 
 
+def test_a_pose_alone(tmp_path, capsys):
+    """A heading beside x and y is read; a filter of one sensor has its distances without a name."""
+    time = np.arange(0, 10, 0.1)
+    circle = np.c_[time, np.sin(time), 1 - np.cos(time), (time + np.pi) % (2 * np.pi) - np.pi]
+    np.savetxt(
+        tmp_path / "pose.txt",
+        circle + 1e-3 * np.random.default_rng(0).normal(size=circle.shape) * [0, 1, 1, 1],
+        header="time x y theta",
+    )
+    assert main(["fuse", str(tmp_path / "pose.txt"), "--out", str(tmp_path / "out"), "--steps", "0"]) == 0
+    assert "| pose0_pose (position) | x, y, yaw | " in capsys.readouterr().out
+
+
 def test_the_command(tmp_path, capsys):
     time, place = write_log(tmp_path / "log.csv", 40.0)
     words = ["fuse", str(tmp_path / "log.csv"), "--out", str(tmp_path / "out"), "--steps", "0", "--gaps", "1"]

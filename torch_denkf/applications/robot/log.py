@@ -56,8 +56,10 @@ def default_settings(streams: Mapping[str, Stream]) -> dict:
         for name, stream in streams.items():
             if find(stream.readings.columns, what) or (kind == "pose" and find(stream.readings.columns, "east")):
                 settings[f"{kind}{number}"] = name
-                north = [5] if kind == "pose" and any(map(from_north, stream.readings.columns)) else []
-                settings[f"{kind}{number}_config"] = [place in (*places, *north) for place in range(15)]
+                columns = stream.readings.columns
+                turned = any(map(from_north, columns)) or (find(columns, "east") and find(columns, "heading"))
+                read = (*places, 5) if kind == "pose" and turned else places
+                settings[f"{kind}{number}_config"] = [place in read for place in range(15)]
                 number += 1
     return settings
 

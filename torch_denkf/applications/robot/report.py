@@ -35,7 +35,7 @@ def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]
             seen = out[f"{name}_observed"][:, 0]
             places = [place for place in model.reads[name] if not (model.config.two_d and place in PLANE)]
             size = len(places)
-            nis = out["info", name, "nis"][seen, 0]
+            nis = out.get(("info", name, "nis"), out["info", "nis"])[seen, 0]  # of one sensor without its name
             share = float((nis < _chi_square(size)).double().mean())
             residual = out[name][seen][:, :size] - out["smoothed", "mean"][seen][:, places]
             for at, place in enumerate(places):

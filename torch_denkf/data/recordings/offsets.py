@@ -297,6 +297,7 @@ def _delay(
     block = ((late.times[begin] - late.times[begin[0]]) // max(_BLOCK * span, 8.0)).astype(int)
     sums, known = np.bincount(block, score), np.bincount(block, weight * slope * slope)
     blocks = max(2.0, float(known.sum() ** 2 / np.square(known).sum()))  # that say as much as others
-    variance = np.square(sums / (known.sum() - known).clip(min=1e-300)).sum()
+    with np.errstate(over="ignore"):  # of a single block, which leaves nothing: infinite
+        variance = np.square(sums / (known.sum() - known).clip(min=1e-300)).sum()
     variance = variance * (1 + 1.2 / (blocks - 1)) ** 2 + np.median(np.diff(early.times)) ** 2 / 12
     return shift, float(np.sqrt(variance)), scale, correlation
