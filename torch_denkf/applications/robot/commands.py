@@ -41,7 +41,7 @@ class Fuse(Command):
 
         from torch_denkf._checks import check_count, check_number
         from torch_denkf.applications.robot import robot_model
-        from torch_denkf.applications.robot.learning import RATE, learn_noises, spread_over
+        from torch_denkf.applications.robot.learning import learn_noises
         from torch_denkf.applications.robot.log import (
             default_settings,
             drift_settings,
@@ -73,14 +73,11 @@ class Fuse(Command):
         with alone_in(self.out):
             lines = [f"# {', '.join(each.name for each in self.log)}", "", f"`{self.command_line}`", ""]
             if self.steps:
-                rate = model.config.frequency
-                few = rows_of_log(log, model, hidden, min(RATE, rate))
                 others = []
                 for file in self.also:
                     other = read_log(file, model.config, log_streams(file))
-                    others.append((start_of(other, model), rows_of_log(other, model, None, min(RATE, rate))))
-                learned = learn_noises(model, few, others=others, steps=self.steps, window=self.gap_seconds)
-                spread_over(model, few, rows)
+                    others.append((start_of(other, model), rows_of_log(other, model)))
+                learned = learn_noises(model, rows, others=others, steps=self.steps, window=self.gap_seconds)
                 lines.append(
                     f"Log-likelihood of what was held out: {learned.before:.3f} with the noises at first, "
                     f"{learned.after:.3f} with those learned" + (", interrupted." if learned.interrupted else ".")

@@ -17,9 +17,8 @@ from torch_denkf.applications.robot.motion import ANGLES, STATES, RobotNoise
 from torch_denkf.deployment.progress import progress_bar
 from torch_denkf.smoothers import RTSSmoother
 
-__all__ = ["RATE", "Learned", "fix_error", "learn_noises", "scale_of", "spread_over"]
+__all__ = ["Learned", "fix_error", "learn_noises", "scale_of"]
 
-RATE = 2.0  # Hz, of rows that suffice to learn from
 
 _HELD_OUT = 4  # every so many segments one is held out
 _MOST = 20  # segments; of a longer log so many are spread over it
@@ -139,14 +138,6 @@ def _alike(gradient: Tensor, at: Sequence[int]) -> Tensor:
 def scale_of(model: RobotModel, name: str) -> Tensor:
     """The parameter of a sensor's noise."""
     return model.filter[f"{name}_noise"].module.log_scale
-
-
-def spread_over(model: RobotModel, learned_from: TensorDict, rows: TensorDict) -> None:
-    """Makes noises that were learned from few rows those of more rows, which together say as much."""
-    for name in model.reads:
-        few, many = (float(each[f"{name}_observed"].sum()) for each in (learned_from, rows))
-        with torch.no_grad():
-            scale_of(model, name).add_(0.5 * math.log(max(many, 1.0) / max(few, 1.0)))
 
 
 def _varies(model: RobotModel, rows: TensorDict, name: str) -> Tensor:

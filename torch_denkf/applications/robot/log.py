@@ -21,6 +21,7 @@ from torch_denkf.data.recordings.streams import Stream, streams_of
 
 __all__ = ["RobotLog", "default_settings", "drift_settings", "log_streams", "read_log", "rows_of_log", "start_of"]
 
+_RATE = 2.0  # Hz, of rows to learn from
 _SHARE = 0.05  # of a speed, or of a reading's spread: size of a drift before it is learned
 _AWAY = 5.0  # m, from the first fix to the one that tells the heading
 
@@ -96,10 +97,11 @@ def read_log(file: Path | str, config: Config, streams: Mapping[str, Stream]) ->
 def drift_settings(log: RobotLog, model: RobotModel) -> dict:
     """The settings, with drifts of all readings that vary, from which they are learned; those that are given stay.
 
+    Rows are few: fast readings are means, whose noise is what matters for a path, and is learned for this rate alone.
     Velocities are held for a step, and without process noise in the settings it follows from how they change in 1 s.
     A pose drifts by what the log says of its noise; a forward speed by a share, other readings by one of their spread.
     """
-    settings = {"held_velocities": True, **model.config.given}
+    settings = {"held_velocities": True, **model.config.given, "frequency": min(_RATE, model.config.frequency)}
     walks = [1e-2] * 3 + [1e-4] * 3 + [1e-2] * 9  # the variance that a second adds
     for sensor in model.config.sensors:
         drifts = [0.0] * len(STATES)
@@ -128,9 +130,7 @@ def _found(topic: str, streams: Mapping[str, Stream], file: Path | str) -> str:
     raise ValueError(f"{file} has no stream {topic!r}; it has {list(streams)}: see denkf log {file}")
 
 
-def rows_of_log(
-    log: RobotLog, model: RobotModel, hidden: np.ndarray | None = None, frequency: float | None = None
-) -> TensorDict:
+def rows_of_log(log: RobotLog, model: RobotModel, hidden: np.ndarray | None = None) -> TensorDict:
     """Makes rows ``[T]`` of all poses, of fast ones of every so many, and of ``frequency`` where none is near.
 
     Readings of other sensors that are as fast stand in the row that is nearest to them, as their mean; in the one
@@ -140,9 +140,8 @@ def rows_of_log(
         log: the readings.
         model: whose sensors read them.
         hidden: intervals in s ``[N, 2]`` in which poses are not observed, after the first row.
-        frequency: of rows, Hz; by default the model's.
     """
-    rate = model.config.frequency if frequency is None else frequency
+    rate = model.config.frequency
     poses = {name for name in log.seen if name.endswith("_pose") and model.reads[name][0] < 6}
     streams = {name: seen.every(int(_rate(seen) / rate)) if name in poses else seen for name, seen in log.seen.items()}
     own = {name: name in poses or _rate(seen) < 0.7 * rate for name, seen in streams.items()}
