@@ -74,7 +74,7 @@ $(NIGHTLY_STAMP): setup.py constraints.txt
 smoke: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.common.smoke
 
-# Damaged inputs at every border: about ten minutes. The tests run a sample.
+# Damaged inputs at every border: about a quarter of an hour. The tests run a sample.
 fuzz: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.reliability fuzz
 

@@ -1,4 +1,4 @@
-"""What the property tests draw: sizes, scales, precisions, and numbers from a seed; the same in each run."""
+"""Draws what the property tests need: sizes, scales, precisions, and numbers from a seed; the same in each run."""
 
 import torch
 from hypothesis import HealthCheck, settings

@@ -1,4 +1,4 @@
-"""Where the tests find real recordings: those that need them are skipped where they are not."""
+"""Finds real recordings: tests that need them are skipped where they are not."""
 
 import os
 from pathlib import Path

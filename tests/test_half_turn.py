@@ -293,7 +293,7 @@ FILTERS = {
 
 
 def turned_back(key, value, turn):
-    """What was written at a turn, as it would be without."""
+    """Returns what was written at a turn, as it would be without."""
     angle = {"mean", "ensemble", "past", "joint_mean", "past_mean"}
     if isinstance(key, tuple) and key[0] in ("belief", "smoothed") and key[-1] in angle:
         value = value.clone()

@@ -1,4 +1,4 @@
-"""What stands around filters on ``device="meta"``, a stand-in for a GPU: losses, smoothers, spaces, environments."""
+"""Tests what stands around filters on ``device="meta"``, a stand-in for a GPU: losses, smoothers, spaces."""
 
 import pytest
 import torch

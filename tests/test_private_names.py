@@ -1,4 +1,4 @@
-"""What torch keeps to itself is used in one room, so that a new torch can break no more than that."""
+"""Keeps what torch keeps to itself in one room, so that a new torch can break no more than that."""
 
 import ast
 from pathlib import Path

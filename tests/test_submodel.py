@@ -1,4 +1,4 @@
-"""What holds for every sub-model: missing keys are named, keys may be renamed and nested, copies compute the same."""
+"""Tests every sub-model: missing keys are named, keys may be renamed and nested, copies compute the same."""
 
 import inspect
 import pickle

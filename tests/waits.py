@@ -1,4 +1,4 @@
-"""What a step on a GPU must not do: wait for the device, copy to it, or call what no CUDA graph captures."""
+"""Finds what a step on a GPU must not do: wait for the device, copy to it, or call what no CUDA graph captures."""
 
 import torch
 from torch.overrides import TorchFunctionMode

@@ -24,7 +24,7 @@ def wrap(angle: Tensor) -> Tensor:
 
 @dataclass
 class Arm:
-    """What the study needs to know of an arm; its state is the joints' cosines, sines and velocities ``[3 J]``."""
+    """Holds what the study needs of an arm; its state is the joints' cosines, sines and velocities ``[3 J]``."""
 
     domain: str
     task: str
@@ -58,7 +58,7 @@ class Arm:
         return torch.atan2(sin, cos), velocity
 
     def places(self, angles: Tensor) -> Tensor:
-        """Where the links of angles ``[*, J]`` end, from the root, in the plane of motion, m ``[*, J, 2]``."""
+        """Returns the links' ends of angles ``[*, J]``, from the root, in the plane of motion, m ``[*, J, 2]``."""
         turned, links = self.ahead + angles.cumsum(-1), torch.tensor(self.links)
         return torch.stack([links * turned.cos(), links * turned.sin()], -1).cumsum(-2)
 
@@ -69,7 +69,7 @@ class Arm:
         return wrap(torch.cat([turned[..., :1], turned.diff(dim=-1)], -1))
 
     def tip(self, angles: Tensor) -> Tensor:
-        """Where the last link ends, m ``[*, 2]``."""
+        """Returns the end of the last link, m ``[*, 2]``."""
         return self.places(angles)[..., -1, :]
 
     def goal(self, emitted: TensorDictBase) -> Tensor:

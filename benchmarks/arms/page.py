@@ -39,7 +39,7 @@ def values(rows: Sequence[dict], name: str, **wanted) -> np.ndarray:
 
 
 def difference(rows: Sequence[dict], name: str, **case) -> str:
-    """How much more the belief's episodes have than the readings' of the same starts: mean, interval, and share."""
+    """Compares the belief's episodes with the readings' of the same starts: mean difference, interval, and share."""
     belief, reading = (values(rows, name, estimate=estimate, **case) for estimate in ("belief", "reading"))
     center, low, high = bootstrap_interval(belief - reading)
     return f"{center:+.2f} [{low:+.2f}, {high:+.2f}], {center / reading.mean():+.0%}"

@@ -74,7 +74,7 @@ class JointSensor(Sensor):
         return self.places(maps).flatten(-2).unflatten(0, pixels.shape[:-3])
 
     def losses(self, pixels: Tensor, state: Tensor) -> dict[str, Tensor]:
-        """Of pictures ``[N, 1, H, W]`` and states: maps against a bump of a cell at each joint, and places."""
+        """Scores pictures ``[N, 1, H, W]`` and states: maps against a bump of a cell at each joint, and places."""
         maps, truth = self.module(pixels), self.arm.places(self.arm.split(state)[0])
         across, up = (truth / self.arm.view).unsqueeze(-1).unbind(-2)
         column, row = ((-0.5 * ((MIDDLES - at) * CELLS / 2).square()).softmax(-1) for at in (across, -up))
@@ -87,7 +87,7 @@ class JointSensor(Sensor):
 
 
 class JointPlaces(Sensor):
-    """Where the links of members ``[*B, E, 3 J + 2 J]`` end, and what the sensor adds to it: its biases."""
+    """Returns the ends of the links of members ``[*B, E, 3 J + 2 J]``, and what the sensor adds to it: its biases."""
 
     def __init__(self, arm: Arm):
         super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])

@@ -1,1 +1,1 @@
-"""What the studies have in common: options, jobs, tables, recipes of filters, scores, pictures."""
+"""Shares options, jobs, tables, recipes of filters, scores and pictures among the studies."""

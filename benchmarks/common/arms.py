@@ -1,4 +1,4 @@
-"""What the studies of arms share: motions with rates and a sensor's slow errors, starts at rest, recipes of both."""
+"""Shares among the studies of arms: motions with rates and a sensor's slow errors, starts at rest, recipes of both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the pictures of the studies have in common. matplotlib draws without a window."""
+"""Shares the pictures of the studies. matplotlib draws without a window."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class Registry(dict[str, type]):
 
 
 class Recipe:
-    """How to compose, train and tune one filter. All filters of a study read the same sensor.
+    """Composes, trains and tunes one filter. All filters of a study read the same sensor.
 
     Attributes:
         dims: the dimensions of the state that count, in scores and losses.
@@ -68,7 +68,7 @@ class Recipe:
         raise NotImplementedError
 
     def loss(self, model: Filter) -> nn.Module:
-        """What the training minimises, on windows with the true state: by default a Gaussian belief's score."""
+        """Returns what the training minimises, on windows with the true state: by default a Gaussian belief's score."""
         return GaussianLoss(model, sensor=0.0, dims=self.dims, state_scale=self.unit)
 
     def set_inflation(self, model: Filter, factor: float) -> None:
@@ -86,10 +86,6 @@ class Recipe:
         """The fair CRPS of forecast and belief; a score is the mean over what counts."""
         share = self.state_scale.isfinite().float().mean().item()
         return DEnKFLoss(model, state=share, transition=share, sensor=0.0, state_scale=self.state_scale)
-
-    def likelihood_loss(self, model: Filter) -> DEnKFLoss:
-        """The likelihood of the readings alone (Chen, Sanz-Alonso & Willett 2022)."""
-        return DEnKFLoss.ad_enkf(model, detach_every=8)
 
 
 class Particles(Recipe):

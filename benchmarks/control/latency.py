@@ -1,42 +1,53 @@
-"""A pendulum whose actions run late: a policy on the belief ahead, on the belief of now, on readings.
+"""Robots whose actions run late: a policy on the belief ahead, on the belief of now, on readings; and an LSTM.
 
-``python -m benchmarks.control.latency``. The policy is that of the true state without delay, by value iteration on a
-grid: nothing is learned, so that all arms differ in what they show it alone. The filter knows the pendulum.
+``python -m benchmarks.control.latency``. A pendulum and an arm of two links. The policy is one of the true state
+without delay, by value iteration for the pendulum, a regulator for the arm: nothing is learned, what it sees alone
+differs. The filter knows the robot. The LSTM is trained by PPO for each delay, and sees the actions under way.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.envs import InitTracker, TransformedEnv
+from torchrl.data import Bounded
+from torchrl.envs import CatTensors, ExplorationType, FlattenObservation, InitTracker, TransformedEnv
+from torchrl.modules import get_primers_from_module
 
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import head, line, write_page
-from torch_denkf import DEnKF, DEnKFTransform, NoisyPendulumEnv
+from benchmarks.control.arms import ARMS, Inputs
+from benchmarks.control.ppo import PPO
+from benchmarks.control.run import rollout
+from benchmarks.control.tasks import RATES, TASKS
+from torch_denkf import DEnKF, DEnKFTransform, LinearGaussianEnv, NoisyPendulumEnv
 from torch_denkf.envs import LateActions
 from torch_denkf.fusion import BeliefAhead
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
 
 DT, SPEED, TORQUE = NoisyPendulumEnv.DT, NoisyPendulumEnv.MAX_SPEED, NoisyPendulumEnv.MAX_TORQUE
 STEPS = 200  # of an episode
-ARMS = ("belief ahead", "belief", "last two readings", "truth")
+SHOWN = ("belief ahead", "belief", "last two readings", "truth")
 
 
 @dataclass(frozen=True)
 class Latency:
     """Options of the study of late actions."""
 
+    robots: tuple[str, ...] = ("pendulum", "arm")
     delays: tuple[int, ...] = (2, 4, 8)  # steps of 50 ms, of sensing and inference together
-    noises: tuple[float, ...] = (0.02, 0.1)  # of a reading of cosine and sine
+    noises: tuple[float, ...] = (0.02, 0.1)  # of a reading
     members: int = 32
     seeds: int = 1
     episodes: int = 100  # a seed
     grid: int = 61  # angles, and speeds
+    env_steps: int = 100_000  # of an LSTM's training, with the first noise; 0 for none
     page: Path | None = None  # where to leave the table
 
 
@@ -79,80 +90,189 @@ def best_policy(count: int, sweeps: int = 400, gamma: float = 0.99) -> Callable[
     return policy
 
 
-def known_filter(noise: float, members: int) -> DEnKF:
-    """The pendulum's own motion, on cosine, sine and speed."""
+class TwoLinks(LinearGaussianEnv):
+    """Two links on a table that two motors hold at zero, in steps of 50 ms; pushes shake it.
 
-    def step(x: Tensor) -> Tensor:
-        angle, speed = moved(torch.atan2(x[..., 1:2], x[..., :1]), x[..., 2:3], x[..., 3:])
-        return torch.cat([angle.cos(), angle.sin(), speed], -1)
+    The state is two angles (rad) and their speeds (rad/s). The angles are read.
+    """
 
+    L, M, C, DAMPING, GEAR = 0.2, 0.25, 0.1, 0.05, (0.3, 0.15)  # m, kg, m to a link's middle, Nms, Nm
+    PUSH = 0.2  # rad/s in a step
+
+    def __init__(self, noise: float, *, batch_size: tuple[int, ...], seed: int):
+        one = torch.eye(4)
+        stds = [0.0, 0.0, self.PUSH, self.PUSH], [noise] * 2
+        start = {"initial_std": [1.0, 1.0, 0.0, 0.0], "max_steps": STEPS}
+        super().__init__(one, one[:2], *stds, control=one[:, 2:], batch_size=batch_size, seed=seed, **start)
+        self.action_spec = Bounded(-1.0, 1.0, (*batch_size, 2))
+
+    @classmethod
+    def moved(cls, state: Tensor, action: Tensor) -> Tensor:
+        """States ``[*B, 4]`` a step on, without a push."""
+        one, two, first, second = state.unbind(-1)
+        torque = action.clamp(-1, 1) * torch.tensor(cls.GEAR)
+        heavy = cls.M * cls.L**2 / 12 + cls.M * cls.C**2  # of a link around its joint
+        for _ in range(5):
+            mixed = cls.M * cls.L * cls.C * two.cos()
+            bend = cls.M * cls.L * cls.C * two.sin()
+            force = torque[..., 0] - cls.DAMPING * first + bend * (2 * first + second) * second
+            other = torque[..., 1] - cls.DAMPING * second - bend * first**2
+            whole, half = 2 * heavy + cls.M * cls.L**2 + 2 * mixed, heavy + mixed
+            det = whole * heavy - half**2
+            first, second = (
+                (first + DT / 5 * (heavy * force - half * other) / det).clamp(-20, 20),
+                (second + DT / 5 * (whole * other - half * force) / det).clamp(-20, 20),
+            )
+            one, two = one + DT / 5 * first, two + DT / 5 * second
+        return torch.stack([one, two, first, second], -1)
+
+    def _step(self, tensordict):
+        state, action = tensordict["state"], tensordict["action"]
+        cost = state[..., :2].square().sum(-1, True) + 0.001 * action.square().sum(-1, True)
+        after = self.moved(state, action) + self.transition_std * self._randn(state, 4)
+        return self._emit(after, tensordict["step"] + 1).set("reward", -cost)
+
+
+def regulator(state: Tensor) -> Tensor:
+    """Torques ``[*B, 2]`` for the arm's true state."""
+    return (-2.0 * state[..., :2] - 0.3 * state[..., 2:]).clamp(-1, 1)
+
+
+class Robot(NamedTuple):
+    """A simulated robot, what its filter knows, and how it is controlled."""
+
+    world: Callable[..., LinearGaussianEnv]  # many at once, of a noise, batch size and seed
+    motion: Callable[[Tensor], Tensor]  # states and actions to the next states
+    start: tuple[list[float], list[float]]  # mean and standard deviations of the first state
+    shake: list[float]  # standard deviations of the motion
+    policy: Callable[[Tensor], Tensor]  # of the true state
+    angles: Callable[[Tensor], Tensor]  # of readings
+    state: Callable[[Tensor, Tensor], Tensor]  # of angles and speeds
+
+
+def swing(x: Tensor) -> Tensor:
+    """The pendulum's own motion, on cosine, sine, speed and torque."""
+    angle, speed = moved(torch.atan2(x[..., 1:2], x[..., :1]), x[..., 2:3], x[..., 3:])
+    return torch.cat([angle.cos(), angle.sin(), speed], -1)
+
+
+@cache
+def robot(name: str, grid: int) -> Robot:
+    """The pendulum or the arm."""
+    if name == "arm":
+        motion = lambda x: TwoLinks.moved(x[..., :4], x[..., 4:])  # noqa: E731
+        start = [0.0] * 4, [1.0, 1.0, 0.01, 0.01]
+        together = lambda angle, speed: torch.cat([angle, speed], -1)  # noqa: E731
+        return Robot(TwoLinks, motion, start, [0.0, 0.0, *[TwoLinks.PUSH] * 2], regulator, lambda y: y, together)
+    return Robot(
+        partial(NoisyPendulumEnv, max_steps=STEPS),
+        swing,
+        ([0.0] * 3, [0.7, 0.7, 0.6]),
+        [0.0, 0.0, 0.05],
+        best_policy(grid),
+        lambda y: torch.atan2(y[..., 1:], y[..., :1]),
+        lambda angle, speed: torch.cat([angle.cos(), angle.sin(), speed], -1),
+    )
+
+
+def known_filter(of: Robot, noise: float, members: int) -> DEnKF:
+    """The robot's own motion."""
     return DEnKF(
-        LearnedTransition(step, residual=False, action_key="action"),
+        LearnedTransition(of.motion, residual=False, action_key="action"),
         None,
         Select([0, 1]),
         ConstantNoise([noise] * 2, in_key="observation"),
         EnsembleAnalysis("etkf", observation_key="observation"),
-        initial=GaussianPrior([0.0] * 3, [0.7, 0.7, 0.6], ensemble_size=members),
-        process_noise=[0.0, 0.0, 0.05],
+        initial=GaussianPrior(*of.start, ensemble_size=members),
+        process_noise=of.shake,
         update_at_reset=True,
     )
 
 
-def returned(
-    study: Latency, policy: Callable[[Tensor], Tensor], noise: float, arm: str, delay: int, seed: int
-) -> float:
-    """The mean return of an arm; ``"nothing"`` is the pendulum without a motor."""
+def late_env(of: Robot, noise: float, delay: int, count: int, seed: int) -> TransformedEnv:
+    """Robots whose actions run so many steps late."""
+    env = TransformedEnv(of.world(noise, batch_size=(count,), seed=seed), InitTracker())
+    return env.append_transform(LateActions(delay)) if delay else env
+
+
+def returned(study: Latency, of: Robot, noise: float, shown: str, delay: int, seed: int) -> float:
+    """The mean return of the policy that sees something; ``"nothing"`` is the robot without a motor."""
     torch.manual_seed(seed)
-    env = NoisyPendulumEnv(noise, max_steps=STEPS, batch_size=[study.episodes], seed=seed)
-    env = TransformedEnv(env, InitTracker())
-    if delay:
-        env.append_transform(LateActions(delay))
-    if arm in ("belief", "belief ahead"):
-        filter = known_filter(noise, study.members)
-        keep = [("belief", "mean")]
-        ahead = BeliefAhead(filter, delay, keep=keep) if arm == "belief ahead" and delay else None
+    env = late_env(of, noise, delay, study.episodes, seed)
+    if shown in ("belief", "belief ahead"):
+        filter = known_filter(of, noise, study.members)
+        ahead = BeliefAhead(filter, delay, keep=[("belief", "mean")]) if shown == "belief ahead" and delay else None
         env.append_transform(DEnKFTransform(filter, ahead=ahead))
     before: list[Tensor] = []
 
     def last_two(reading: Tensor) -> Tensor:
-        old = before[-1] if before else reading
-        before.append(reading)
-        turn = torch.atan2(reading[..., 1:], reading[..., :1]) - torch.atan2(old[..., 1:], old[..., :1])
-        return torch.cat([reading, torch.atan2(turn.sin(), turn.cos()) / DT], -1)
+        angle = of.angles(reading)
+        old = before[-1] if before else angle
+        before.append(angle)
+        return of.state(angle, torch.atan2((angle - old).sin(), (angle - old).cos()) / DT)
 
-    key = {"belief": ("belief", "mean"), "last two readings": "observation"}.get(arm, "state")
-    if arm == "belief ahead":
+    key = {"belief": ("belief", "mean"), "last two readings": "observation"}.get(shown, "state")
+    if shown == "belief ahead":
         key = ("ahead", "belief", "mean") if delay else ("belief", "mean")
-    seen = {"last two readings": last_two}.get(arm, lambda state: state)
-    act = (lambda state: 0 * state[..., 2:]) if arm == "nothing" else (lambda state: policy(seen(state)))
+    seen = {"last two readings": last_two}.get(shown, lambda state: state)
+    still = env.full_action_spec["action"].zero()
+    act = (lambda state: still) if shown == "nothing" else (lambda state: of.policy(seen(state)))
     with torch.no_grad():
         data = env.rollout(STEPS, TensorDictModule(act, [key], ["action"]))
     return data["next", "reward"].sum((1, 2)).mean().item()
 
 
+def trained(study: Latency, of: Robot, noise: float, delay: int, seed: int) -> float:
+    """The mean return of an LSTM that learned with this delay."""
+    torch.manual_seed(seed)
+    task, arm = TASKS["pendulum"], ARMS["LSTM"]
+
+    def make(count: int, seed: int) -> TransformedEnv:
+        env, keys = late_env(of, noise, delay, count, seed), ["observation"]
+        if delay:
+            env.append_transform(FlattenObservation(-2, -1, [("under_way", "action")], ["waiting"]))
+            keys.append("waiting")
+        return env.append_transform(CatTensors(keys, "seen", del_keys=False, sort=False))
+
+    env, test = make(task.count, 2 * seed), make(study.episodes, 2 * seed + 1)
+    spec, batches = env.full_action_spec["action"], max(1, study.env_steps // (task.count * STEPS))
+    settings = replace(task.settings, lr=RATES["pendulum", "LSTM"] * task.settings.lr)
+    inputs = Inputs(env.observation_spec["seen"].shape[-1], spec.shape[-1], torch.ones(1), spec.space.high.max().item())
+    agent = PPO(arm, inputs, settings, batches)
+    for one in (env, test):
+        one.append_transform(get_primers_from_module(agent.policy))
+    for _ in range(batches):
+        agent.update(rollout(env, agent.policy, STEPS, ExplorationType.RANDOM))
+    return rollout(test, agent.policy, STEPS, ExplorationType.DETERMINISTIC)["next", "reward"].sum((1, 2)).mean().item()
+
+
 def main() -> None:
     """Writes the table."""
     study = parse(Latency)
-    policy = best_policy(study.grid)
-
-    def mean(noise: float, arm: str, delay: int) -> float:
-        return sum(returned(study, policy, noise, arm, delay, seed) for seed in range(study.seeds)) / study.seeds
-
-    none, truth = (mean(0.0, arm, 0) for arm in ("nothing", "truth"))
     lines = [
-        f"{study.seeds * study.episodes} episodes. The return is {none:.0f} without a motor, {truth:.0f} on the truth "
-        "without delay. In brackets: the share of what the belief gains over no motor without delay.",
+        f"{study.seeds * study.episodes} episodes. In brackets: the share of what the belief gains over no motor "
+        f"without delay. An LSTM has {study.env_steps:,} steps of PPO for each delay, one seed.",
         "",
-        *head("noise", "delay, ms", *ARMS),
+        *head("robot", "noise", "delay, ms", *SHOWN, "LSTM"),
     ]
-    for noise in study.noises:
-        full = mean(noise, "belief", 0)
-        lines.append(line(noise, 0, "", f"{full:.0f} (100 %)", *[""] * (len(ARMS) - 2)))
-        for delay in study.delays:
-            cells = [(value, 100 * (value - none) / (full - none)) for value in (mean(noise, a, delay) for a in ARMS)]
-            cells = [f"{value:.0f} ({share:.0f} %)" for value, share in cells]
-            lines.append(line(noise, round(1000 * DT * delay), *cells))
-            print(lines[-1], flush=True)
+    for name in study.robots:
+        of = robot(name, study.grid)
+
+        def mean(noise: float, shown: str, delay: int, of: Robot = of) -> float:
+            found = [returned(study, of, noise, shown, delay, seed) for seed in range(study.seeds)]
+            return sum(found) / study.seeds
+
+        none = mean(0.0, "nothing", 0)
+        for noise in study.noises:
+            full = mean(noise, "belief", 0)
+            for delay in (0, *study.delays):
+                values = {shown: mean(noise, shown, delay) for shown in SHOWN}
+                if study.env_steps and noise == study.noises[0]:
+                    values["LSTM"] = trained(study, of, noise, delay, 0)
+                cells = [f"{value:.0f} ({100 * (value - none) / (full - none):.0f} %)" for value in values.values()]
+                lines.append(line(name, noise, round(1000 * DT * delay), *cells, *[""] * (len(SHOWN) + 1 - len(cells))))
+                print(lines[-1], flush=True)
+        lines[0] += f" The {name} returns {none:.0f} without a motor."
     write_page("\n".join([*lines, "", *made_by("control.latency"), ""]), study.page)
 
 

@@ -11,7 +11,7 @@ from benchmarks.common.tables import report, write_page
 from benchmarks.g1.base import SensorBudget, TrainedSensor
 from benchmarks.g1.diagnosis import diagnose
 from benchmarks.g1.pictures import draw_all
-from benchmarks.g1.study import FIRST, Study, rows_in, run_all
+from benchmarks.g1.study import Study, rows_in, run_all
 from benchmarks.g1.tables import COLUMNS, markdown
 from benchmarks.g1.training import FilterBudget
 
@@ -26,7 +26,7 @@ def smoke(study: Study) -> Study:
         tune=3,
         validation=2,
         seeds=(0,),
-        sensor_budget=SensorBudget(glimpse=3, paper=2, frames=4),
+        sensor_budget=SensorBudget(updates=3, frames=4),
         budget=FilterBudget(motion=5, filter=2, length=6, batch=4),
     )
 
@@ -40,8 +40,8 @@ def main() -> None:
         rows = rows_in(study.out)
         report(study.out, COLUMNS, rows, markdown(rows, f"`{command('g1')}`"))
     if study.command == "diagnosis" or study.smoke:
-        sensors = [TrainedSensor(study, FIRST, seed, study.sensor_budget) for seed in study.seeds]
-        write_page("\n".join(text for sensor in sensors for text in diagnose(sensor)), study.out / "diagnosis.md")
+        sensors = [TrainedSensor(study, seed, study.sensor_budget) for seed in study.seeds]
+        write_page("\n".join(map(diagnose, sensors)) + "\n", study.out / "diagnosis.md")
     if study.command == "pictures" or study.smoke:
         print(*draw_all(study), sep="\n")
 

@@ -1,4 +1,4 @@
-"""Where the hand is in the picture, without a label: where pictures change while the arm moves."""
+"""Finds the hand in the picture without a label: where pictures change while the arm moves."""
 
 from __future__ import annotations
 

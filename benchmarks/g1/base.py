@@ -1,4 +1,4 @@
-"""What all filters of a sensor and a seed share: sensor, statistics, the hand's place."""
+"""Holds what all filters of a seed share: sensor, statistics, the hand's place."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from benchmarks.g1.aim import HandPlace
 from benchmarks.g1.recordings import ARM, Recordings, Roles, bytes_of, rows_of, targets
-from benchmarks.g1.sensors import SENSORS, FramePool, Statistics, train_sensor
+from benchmarks.g1.sensors import FramePool, Statistics, build_sensor, train_sensor
 from torch_denkf.modules import ImageSensor
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
@@ -22,10 +22,9 @@ CHECKED = 1200  # frames that a sensor is validated on
 class SensorBudget:
     """Updates of a sensor, and frames in each; networks that read together, trained from different random numbers."""
 
-    glimpse: int = 2400
-    paper: int = 1000
+    updates: int = 2400
     frames: int = 32
-    networks: int = 2  # of `glimpse`; `paper` is one
+    networks: int = 2
 
 
 class TrainedSensor:
@@ -33,14 +32,13 @@ class TrainedSensor:
 
     Args:
         recordings: the study's.
-        kind: name of the sensor.
         seed: of roles and of all random numbers.
         budget: updates.
     """
 
-    def __init__(self, recordings: Recordings, kind: str, seed: int, budget: SensorBudget):
-        self.recordings, self.kind, self.seed, self.budget = recordings, kind, seed, budget
-        self.name = f"{kind}-{seed}"
+    def __init__(self, recordings: Recordings, seed: int, budget: SensorBudget):
+        self.recordings, self.seed, self.budget = recordings, seed, budget
+        self.name = f"glimpse-{seed}"
         self.out = recordings.out / "sensors" / self.name
 
     @cached_property
@@ -60,7 +58,7 @@ class TrainedSensor:
 
     @cached_property
     def hand(self) -> HandPlace:
-        """Where the hand is in the picture, of the arm's joints."""
+        """Returns the hand's place in the picture, of the arm's joints."""
         data = self.recordings.data
         return HandPlace(data, rows_of(data, self.roles.sensor), data.storage[:]["state"][:, list(ARM)])
 
@@ -73,8 +71,7 @@ class TrainedSensor:
     @cached_property
     def trained(self) -> tuple[list[ImageSensor], Statistics]:
         """The trained networks. Their statistics lie beside them: a resumed study does not read the pictures."""
-        count = self.budget.networks if self.kind == "glimpse" else 1
-        folders, facts_file = [self.out / str(k) for k in range(count)], self.out / "facts.pt"
+        folders, facts_file = [self.out / str(k) for k in range(self.budget.networks)], self.out / "facts.pt"
         if facts_file.exists() and all((folder / "sensor.pt").exists() for folder in folders):
             facts = Statistics(**read_checkpoint(facts_file))
             return [self._read(folder, facts) for folder in folders], facts
@@ -87,13 +84,13 @@ class TrainedSensor:
         for k, folder in enumerate(folders):
             seed = self.seed + 1000 * k
             torch.manual_seed(seed)
-            sensor, updates = SENSORS[self.kind](facts), getattr(self.budget, self.kind)
-            train_sensor(sensor, train, held_out, out=folder, seed=seed, updates=updates, batch=self.budget.frames)
+            sensor, budget = build_sensor(facts), {"updates": self.budget.updates, "batch": self.budget.frames}
+            train_sensor(sensor, train, held_out, out=folder, seed=seed, **budget)
             sensors.append(sensor.eval())
         write_checkpoint(facts_file, vars(facts))
         return sensors, facts
 
     def _read(self, folder: Path, facts: Statistics) -> ImageSensor:
-        sensor = SENSORS[self.kind](facts)
+        sensor = build_sensor(facts)
         sensor.load_state_dict(read_checkpoint(folder / "sensor.pt")["sensor"])
         return sensor.eval()

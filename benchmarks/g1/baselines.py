@@ -1,4 +1,4 @@
-"""What needs no filter: do the pictures say anything, and does a filter say more than its sensor?"""
+"""Estimates without a filter: do the pictures say anything, and does a filter say more than its sensor?"""
 
 from __future__ import annotations
 
@@ -10,46 +10,12 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from benchmarks.g1.readings import PICTURES
-from benchmarks.g1.scores import FLOOR, counted
-from benchmarks.g1.targets import Target
+from benchmarks.g1.recordings import JOINTS
 from torch_denkf.functional import crps_gaussian
 from torch_denkf.modules import DiagonalNoise
 from torch_denkf.training import hold_last
 
-BINS = 100  # of an episode's phase
 SPREAD_CELLS = (16,)  # hidden layers of the sensor's spread
-WEIGHTS = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of a new reading in an exponential filter
-
-
-def clock(sequences: Sequence[Tensor], bins: int = BINS) -> tuple[Tensor, Tensor]:
-    """Mean and variance of the episodes ``[T_k, D]`` at each share of their length, ``[bins, D]``."""
-    at = torch.linspace(0, 1, bins)
-    resampled = torch.stack([one[(at * (len(one) - 1)).round().long()] for one in sequences])
-    return resampled.mean(0), resampled.var(0)
-
-
-def at_phase(values: Tensor, lengths: Tensor, steps: int) -> Tensor:
-    """Values of a clock ``[bins, D]`` in each row of episodes, ``[N, steps, D]``."""
-    phase = torch.arange(steps) / (lengths.unsqueeze(-1) - 1).clamp_min(1)
-    return values[(phase.clamp(max=1) * (len(values) - 1)).round().long()]
-
-
-def smoothed(reading: Tensor, observed: Tensor, start: Tensor, weight: float) -> Tensor:
-    """An exponential filter: the estimate moves by a share of the way to each reading that arrives.
-
-    Args:
-        reading: ``[N, T, D]``.
-        observed: ``[N, T, 1]``.
-        start: ``[D]`` or ``[N, D]``, before the first reading, which is taken as it is.
-        weight: the share, in (0, 1].
-    """
-    estimate, out = start.expand_as(reading[:, 0]), []
-    begun = torch.zeros_like(observed[:, 0])
-    for now, seen in zip(reading.unbind(1), observed.unbind(1), strict=True):
-        moved = torch.where(begun, estimate + weight * (now - estimate), now)
-        estimate, begun = torch.where(seen, moved, estimate), begun | seen
-        out.append(estimate)
-    return torch.stack(out, 1)
 
 
 class SensorSpread:
@@ -58,7 +24,6 @@ class SensorSpread:
     A sensor's samples say how its weights' noise spreads, not how wrong it is on episodes it has not seen.
 
     Args:
-        target: what is read.
         tune: readings of the tuning episodes, by condition.
         validation: of the validation episodes; they choose when to stop, and a factor for the coverage.
         updates: of the fit.
@@ -66,7 +31,6 @@ class SensorSpread:
 
     def __init__(
         self,
-        target: Target,
         tune: dict[str, TensorDict],
         validation: dict[str, TensorDict],
         updates: int = 600,
@@ -77,7 +41,7 @@ class SensorSpread:
         options = {"num_cells": SPREAD_CELLS, "in_features": features.shape[-1], "in_key": "encoding"}
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            self.noise = DiagonalNoise(target.size, r=root, **options)
+            self.noise = DiagonalNoise(JOINTS, r=root, **options)
             optimiser = torch.optim.AdamW(self.noise.parameters(), lr=5e-4, weight_decay=0.1)
             best, kept = self._score(checked, wrong), deepcopy(self.noise.state_dict())
             for update in range(updates):
@@ -121,53 +85,28 @@ def _pairs(readings: Sequence[TensorDict]) -> tuple[Tensor, Tensor]:
 
 
 class Baselines:
-    """All baselines of a target.
+    """All baselines.
 
     Args:
-        target: what is estimated.
         sequences: true states of the training episodes, ``[T, D]`` each.
         tune: readings of the tuning episodes, by condition.
         validation: of the validation episodes, by condition, with those of failing frames.
     """
 
-    names = ("mean_pose", "clock", "sensor", "held", "smoothed")
+    names = ("mean_pose", "sensor", "held")
 
-    def __init__(
-        self,
-        target: Target,
-        sequences: Sequence[Tensor],
-        tune: dict[str, TensorDict],
-        validation: dict[str, TensorDict],
-    ):
+    def __init__(self, sequences: Sequence[Tensor], tune: dict[str, TensorDict], validation: dict[str, TensorDict]):
         flat = torch.cat(list(sequences))
         self.mean, self.var = flat.mean(0), flat.var(0)
         self.start = torch.stack([one[0] for one in sequences]).mean(0)
-        self.clock, self.clock_var = clock(sequences)
-        self.spread = SensorSpread(target, tune, validation)
-        errors = {weight: self._validation_error(validation["clean"], weight) for weight in WEIGHTS}
-        self.weight = min(errors, key=errors.__getitem__)
-        residuals = []
-        for reading in validation.values():
-            mean = smoothed(_mean(reading), reading["observed"], self.start, self.weight)
-            residuals.append((mean - reading["state"])[counted(reading)])
-        self.smoothed_var = (torch.cat(residuals).abs().quantile(0.9, dim=0) / 1.645).square().clamp_min(FLOOR)
-
-    def _validation_error(self, reading: TensorDict, weight: float) -> float:
-        mean = smoothed(_mean(reading), reading["observed"], self.start, weight)
-        return float((mean - reading["state"])[counted(reading)].abs().mean())
+        self.spread = SensorSpread(tune, validation)
 
     def __call__(self, name: str, readings: TensorDict) -> tuple[Tensor, Tensor]:
         """Means and variances ``[N, T, D]``."""
         truth, seen = readings["state"], readings["observed"]
         if name == "mean_pose":
             return self.mean.expand_as(truth), self.var.expand_as(truth)
-        if name == "clock":
-            lengths = readings["valid"].sum((1, 2))
-            return tuple(at_phase(value, lengths, truth.shape[1]) for value in (self.clock, self.clock_var))
-        read = _mean(readings)
-        if name == "smoothed":
-            return smoothed(read, seen, self.start, self.weight), self.smoothed_var.expand_as(truth)
-        var = self.spread(readings)
+        read, var = readings["sensor", "ensemble"].mean(-2), self.spread(readings)
         if name == "held":
             first = self.var.expand_as(truth[:, 0])
             return hold_last(read, seen, self.start.expand_as(truth[:, 0])), hold_last(var, seen, first)
@@ -175,7 +114,3 @@ class Baselines:
             there = readings["arrived"]
             return torch.where(there, read, self.mean), torch.where(there, var, self.var)
         raise ValueError(f"there is no baseline {name!r}; there are {self.names}")
-
-
-def _mean(readings: TensorDict) -> Tensor:
-    return readings["sensor", "ensemble"].mean(-2)

@@ -1,4 +1,4 @@
-"""What goes wrong with the camera's pictures: in training at random, in tests one by one."""
+"""Disturbs the camera's pictures: in training at random, in tests one by one."""
 
 from __future__ import annotations
 

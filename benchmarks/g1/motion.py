@@ -12,8 +12,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from benchmarks.g1.recordings import JOINTS
 from benchmarks.g1.sensors import Statistics
-from benchmarks.g1.targets import Target
 from torch_denkf.training import Stage
 from torch_denkf.training.parts import train_part
 
@@ -42,19 +42,17 @@ class Motion(nn.Module):
 
     Args:
         facts: statistics of the training episodes.
-        target: what moves.
         actions: whether the commands are read: the last features of the input.
     """
 
     fading = FADING
 
-    def __init__(self, facts: Statistics, target: Target, actions: bool = False):
+    def __init__(self, facts: Statistics, actions: bool = False):
         super().__init__()
-        self.target, self.actions = target, actions
-        size, dims = target.size, list(target.dims)
+        self.actions, size = actions, JOINTS
         self.size, self.read = 2 * size, size
         for name in ("loc", "scale", "rate", "acceleration"):
-            self.register_buffer(name, getattr(facts, name)[dims].clone())
+            self.register_buffer(name, getattr(facts, name)[:size].clone())
         self.damping = nn.Parameter(torch.full((size,), 3.0))  # of it the sigmoid
         self.pull = nn.Parameter(torch.zeros(len(DELAYS), size)) if actions else None
         inputs = 2 * size + len(DELAYS) * size * actions
@@ -66,7 +64,7 @@ class Motion(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """States ``[*, 2D]`` of states ``[*, 2D]``, or of states and commands ``[*, 4D]``."""
-        size = self.target.size
+        size = self.read
         place, rates = features[..., :size], features[..., size : 2 * size]
         parts = [(place - self.loc) / self.scale, (rates / (3 * self.rate)).tanh()]
         wanted = self.damping.sigmoid() * rates
@@ -79,22 +77,12 @@ class Motion(nn.Module):
 
 
 class BiasedReading(nn.Module):
-    """h: the numbers, with the sensor's errors of them where the state holds those; then those that have an encoder.
-
-    Args:
-        size: D.
-        encoders: numbers that have one.
-    """
-
-    def __init__(self, size: int, encoders: tuple[int, ...] = ()):
-        super().__init__()
-        self.size, self.encoders = size, list(encoders)
+    """h: the joints, with the sensor's errors of them where the state holds those."""
 
     def forward(self, state: Tensor) -> Tensor:
-        """Readings ``[*, D + encoders]`` of states ``[*, 2D or 3D]``."""
-        place = state[..., : self.size]
-        read = place if state.shape[-1] == 2 * self.size else place + state[..., 2 * self.size :]
-        return torch.cat([read, place[..., self.encoders]], -1)
+        """Readings ``[*, D]`` of states ``[*, 2D or 3D]``."""
+        place, bias = state[..., :JOINTS], state[..., 2 * JOINTS :]
+        return place + bias if bias.shape[-1] else place
 
 
 class MotionLoss(nn.Module):
@@ -106,7 +94,7 @@ class MotionLoss(nn.Module):
 
     def forward(self, rows: TensorDict) -> dict[str, Tensor]:
         """Scores stretches ``[N, AHEAD + 1]``."""
-        size = self.motion.target.size
+        size = self.motion.read
         state, terms = rows["motion"][:, 0], []
         for step in range(AHEAD):
             inputs = torch.cat([state, rows["action"][:, step]], -1) if self.motion.actions else state
@@ -128,7 +116,7 @@ def train_motion(
 
     def stretches(index: Tensor) -> TensorDict:
         rows = full[begins[index].unsqueeze(-1) + torch.arange(AHEAD + 1)]
-        width = 2 * motion.target.size
+        width = motion.size
         return TensorDict({"motion": rows[..., :width], "action": rows[..., width:]}, batch_size=rows.shape[:2])
 
     def sample(generator: torch.Generator, length: int | None) -> TensorDict:

@@ -1,4 +1,4 @@
-"""What a sensor reads of whole episodes, with failing cameras; and windows of that.
+"""Reads whole episodes by a sensor, with failing cameras; and windows of that.
 
 A sensor stays as it is when filters are trained. Its trunk's features of every frame are computed once, and its
 stochastic head runs on those: afterwards a filter costs no pictures.
@@ -17,9 +17,8 @@ from torch.nn.functional import pad
 from benchmarks.g1.aim import HandPlace
 from benchmarks.g1.disturbances import BOX, DARK, SHIFT, boxed, shifted
 from benchmarks.g1.motion import delayed, with_rates
-from benchmarks.g1.recordings import ARM, HAND, targets
+from benchmarks.g1.recordings import ARM, HAND, JOINTS, targets
 from benchmarks.g1.sensors import code_of, read_code
-from benchmarks.g1.targets import Target
 from torch_denkf.data import LeRobotReplay
 from torch_denkf.envs import SaltAndPepper
 from torch_denkf.modules import ImageSensor
@@ -123,9 +122,9 @@ def read_codes(
 
 
 def with_readings(
-    sensors: Sequence[ImageSensor], codes: TensorDict, target: Target, members: int, start: Tensor, seed: int = 0
+    sensors: Sequence[ImageSensor], codes: TensorDict, members: int, start: Tensor, seed: int = 0
 ) -> TensorDict:
-    """What a filter of a target reads, of features ``[N, T]``: the same random numbers each time.
+    """Returns what a filter reads, of features ``[N, T]``: the same random numbers each time.
 
     ======================= =============== ===========================================================================
     ``sensor``: ensemble    [N,T,E,D]       samples of the sensor
@@ -133,31 +132,26 @@ def with_readings(
     ``state``               [N,T,D]         the truth
     ``motion``              [N,T,2D]        with rates
     ``action``              [N,T,2D]        commands, see :func:`benchmarks.g1.motion.delayed`
-    ``encoders``            [N,T,E,K]       noisy readings of the joints that have an encoder
     ``arrived``             [N,T,1]         False where there is no picture, not even a repeat
     ``start``               [N,T,D]         where episodes begin on average
     ======================= =============== ===========================================================================
     """
-    generator, dims = torch.Generator().manual_seed(seed), list(target.dims)
+    generator = torch.Generator().manual_seed(seed)
     ensembles, encodings = [], []
     for part in codes["code"].split(1):
         with torch.no_grad():
             samples, encoding = read_code(sensors, part, members, generator)
-        ensembles.append(samples[..., dims].clone())
+        ensembles.append(samples[..., :JOINTS].clone())
         encodings.append(encoding)
     out = codes.select("observed", "valid")
     out["arrived"] = out["valid"].clone()
-    truth, command = codes["truth"][..., dims], codes["command"][..., dims]
+    truth, command = codes["truth"][..., :JOINTS], codes["command"][..., :JOINTS]
     out["sensor"] = TensorDict(
         {"ensemble": torch.cat(ensembles), "encoding": torch.cat(encodings)}, batch_size=out.batch_size
     )
     out["state"], out["start"] = truth, start.expand_as(truth)
     out["motion"] = torch.stack([with_rates(one) for one in truth])
     out["action"] = torch.stack([delayed(one) for one in command])
-    true = truth[..., list(target.encoders)].unsqueeze(-2)
-    noise = torch.randn(*true.shape[:2], members + 1, true.shape[-1], generator=generator)
-    # One error for all members, which is the encoder's; and each member's own, as perturbed observations have.
-    out["encoders"] = true + target.encoder_std * (noise[..., :1, :] + noise[..., 1:, :])
     return out
 
 
@@ -167,18 +161,18 @@ def standardised(encoding: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def black_readings(sensors: Sequence[ImageSensor], target: Target, members: int) -> TensorDict:
-    """What the sensor reads in a black picture, and whether such a picture counts as observed, ``[1, 1]``."""
+def black_readings(sensors: Sequence[ImageSensor], members: int) -> TensorDict:
+    """Returns the reading of a black picture, and whether such a picture counts as observed, ``[1, 1]``."""
     generator = torch.Generator().manual_seed(1)
     pixels = GREY * torch.rand(1, *sensors[0].image_shape, generator=generator)
     samples, encoding = read_code(sensors, code_of(sensors, pixels).unsqueeze(0), members, generator)
-    entries = {"ensemble": samples[..., list(target.dims)], "encoding": encoding}
+    entries = {"ensemble": samples[..., :JOINTS], "encoding": encoding}
     observed = BlackIsMissing()(TensorDict({"pixels": pixels}, [1]))["seen"]
     return TensorDict({**entries, "observed": observed.unsqueeze(0)}, batch_size=[1, 1])
 
 
 def blackouts(lengths: Tensor, seed: int = 0) -> Tensor:
-    """Where the black frames begin, ``[N]``: in the middle half of each episode."""
+    """Draws where the black frames begin, ``[N]``: in the middle half of each episode."""
     share = torch.rand(len(lengths), generator=torch.Generator().manual_seed(seed))
     return (lengths * (0.25 + 0.5 * share)).long()
 

@@ -26,7 +26,7 @@ LAGS = range(-8, 11)  # rows that are tried
 
 @dataclass(frozen=True)
 class Recordings:
-    """Where the recordings are, and how they are read."""
+    """Says where the recordings are, and how they are read."""
 
     root: Path = Path("../shared/data/g1")  # LeRobot folder
     out: Path = Path("runs/g1")  # checkpoints, logs, table, beliefs, decoded pictures
@@ -104,7 +104,7 @@ def bytes_of(data: LeRobotReplay, rows: Tensor) -> Tensor:
 
 
 def targets(rows: TensorDict) -> Tensor:
-    """What a sensor reads of rows: arm and hand, ``[*, 13]``."""
+    """Returns what a sensor reads of rows: arm and hand, ``[*, 13]``."""
     return torch.cat([rows["state"][..., list(ARM)], rows["state"][..., list(HAND)]], -1)
 
 

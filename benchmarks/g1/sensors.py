@@ -1,8 +1,8 @@
-"""Sensors by name, and their training on single frames."""
+"""The sensor, and its training on single frames."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from benchmarks.g1.disturbances import MARGIN, before_another, disturb
 from benchmarks.g1.recordings import FINGERS, JOINTS, READ
-from benchmarks.g1.trunk import SecondLookTrunk, Shrink
+from benchmarks.g1.trunk import SecondLookTrunk
 from torch_denkf.functional import crps_ensemble
-from torch_denkf.modules import ImageSensor, convolutional_trunk
+from torch_denkf.modules import ImageSensor
 from torch_denkf.training import Stage
 from torch_denkf.training.parts import train_part
 
@@ -39,7 +39,7 @@ class Statistics:
 
     @classmethod
     def of(cls, sequences: list[Tensor], pixels: Tensor) -> Statistics:
-        """Of true numbers of episodes ``[T, 13]`` and of pictures, uint8."""
+        """Takes statistics of true numbers of episodes ``[T, 13]`` and of pictures, uint8."""
         flat, some = torch.cat(sequences), pixels[:: max(len(pixels) // 300, 1)].float() / 255
         rates = [one.diff(dim=0) for one in sequences]
         rate = torch.cat(rates).square().mean(0).sqrt().clamp_min(1e-4)
@@ -48,35 +48,25 @@ class Statistics:
         return cls(flat.mean(0), scale, rate, acceleration, some.mean((0, 2, 3)), some.std((0, 2, 3)), size)
 
 
-def glimpse_sensor(facts: Statistics) -> ImageSensor:
-    """Keypoints and a second look at the hand. Flipout learns how large its noise is."""
+def build_sensor(facts: Statistics) -> ImageSensor:
+    """Builds keypoints and a second look at the hand. Flipout learns how large its noise is."""
     # Measured on one thread of an EPYC: 244 ms an update of 32 frames as ImageSensor has it by default, 153 like this.
-    sensor = _sensor(facts, SecondLookTrunk(facts.size[1]), num_cells=(128, 64), layer="flipout", trunk_memory=2**34)
-    sensor.module["trunk"].to(memory_format=torch.contiguous_format)
-    return sensor
-
-
-def paper_sensor(facts: Statistics) -> ImageSensor:
-    """The paper's: Table I, on the picture at half the size."""
-    return _sensor(facts, nn.Sequential(Shrink(), convolutional_trunk(3)), trunk_dtype=torch.bfloat16)
-
-
-SENSORS: dict[str, Callable[[Statistics], ImageSensor]] = {"glimpse": glimpse_sensor, "paper": paper_sensor}
-
-
-def _sensor(facts: Statistics, trunk: nn.Module, **options) -> ImageSensor:
-    return ImageSensor(
+    sensor = ImageSensor(
         READ,
         image_shape=(3, *facts.size),
-        trunk=trunk,
+        trunk=SecondLookTrunk(facts.size[1]),
         ensemble_size=SAMPLES,
         loc=facts.loc,
         scale=facts.scale,
         pixel_loc=facts.pixel_loc,
         pixel_scale=facts.pixel_scale,
         encoding_key=("sensor", "encoding"),
-        **options,
+        num_cells=(128, 64),
+        layer="flipout",
+        trunk_memory=2**34,
     )
+    sensor.module["trunk"].to(memory_format=torch.contiguous_format)
+    return sensor
 
 
 def code_of(sensors: Sequence[ImageSensor], pixels: Tensor) -> Tensor:
@@ -110,21 +100,21 @@ def encoding_size(sensors: Sequence[ImageSensor]) -> int:
 
 
 class FrameLoss(nn.Module):
-    """CRPS of a sensor's samples in units of a good sensor's errors; and, for a second look, where it looks."""
+    """CRPS of a sensor's samples in units of a good sensor's errors; and where it looks closely."""
 
     def __init__(self, sensor: ImageSensor):
         super().__init__()
         self.sensor = sensor
-        self.looks = isinstance(sensor.module["trunk"], SecondLookTrunk)
 
     def forward(self, frames: TensorDict) -> dict[str, Tensor]:
         """Scores frames ``[N]``."""
         code = code_of([self.sensor], frames["pixels"])
         score = (crps_ensemble(read_code([self.sensor], code, SAMPLES)[0], frames["target"]) / UNIT).mean(0)
-        terms = {"loss_joints": score[:JOINTS].mean(), "loss_hand": 0.3 * score[JOINTS:].mean()}
-        if self.looks:
-            terms["loss_place"] = 3 * (code[:, -2:] - frames["place"]).abs().mean()
-        return terms
+        return {
+            "loss_joints": score[:JOINTS].mean(),
+            "loss_hand": 0.3 * score[JOINTS:].mean(),
+            "loss_place": 3 * (code[:, -2:] - frames["place"]).abs().mean(),
+        }
 
 
 class FramePool:

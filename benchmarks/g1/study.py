@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -31,18 +30,15 @@ from benchmarks.g1.readings import (
 )
 from benchmarks.g1.recipes import FILTERS, G1Recipe
 from benchmarks.g1.recipes._base import MEMBERS
-from benchmarks.g1.recordings import Recordings, rows_of
-from benchmarks.g1.sensors import SENSORS, encoding_size
-from benchmarks.g1.targets import TARGETS, Target
+from benchmarks.g1.recordings import ARM, JOINTS, Recordings, rows_of
+from benchmarks.g1.sensors import encoding_size
 from benchmarks.g1.training import FilterBudget, filter_error, train_filter
 from torch_denkf.filters import Filter
-
-FIRST = "glimpse"  # the sensor that all filters read
 
 
 @dataclass(frozen=True)
 class Study(Recordings):
-    """A real arm that its head camera watches: seven joints and a hand, with every filter that is registered.
+    """A real arm that its head camera watches: seven joints, with every filter that is registered.
 
     table: estimate the lag, train sensors and filters, test. diagnosis: how the trained sensors err. pictures: plots
     and videos of what a table left in --out. What was broken off goes on where it stopped. See benchmarks/g1/README.md.
@@ -50,8 +46,6 @@ class Study(Recordings):
 
     command: Positional[Literal["table", "diagnosis", "pictures"]] = "table"
     filters: some_of(sorted(FILTERS)) = tuple(sorted(FILTERS))
-    sensors: some_of(sorted(SENSORS)) = (FIRST, "paper")
-    states: some_of(sorted(TARGETS)) = ("arm", "hand")
     seeds: tuple[int, ...] = (0, 1, 2)
     sensor_budget: OmitArgPrefixes[SensorBudget] = field(default_factory=SensorBudget)
     budget: OmitArgPrefixes[FilterBudget] = field(default_factory=FilterBudget)
@@ -59,34 +53,33 @@ class Study(Recordings):
 
 
 class Base:
-    """What all filters of a sensor, a seed and a target share.
+    """Holds what all filters of a seed share.
 
     Args:
         study: the study.
         sensor: trained.
-        target: what is estimated.
     """
 
-    def __init__(self, study: Study, sensor: TrainedSensor, target: Target):
-        self.study, self.trained, self.target = study, sensor, target
-        self.name = f"{target.name}-{sensor.name}"
+    def __init__(self, study: Study, sensor: TrainedSensor):
+        self.study, self.trained = study, sensor
+        self.name = f"arm-{sensor.name}"
         self._motions: dict[bool, Motion] = {}
 
     @cached_property
     def sequences(self) -> list[tuple[Tensor, Tensor]]:
         """True states and commands of the sensor's and the filters' training episodes."""
-        data, roles, dims = self.study.data, self.trained.roles, list(self.target.dims)
-        command = torch.cat([data.storage[:]["action"][:, 7:14], data.storage[:]["action"][:, 20:26]], -1)
+        data, roles = self.study.data, self.trained.roles
+        command = data.storage[:]["action"][:, list(ARM)]
         rows = [rows_of(data, [number]) for number in (*roles.sensor, *roles.tune)]
-        return [(self.trained.target[at][:, dims], command[at][:, dims]) for at in rows]
+        return [(self.trained.target[at][:, :JOINTS], command[at]) for at in rows]
 
     @property
     def start(self) -> Tensor:
-        """Where the training episodes begin, ``[N, D]``."""
+        """Returns where the training episodes begin, ``[N, D]``."""
         return torch.stack([state[0] for state, _ in self.sequences])
 
     def _pictures(self, role: str) -> dict[str, TensorDict]:
-        """What the sensor reads of the episodes of a role in all pictures; encodings as they are."""
+        """Returns what the sensor reads of the episodes of a role in all pictures; encodings as they are."""
         trained, study = self.trained, self.study
         sensors, _ = trained.trained
         numbers, out = getattr(trained.roles, role), {}
@@ -95,7 +88,7 @@ class Base:
             exact = role == "test"
             hand = None if file.exists() else trained.hand
             codes = read_codes(sensors, study.data, hand, numbers, condition=condition, exact=exact, file=file)
-            out[condition] = with_readings(sensors, codes, self.target, MEMBERS, self.start.mean(0))
+            out[condition] = with_readings(sensors, codes, MEMBERS, self.start.mean(0))
         return out
 
     @cached_property
@@ -114,7 +107,7 @@ class Base:
         return readings.copy().set("sensor", sensor)
 
     def _readings(self, role: str) -> dict[str, TensorDict]:
-        """What the sensor reads of the episodes of a role, in all conditions."""
+        """Returns what the sensor reads of the episodes of a role, in all conditions."""
         pictures = self._tune if role == "tune" else self._pictures(role)
         out = {condition: self._standardised(one) for condition, one in pictures.items()}
         for condition in set(CONDITIONS) - set(PICTURES):
@@ -124,7 +117,7 @@ class Base:
     @cached_property
     def black(self) -> TensorDict:
         """The reading of a black frame."""
-        black = black_readings(self.trained.trained[0], self.target, MEMBERS)
+        black = black_readings(self.trained.trained[0], MEMBERS)
         return black.set("encoding", standardised(black["encoding"], *self._encoding))
 
     @cached_property
@@ -145,15 +138,15 @@ class Base:
     @cached_property
     def baselines(self) -> Baselines:
         """All baselines."""
-        return Baselines(self.target, [state for state, _ in self.sequences], self.tune, self.validation)
+        return Baselines([state for state, _ in self.sequences], self.tune, self.validation)
 
     def motion(self, actions: bool) -> Motion:
         """The motion, trained once on true states."""
         if actions not in self._motions:
             seed, study = self.trained.seed, self.study
             torch.manual_seed(seed)
-            motion = Motion(self.trained.trained[1], self.target, actions)
-            out = study.out / "motions" / f"{self.target.name}{'-actions' * actions}-{seed}"
+            motion = Motion(self.trained.trained[1], actions)
+            out = study.out / "motions" / f"arm{'-actions' * actions}-{seed}"
             self._motions[actions] = train_motion(
                 motion, self.sequences, out=out, seed=seed, updates=study.budget.motion
             )
@@ -172,7 +165,6 @@ class Base:
         sensors, facts = self.trained.trained
         encoding = encoding_size(sensors)
         recipe = kind(
-            self.target,
             facts,
             self.motion(kind.actions),
             self.error,
@@ -194,41 +186,24 @@ def joined(readings: dict[str, TensorDict]) -> TensorDict:
 
 
 def run_all(study: Study) -> None:
-    """Trains and tests everything: all filters of the arm with the first sensor, fewer of all else."""
-    for seed in study.seeds:
-        for kind in study.sensors:
-            sensor = TrainedSensor(study, kind, seed, study.sensor_budget)
-            for state in study.states:
-                every = (kind, state) == (FIRST, "arm")
-                if kind == FIRST or state == "arm":
-                    chosen = [name for name in study.filters if every or name in SHORT[state]]
-                    run_jobs(study, chosen, sensor, TARGETS[state])
-
-
-SHORT = {"arm": {"denkf"}, "hand": {"denkf", "denkfactions"}}  # what the other tables show
-
-
-def run_jobs(study: Study, filters: Sequence[str], sensor: TrainedSensor, target: Target) -> None:
     """Trains and tests what is not done already; leaves rows in ``--out/rows``."""
-    base, folder = Base(study, sensor, target), study.out / "rows"
-    names = {"sensor": sensor.kind, "state": target.name, "seed": sensor.seed}
-    once(folder / f"baselines-{base.name}.json", partial(_baselines, base, names))
-    for name in filters:
-        once(folder / f"{name}-{base.name}.json", partial(_filter, base, {**names, "filter": name}))
+    for seed in study.seeds:
+        base, folder = Base(study, TrainedSensor(study, seed, study.sensor_budget)), study.out / "rows"
+        once(folder / f"baselines-{base.name}.json", partial(_baselines, base, {"seed": seed}))
+        for name in study.filters:
+            once(folder / f"{name}-{base.name}.json", partial(_filter, base, {"seed": seed, "filter": name}))
 
 
 def _baselines(base: Base, names: dict) -> list[dict]:
-    return baseline_rows(base.baselines, base.target, base.test, names)
+    return baseline_rows(base.baselines, base.test, names)
 
 
 def _filter(base: Base, names: dict) -> list[dict]:
-    recipe, model = base.train(names["filter"])
-    rows = filter_rows(recipe, model, base.test, names)
-    rows[0]["validation_crps"] = filter_error(recipe, model, joined(base.validation))["crps"]
-    if names["filter"] == "denkf" and base.target.name == "arm" and base.trained.kind == FIRST:
-        save_beliefs(
-            recipe, model, base.test, base.trained.roles.test, f"denkf-{base.name}", base.study.out / "beliefs"
-        )
+    _, model = base.train(names["filter"])
+    rows = filter_rows(model, base.test, names)
+    rows[0]["validation_crps"] = filter_error(model, joined(base.validation))["crps"]
+    if names["filter"] == "denkf":
+        save_beliefs(model, base.test, base.trained.roles.test, f"denkf-{base.name}", base.study.out / "beliefs")
     return rows
 
 

@@ -25,13 +25,12 @@ from benchmarks.g1.readings import blackouts, read_codes
 from benchmarks.g1.recordings import ARM as JOINTS
 from benchmarks.g1.recordings import Recordings, rows_of
 from benchmarks.g1.sensors import read_code
-from benchmarks.g1.targets import ARM
 from torch_denkf import FusedFilter, FusedSensor
 from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import ConstantNoise, LearnedTransition, MappedNoise, MomentPrior, Select
 from torch_denkf.training import hold_last
 
-SIZE, RATE = ARM.size, 30  # joints; rows a second
+SIZE, RATE = len(JOINTS), 30  # joints; rows a second
 ENCODER = math.radians(0.1)  # standard deviation of an encoder's reading, rad
 COMMANDS = 8  # of the last rows, that the joints follow
 SAMPLES = 64  # of the camera's sensor
@@ -53,7 +52,7 @@ class Together(Recordings):
 
 
 class Arm:
-    """What a camera reads of the arm, its motion, and how the sensors err.
+    """Holds what a camera reads of the arm, its motion, and how the sensors err.
 
     Args:
         study: where the recordings are.
@@ -61,7 +60,7 @@ class Arm:
 
     def __init__(self, study: Together):
         self.study, self.surprise = study, SURPRISE
-        self.sensor = TrainedSensor(study, "glimpse", study.seed, study.sensor_budget)
+        self.sensor = TrainedSensor(study, study.seed, study.sensor_budget)
         self.roles = self.sensor.roles
 
     @cached_property
@@ -86,7 +85,7 @@ class Arm:
 
     @torch.no_grad()
     def read(self, codes: TensorDict) -> TensorDict:
-        """What the camera's head makes of features."""
+        """Returns what the camera's head makes of features."""
         out, generator = codes.select("valid"), torch.Generator().manual_seed(0)
         samples, encoding = read_code(self.sensor.trained[0], codes["code"], SAMPLES, generator)
         out["camera"], out["encoding"] = samples[..., :SIZE].mean(-2), encoding
@@ -108,7 +107,7 @@ class Arm:
     def motion(self) -> Motion:
         """The motion, learned from true states."""
         torch.manual_seed(self.study.seed)
-        motion = Motion(self.sensor.trained[1], ARM)
+        motion = Motion(self.sensor.trained[1])
         pairs = [(state, state) for state, _ in self.known]
         out = self.study.out / "motions" / "together"
         return train_motion(motion, pairs, out=out, seed=self.study.seed, updates=self.study.motion_updates)
@@ -120,11 +119,11 @@ class Arm:
 
     @property
     def noise(self) -> MappedNoise:
-        """What the motion does not foresee of a row."""
+        """Returns the noise of the motion in a row."""
         return unforeseen(self.motion, self.pairs, self.surprise)
 
     def start(self, begins: bool = True) -> MomentPrior:
-        """Where episodes begin, or where the arm is at any time; at rest, or nearly."""
+        """Returns where episodes begin, or where the arm is at any time; at rest, or nearly."""
         poses = torch.stack([state[0] for state, _ in self.known]) if begins else torch.cat([s for s, _ in self.known])
         rate = self.motion.rate.square().diag()
         mean = torch.cat([poses.mean(0), torch.zeros(SIZE)])
@@ -136,7 +135,7 @@ class Arm:
         return [self.readings(role) for role in ("tune", "validation")]
 
     def errors(self, name: str, kind: str = "episodes") -> tuple[FadingBias | None, Tensor]:
-        """What lasts of a sensor's errors, ``"episodes"`` for a part that is an episode's, and what is white."""
+        """Estimates a sensor's bias, ``"episodes"`` for a part that is an episode's, and its white noise."""
         errors = [torch.where(one[f"{name}_observed"], one[name] - one["state"], torch.nan) for one in self.unseen]
         every = pad_sequence([error for one in errors for error in one], batch_first=True, padding_value=torch.nan)
         if kind == "white":
@@ -159,7 +158,7 @@ class Arm:
 
 @torch.no_grad()
 def unforeseen(motion: nn.Module, pairs: list[Tensor], surprise: float = SURPRISE) -> MappedNoise:
-    """What a motion does not foresee of a row of true states: of the rates, and through them of the joints."""
+    """Returns the noise of a motion from true states: of the rates, and through them of the joints."""
     missed = torch.cat([one[1:, SIZE:] - motion(one[:-1])[:, SIZE:] for one in pairs])
     root = surprise * torch.linalg.cholesky(missed.mT @ missed / len(missed))
     unit = ConstantNoise([1.0] * SIZE, in_key=("belief", "mean"), out_key=("forecast", "noise"))

@@ -12,6 +12,7 @@ from torch import Tensor
 from benchmarks.common.training import fit_filter
 from benchmarks.g1.readings import Windows
 from benchmarks.g1.recipes import G1Recipe
+from benchmarks.g1.recordings import JOINTS
 from benchmarks.g1.scores import FLOOR, counted, scores
 from torch_denkf.filters import Filter
 from torch_denkf.metrics import interval_coverage
@@ -39,19 +40,18 @@ def run_filter(model: Filter, readings: TensorDict) -> tuple[Tensor, Tensor]:
     return out["belief", "mean"], out["belief", "var"]
 
 
-def filter_error(recipe: G1Recipe, model: Filter, readings: TensorDict) -> dict[str, float]:
+def filter_error(model: Filter, readings: TensorDict) -> dict[str, float]:
     """Scores of a filter."""
     mean, var = run_filter(model, readings)
-    size = recipe.target.size
-    named = scores(recipe.target, mean[..., :size], var[..., :size], readings)
+    named = scores(mean[..., :JOINTS], var[..., :JOINTS], readings)
     return {key: named[key] for key in ("crps", "joint_mae_deg", "coverage90")}
 
 
-def filter_coverage(recipe: G1Recipe, model: Filter, readings: TensorDict) -> Tensor:
+def filter_coverage(model: Filter, readings: TensorDict) -> Tensor:
     """Share of the truth inside the belief's 90 % intervals."""
     mean, var = run_filter(model, readings)
-    size, at = recipe.target.size, counted(readings)
-    mean, var = mean[..., :size][at], var[..., :size][at].clamp_min(FLOOR)
+    at = counted(readings)
+    mean, var = mean[..., :JOINTS][at], var[..., :JOINTS][at].clamp_min(FLOOR)
     return interval_coverage(mean, var, readings["state"][at], level=0.9).mean()
 
 
@@ -79,7 +79,7 @@ def train_filter(
     """
     torch.manual_seed(seed)
     model = recipe.build()
-    padding, updates = recipe.size - 2 * recipe.target.size, budget.filter * recipe.longer
+    padding, updates = recipe.size - 2 * JOINTS, budget.filter * recipe.longer
 
     def stages() -> list[Stage]:
         return [
@@ -89,7 +89,7 @@ def train_filter(
                 lambda generator, _: windows.sample(generator, budget.batch, recipe.error, padding),
                 updates,
                 lr=2e-3,
-                validate=lambda: filter_error(recipe, model, validation),
+                validate=lambda: filter_error(model, validation),
             )
         ]
 
@@ -97,7 +97,7 @@ def train_filter(
         recipe,
         model,
         stages,
-        lambda: filter_coverage(recipe, model, validation),
+        lambda: filter_coverage(model, validation),
         out=out,
         inflations=INFLATIONS,
         seed=seed,

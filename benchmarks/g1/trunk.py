@@ -12,16 +12,8 @@ from torch_denkf.modules import KeypointTrunk
 REACH = 0.34  # half a patch's side, in half widths of the picture: hand and wrist
 
 
-class Shrink(nn.Module):
-    """Pictures of half the size."""
-
-    def forward(self, images: Tensor) -> Tensor:
-        """``[N, 3, H / 2, W / 2]``."""
-        return avg_pool2d(images, 2)
-
-
 class HalfKeypointTrunk(KeypointTrunk):
-    """The same with convolutions of 16 bits: half the time on a processor that has them. Places keep 32 bits."""
+    """Keypoints with convolutions of 16 bits: half the time on a processor that has them. Places keep 32 bits."""
 
     def forward(self, images: Tensor) -> Tensor:
         """Features of images."""

@@ -27,7 +27,6 @@ from torch_denkf.applications.car.odometry.streams import all_frames, lose_frame
 from torch_denkf.filters import Filter
 from torch_denkf.training import Stage
 from torch_denkf.training.checkpoint import read_checkpoint
-from torch_denkf.training.parts import parameters_without
 
 INFLATIONS = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4, 1.6, 2.0, 2.5, 3.2)
 FLOOR = 1e-8  # of the variances of v and theta_dot
@@ -142,7 +141,8 @@ def train_filter(
                 lambda generator, length: frames.windows(generator, length, start_std),
                 budget.end_to_end,
                 # The noise model knows how wrong the sensor is on new drives; on those it has seen it would forget.
-                parameters=parameters_without(model, {"noise"} & set(model.module.keys())),
+                parameters=model.parameters(),
+                frozen={"noise"} & set(model.module.keys()),
                 lr=1e-4,
                 lengths={0: 4, third: 8, 2 * third: 16},
                 validate=lambda: filter_error(

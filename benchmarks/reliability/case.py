@@ -60,7 +60,7 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came out of a case.
+    """Says what came out of a case.
 
     Attributes:
         kind: ``clear``: an error raised in this library that names what was damaged. ``right``: no error, and the
@@ -146,7 +146,7 @@ def _run(case: Case, folder: Path, write: int) -> None:
     warnings.simplefilter("ignore")
     os.chdir(folder)
     try:
-        verdict = _verdict(case, folder)
+        verdict = verdict_on(case, folder)
         if (folder / MARK).exists():
             verdict = Verdict("silent", "a hostile file got to run")
         os.write(write, json.dumps(vars(verdict)).encode())
@@ -154,7 +154,8 @@ def _run(case: Case, folder: Path, write: int) -> None:
         os._exit(0)
 
 
-def _verdict(case: Case, folder: Path) -> Verdict:
+def verdict_on(case: Case, folder: Path) -> Verdict:
+    """Runs a case in this process."""
     try:
         result = case.act(folder)
     except Exception as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,10 @@ class Wrong:
         """Without those that are not wrong here; none is drawn, as it might be one of them."""
         return Wrong({name: value for name, value in self.named.items() if name not in names})
 
+    def without(self, *names: str) -> Wrong:
+        """Without those that are not wrong here; others are drawn."""
+        return Wrong({name: value for name, value in self.named.items() if name not in names}, self.others)
+
     def each(self, change: Callable[[Any], Any]) -> Wrong:
         """With something made of every value."""
         return Wrong(
@@ -55,7 +59,17 @@ class Wrong:
 
 def drawn(values: st.SearchStrategy[Any]) -> Named:
     """Values under their own names."""
-    return values.map(lambda value: (" ".join(repr(value).split())[:80], value))
+    return values.map(lambda value: (_name(value), value))
+
+
+def of(*values: Any, drawn: st.SearchStrategy[Any] | None = None) -> Wrong:
+    """Returns values under their own names."""
+    others = st.nothing() if drawn is None else drawn.map(lambda value: (_name(value), value))
+    return Wrong({_name(value): value for value in values}, others)
+
+
+def _name(value: Any) -> str:
+    return " ".join(repr(value).split())[:80]
 
 
 # ------------------------------------------------------------------------------------------------------- numbers
@@ -93,7 +107,7 @@ def indices(size: int) -> Wrong:
 
 
 def dims(size: int) -> Wrong:
-    """Likewise, of components that are read: each at most once."""
+    """Returns indices of components that are read: each at most once."""
     return indices(size) | {"twice the same": [0, 0]}
 
 
@@ -146,6 +160,7 @@ def covariance(size: int) -> Wrong:
         "not symmetric": _with(eye, (0, -1), 0.5),
         "negative variance": _with(eye, (-1, -1), -1.0),
         "indefinite": 1.5 * torch.ones(size, size) - eye,
+        "zero beside a correlation": 0.1 * torch.ones(size, size) * (1 - eye) + eye * (torch.arange(size) > 0),
     }
 
 
@@ -233,12 +248,6 @@ FILE = BYTES.each(written) | PLACES
 # ----------------------------------------------------------------------------------------------- what has entries
 
 MISSING = object()
-OF_TYPES = {"text": "x", "nothing": None, "a list": [], "a fraction": 1.5, "negative": -3}
-
-
-def types(*names: str, **more: Any) -> Wrong:
-    """Values of the wrong type, for a field that has another one."""
-    return Wrong({name: OF_TYPES[name] for name in names} | more)
 
 
 def put(path: tuple[Any, ...], value: Any) -> Change:
@@ -276,21 +285,6 @@ def fields(wrong: Mapping[Any, Wrong], *, missing: bool = True) -> Wrong:
     return out
 
 
-def on_row(row: int, change: Callable[[Any], Any]) -> Callable[[list], list]:
-    """Changes one of several values; it goes where there is nothing left of it."""
-
-    def act(values: list) -> list:
-        changed = change(values[row])
-        return [*values[:row], *([] if changed is MISSING else [changed]), *values[row + 1 :]]
-
-    return act
-
-
-def in_lines(change: Callable[[list[str]], list[str]]) -> Change:
-    """Changes the lines of a text file."""
-    return lambda file: file.write_text("\n".join(change(file.read_text().splitlines())) + "\n")
-
-
 # --------------------------------------------------------------------------------------------------- comparisons
 
 
@@ -308,12 +302,12 @@ def leaves(result: Any) -> dict[str, Tensor]:
 
 
 def finite(result: Any) -> bool:
-    """Whether all numbers are finite."""
+    """Tells whether all numbers are finite."""
     return all(bool(value.isfinite().all()) for value in leaves(result).values())
 
 
 def same(result: Any, expected: Any, *, rtol: float = 0.0, atol: float = 0.0) -> bool:
-    """Whether two results have the same entries, with the same numbers."""
+    """Tells whether two results have the same entries, with the same numbers."""
     one, other = leaves(result), leaves(expected)
     return one.keys() == other.keys() and all(
         one[key].shape == other[key].shape
@@ -322,22 +316,25 @@ def same(result: Any, expected: Any, *, rtol: float = 0.0, atol: float = 0.0) ->
     )
 
 
-def same_but(result: Any, expected: Any, rows: Iterable[int], masks: Iterable[str]) -> bool:
-    """Whether ``rows`` are marked as missing in one of ``masks``, and all other rows are as expected.
+def kept(result: Any, expected: Any, *, most: int = 1, rtol: float = 0.0) -> bool:
+    """Tells whether rows are as expected, but for some that are marked as missing, or lack at the end.
 
     Args:
         result: entries ``[N, ...]``.
-        expected: likewise.
-        rows: numbers of the damaged ones.
-        masks: names of boolean entries; where one is False the row's reading does not count.
+        expected: likewise, maybe longer; its boolean entries are masks, False where a row's reading does not count.
+        most: so many rows may be marked.
+        rtol: of the comparison.
     """
     one, other = leaves(result), leaves(expected)
-    rows = list(rows)
     if not other.keys() <= one.keys() or not finite(one):
         return False
-    if any(one[key].shape != other[key].shape for key in other):
-        return False
-    keep = torch.ones(len(next(iter(other.values()))), dtype=torch.bool)
-    keep[rows] = False
-    marked = any(bool((~one[name][rows]).any()) for name in masks if name in one)
-    return marked and all(torch.equal(one[key][keep], other[key][keep]) for key in other)
+    count = len(next(iter(one.values())))
+    differ = marked = torch.zeros(count, dtype=torch.bool)
+    for key, right in other.items():
+        found, right = one[key].reshape(count, -1), right[:count].reshape(min(count, len(right)), -1)
+        if found.shape != right.shape:
+            return False
+        differ = differ | ~found.double().isclose(right.double(), rtol=rtol, atol=rtol).all(-1)
+        if found.dtype == torch.bool:
+            marked = marked | (right & ~found).any(-1)
+    return count > 0 and bool((marked | ~differ).all()) and int(marked.sum()) <= most

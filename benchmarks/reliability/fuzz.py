@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import re
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -21,10 +20,10 @@ from benchmarks.common.tables import head, line
 from benchmarks.reliability.case import Case, Verdict, judge
 from benchmarks.reliability.target import Target
 
-#: Modules of benchmarks/reliability/borders.
+#: Modules of tests/borders, whose cases the tests run, too; then those of benchmarks/reliability/borders.
+TESTED = ("filters_made", "sub_models")
 BORDERS = (
-    "filters_made",
-    "sub_models",
+    *TESTED,
     "filters_fed",
     "spaces",
     "noises",
@@ -50,13 +49,14 @@ Row = dict[str, str]  # border, case, kind, what, and how to run it again
 
 
 def all_targets(borders: Sequence[str] = BORDERS) -> list[Target]:
-    """What may be damaged, in an order of its own."""
-    modules = [import_module(f"benchmarks.reliability.borders.{name}") for name in borders]
+    """Returns what may be damaged, in an order of its own."""
+    places = {name: "tests" if name in TESTED else "benchmarks.reliability" for name in borders}
+    modules = [import_module(f"{place}.borders.{name}") for name, place in places.items()]
     return [target for module in modules for target in module.targets()]
 
 
 def row(case: Case, verdict: Verdict, again: str) -> Row:
-    """What came of a case, for the record."""
+    """Records what came of a case."""
     return {"border": case.border, "case": case.name, "kind": verdict.kind, "what": verdict.text, "again": again}
 
 
@@ -64,15 +64,14 @@ class Found(AssertionError):
     """An input that is neither refused clearly nor right."""
 
 
-def search(cases: st.SearchStrategy[Case], count: int, seed: int, words: str, again: str = "") -> list[Row]:
+def search(cases: st.SearchStrategy[Case], count: int, seed: int, words: str) -> list[Row]:
     """Draws cases; the smallest that is neither clear nor right comes last, with the words that run it again.
 
     Args:
         cases: what is drawn.
         count: so many of them, if all are in order.
         seed: another one draws others.
-        words: of the command line, by which ``cases`` are found again.
-        again: runs only the case that these letters stand for.
+        words: of the command line, by which the same cases are drawn again.
     """
     rows: list[Row] = []
 
@@ -82,7 +81,6 @@ def search(cases: st.SearchStrategy[Case], count: int, seed: int, words: str, ag
         database=None,
         deadline=None,
         derandomize=False,
-        print_blob=True,
         report_multiple_bugs=False,
         phases=(hypothesis.Phase.generate, hypothesis.Phase.shrink),
         suppress_health_check=list(hypothesis.HealthCheck),
@@ -95,23 +93,16 @@ def search(cases: st.SearchStrategy[Case], count: int, seed: int, words: str, ag
         if verdict.kind not in GOOD:
             raise Found(verdict.kind)
 
-    if again:
-        attack = hypothesis.reproduce_failure(hypothesis.__version__, again.encode())(attack)
     try:
         attack()
-    except Found as found:
-        smallest = rows[-1]
-        letters = re.search(r"reproduce_failure\([^,]+, b'([^']+)'\)", "".join(getattr(found, "__notes__", ())))
-        smallest["again"] += f" --again '{letters[1]}'" if letters else ""
-        rows = [*(one for one in rows if one["kind"] in GOOD), smallest]
-    except hypothesis.errors.DidNotReproduce:
-        pass
+    except Found:
+        rows = [*(one for one in rows if one["kind"] in GOOD), rows[-1]]
     return rows
 
 
 def attacked(target: Target, drawn: int, seed: int) -> list[Row]:
     """All named cases of a target, and some that are drawn."""
-    words = f"--match {f'{target.border} {target.name}:'!r}"
+    words = f"--match {f'{target.border} {target.name}:'!r} --drawn {drawn} --seed {seed}"
     rows = [row(case, judge(case), f"--match {f'{case.border} {case.name}'!r} --drawn 0") for case in target.named()]
     if drawn and not target.wrong.others.is_empty:
         rows += search(target.others(), drawn, seed, words)
@@ -202,7 +193,6 @@ class Fuzz:
     """where the inputs come in"""
     processes: int = 2  # that take cases side by side
     match: str = ""  # only cases that have this in their names
-    again: str = ""  # only the case of these letters, which a failure printed beside its ``--match``
     out: Path = RESULTS / "fuzz.json"
     smoke: bool = False  # a tiny run
 
@@ -215,10 +205,7 @@ class Fuzz:
         slow = {target.needs for target in targets if target.needs and not (sample and target.slow)}
         for needs in slow:
             needs()  # once for all
-        if self.again:
-            (target,) = targets
-            works = [lambda: search(target.others(), 1, self.seed, "", self.again)]
-        elif sample:
+        if sample:
             works = sampled(targets, sample, self.seed)
         else:
             works = [lambda target=target: attacked(target, self.drawn, self.seed) for target in targets]

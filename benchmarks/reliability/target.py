@@ -1,4 +1,4 @@
-"""What is attacked: things with arguments, things with files, and the damage that each of them can take."""
+"""Lists what is attacked: things with arguments, things with files, and the damage that each of them can take."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.case import SECONDS, Case
+from benchmarks.reliability.documents import FORMATS, Place, edited, places
 from torch_denkf._arguments import _signature
 
 Right = Callable[[Any], bool] | None  # whether a result is right; ``None`` where there may be none
@@ -67,7 +68,7 @@ class Target:
         return replace(self, wrong=d.Wrong(named, self.wrong.others))
 
     def named(self) -> list[Case]:
-        """Those that are always tried."""
+        """Returns those that are always tried."""
         return [self.case(one) for one in self.wrong.named.items()]
 
     def some(self) -> st.SearchStrategy[Case]:
@@ -94,15 +95,15 @@ class Folder:
     read: Callable[..., Any]
 
     def reference(self, **options: Any) -> Any:
-        """What is read without damage, once for all."""
+        """Returns what is read without damage, once for all."""
         return _reference(self, tuple(options.items()))
 
     def equal(self, result: Any, **options: Any) -> bool:
-        """Whether a result is that."""
+        """Tells whether a result is that."""
         return d.same(result, self.reference(**options))
 
     def damaged(self, change: d.Change, folder: Path, file: str = "", **options: Any) -> Any:
-        """What a user reads of a changed copy."""
+        """Returns what a user reads of a changed copy."""
         root = d.copied(self.sound(), folder)
         change(root / file)
         return self.read(root, **options)
@@ -124,8 +125,47 @@ class Folder:
         act = lambda change, folder: self.damaged(change, folder, file, **(options or {}))  # noqa: E731
         return Target(self.border, name, words, act, wrong, right, **{"needs": self.sound, **more})
 
+    def document(
+        self,
+        file: str,
+        right: Right,
+        words: tuple[str, ...] = (),
+        *,
+        skip: Callable[[Place], bool] = lambda place: False,
+        loose: Callable[[Place], bool] = lambda place: True,
+        then: Callable[[d.Change], d.Change] = lambda change: change,
+        but: tuple[str, ...] = (),
+        **more: Any,
+    ) -> Iterator[Target]:
+        """Targets whose wrong values are those of each place of a document.
+
+        Args:
+            file: the document.
+            right: whether a result is right, in a loose place.
+            words: of clear messages, beside the file's name and the place's.
+            skip: whether a place is left out.
+            loose: whether what stands in a place may be wrong without an error.
+            then: wraps a change of the file, as to adapt a checksum.
+            but: names of values that may be right.
+            **more: of the targets.
+        """
+        form, root = FORMATS[Path(file).suffix], self.sound()
+        for place, leaf in places(form.load(root / file)):
+            if not skip(place):
+                wrong = form.wrong(place, leaf).without(*but)
+                changes = wrong.each(lambda value, at=place: then(edited(d.put(at, value))))
+                named, name = tuple(map(str, place)), f"{root.name}/{file}"
+                yield self.target(
+                    f"{name}, {'/'.join(named)}",
+                    changes,
+                    right if loose(place) else None,
+                    (Path(file).name, *named, *words),
+                    file,
+                    **more,
+                )
+
     def arguments(self, name: str, **more: Any) -> Subject:
-        """What it is read with, as arguments of something by this name."""
+        """Returns what it is read with, as arguments of something by this name."""
         return Subject(lambda **given: self.read(self.sound(), **given), name=name, **more)
 
     def one(self, name: str, change: d.Change, words: str | tuple[str, ...], **more: Any) -> Target:

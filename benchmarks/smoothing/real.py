@@ -15,7 +15,6 @@ from benchmarks.common.arguments import made_by
 from benchmarks.common.tables import Columns, head, line, pick
 from benchmarks.smoothing import gaussian, linear
 from benchmarks.smoothing.gaussian import Series
-from benchmarks.smoothing.paths import paths
 from benchmarks.smoothing.recordings import Group, Task, tasks
 from torch_denkf.smoothers import EnKS, EnRTS, RTSSmoother
 
@@ -147,11 +146,10 @@ def correlation(error: Tensor, lag: int) -> Tensor:
 Jobs = dict[Path, Callable[[], list[dict]]]
 
 
-def jobs(root: Path | None, out: Path, smoke: bool) -> tuple[Jobs, Jobs]:
-    """What writes which file, each on its own: of the velocities and joints, and of the path."""
+def jobs(root: Path | None, out: Path, smoke: bool) -> Jobs:
+    """Returns what writes which file, each on its own."""
     made: Jobs = {}
     large: Jobs = {}
-    ways: Jobs = {}
     parts, readings = out / "parts", out / "readings"
     for make in tasks(root, out, smoke=smoke):
         task = make()
@@ -161,13 +159,10 @@ def jobs(root: Path | None, out: Path, smoke: bool) -> tuple[Jobs, Jobs]:
             job = partial(ensembles, make, place, readings, draws)
             (large if place else made)[parts / f"{task.name}-{members}.json"] = job
         made[parts / f"{task.name}-gaussian.json"] = partial(gaussians, make, readings, 2 if smoke else 60)
-        if task.name == "kitti":
-            ways[parts / "kitti-paths.json"] = partial(paths, make, readings)
-    return made | large, ways
-    return made, ways
+    return made | large
 
 
-def page(rows: Sequence[dict], ways: Sequence[dict]) -> str:
+def page(rows: Sequence[dict]) -> str:
     """Means over the recordings of each group."""
     lines = [
         "# Smoothers behind trained sensors",
@@ -191,11 +186,4 @@ def page(rows: Sequence[dict], ways: Sequence[dict]) -> str:
         own = pick(sensors, **dict(zip(keys, found, strict=False)))
         values = [fmean(row[key] for row in own) for key in COLUMNS.names[-3:]]
         lines.append(line(*found, f"{values[0]:.4f}", *(f"{value:.2f}" for value in values[1:])))
-    if ways:
-        lines += ["", "End point errors of a car's path over 100 steps, means over the drives.", ""]
-        methods = list(dict.fromkeys(row["method"] for row in ways))
-        lines += head("drives", *methods)
-        for group in dict.fromkeys(row["group"] for row in ways):
-            errors = [fmean(r["translation_m_per_m"] for r in pick(ways, group=group, method=m)) for m in methods]
-            lines.append(line(group, *(f"{error:.4f} m/m" for error in errors)))
     return "\n".join([*lines, "", *made_by("smoothing")]) + "\n"

@@ -12,7 +12,7 @@ from statistics import fmean
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.jobs import compute, read_rows
 from benchmarks.common.tables import Columns, head, line, pick, write_page
-from benchmarks.smoothing import against_dapper, ours, paths, real
+from benchmarks.smoothing import against_dapper, ours, real
 from benchmarks.smoothing.cases import CASES
 
 COLUMNS = Columns(
@@ -116,13 +116,11 @@ def main() -> None:
 
 def run_real(study: Study) -> None:
     """The part on recordings."""
-    jobs, ways = real.jobs(study.root, study.out, study.smoke)
-    compute({**jobs, **ways}, study.processes, "smoothing")
-    rows, way_rows = read_rows(jobs), read_rows(ways)
+    jobs = real.jobs(study.root, study.out, study.smoke)
+    compute(jobs, study.processes, "smoothing")
+    rows = read_rows(jobs)
     real.COLUMNS.write(rows, study.out / "smoothing_real.csv")
-    if way_rows:
-        paths.COLUMNS.write(way_rows, study.out / "smoothing_paths.csv")
-    write_page(real.page(rows, way_rows), study.out / "smoothing_real.md")
+    write_page(real.page(rows), study.out / "smoothing_real.md")
 
 
 def joined(rows: Sequence[dict]) -> list[dict]:

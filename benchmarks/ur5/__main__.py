@@ -10,7 +10,6 @@ from pathlib import Path
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import report
 from benchmarks.ur5.frontier import draw
-from benchmarks.ur5.limits import run
 from benchmarks.ur5.members import run as members
 from benchmarks.ur5.pictures import draw_all
 from benchmarks.ur5.study import Study, rows_of, run_all
@@ -18,7 +17,7 @@ from benchmarks.ur5.tables import COLUMNS, markdown
 from benchmarks.ur5.training import Budget
 
 # What reads a table's folder.
-AFTERWARDS = {"pictures": lambda study: draw_all(study.out), "frontier": draw, "limits": run, "members": members}
+AFTERWARDS = {"pictures": lambda study: draw_all(study.out), "frontier": draw, "members": members}
 
 
 def smoke(study: Study) -> Study:

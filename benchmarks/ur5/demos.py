@@ -82,7 +82,7 @@ class FramePool:
         return len(self.state)
 
     def shrunk(self, times: int) -> FramePool:
-        """The same frames with so many times fewer rows and columns, averaged."""
+        """Returns the same frames with so many times fewer rows and columns, averaged."""
         pool = object.__new__(FramePool)
         parts = [avg_pool2d(part.float(), times).round().to(torch.uint8) for part in self.pixels.split(512)]
         pool.pixels, pool.state = torch.cat(parts), self.state
@@ -124,7 +124,7 @@ class Roles:
 
 
 def _numbers(collections: Collections, name: str, split: str, end: int) -> list[int]:
-    """Of a collection's demos those of one side, below ``end``: the folder may hold more than the study asks for."""
+    """Returns those of a collection's demos of one side, below ``end``: the folder may hold more than is asked for."""
     return [episode.demo for episode in collections.replay(name, split).episodes if episode.demo < end]
 
 

@@ -77,7 +77,7 @@ def _rows(base: Base, name: str) -> Iterator[dict]:
 
 
 def _inflation(base: Base, recipe: UR5Recipe, sensor: ImageSensor, saved: dict) -> float:
-    """What a recipe's update wants, of the validation demos' coverage."""
+    """Chooses the inflation of a recipe's update, by the validation demos' coverage."""
     model = read_filter(recipe, recipe.build(), saved)
     readings = with_missing(read_all(sensor, base.codes("validation"), MEMBERS))
     return choose_for_coverage(

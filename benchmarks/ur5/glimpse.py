@@ -14,7 +14,7 @@ COARSE = 112  # pixels: the side of the picture that the first look gets
 
 
 def project(places: Tensor, look: Domain = SIM) -> Tensor:
-    """Where places ``[*, 3]`` are in a camera's picture: columns and rows ``[*, 2]`` from -1 (left, top) to 1.
+    """Projects places ``[*, 3]`` into a camera's picture: columns and rows ``[*, 2]`` from -1 (left, top) to 1.
 
     Only where the first looks go follows from it, so that roll and lens are left out.
     """

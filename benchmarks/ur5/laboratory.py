@@ -75,12 +75,12 @@ class Drawn:
 
 
 def without_arm(pixels: np.ndarray) -> np.ndarray:
-    """What is behind the arm, ``[H, W, 3]``: the median of frames ``[N, H, W, 3]``."""
+    """Returns what is behind the arm, ``[H, W, 3]``: the median of frames ``[N, H, W, 3]``."""
     return np.median(pixels, 0)
 
 
 def foreground(pixels: np.ndarray, behind: np.ndarray) -> np.ndarray:
-    """Where frames ``[N, H, W, 3]`` show something else, ``[N, H, W]`` 0 or 1; each may be brighter as a whole."""
+    """Marks where frames ``[N, H, W, 3]`` show something else, ``[N, H, W]`` 0 or 1; each may be brighter."""
     gain = np.median(pixels / np.maximum(behind, 1.0), axis=(1, 2, 3), keepdims=True)
     return (np.abs(pixels - gain * behind).max(-1) > DIFFERENT).astype(np.float32)
 

@@ -1,4 +1,4 @@
-"""How many members the DEnKF needs, without localisation, with factors on covariances, and with significance.
+"""Counts the members that the DEnKF needs: without localisation, with factors on covariances, with significance.
 
 Filters are trained once each, with few members, and tested with other numbers of members and other localisations.
 The validation demos choose the threshold; the factor on the noise stays that of the training.
@@ -85,7 +85,7 @@ def _rows(base: Base, trained: str, size: int) -> Iterator[dict]:
 
 
 def thresholds_of(kind: str, size: int) -> Sequence[float | None]:
-    """Those that so many members can show."""
+    """Returns the thresholds that so many members can show."""
     return [value for value in THRESHOLDS if value**2 < size - 1] if kind in KINDS[2:] else [None]
 
 

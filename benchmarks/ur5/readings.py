@@ -1,4 +1,4 @@
-"""What a sensor reads of whole sequences, with failing cameras; and windows of that.
+"""Reads whole sequences by a sensor, with failing cameras; and windows of that.
 
 A sensor's trunk is frozen when filters are trained. Its features of every frame are computed once, and its stochastic
 head runs on those: afterwards a filter, of any ensemble size, costs no pictures.
@@ -78,7 +78,7 @@ def read_head(
 
 @torch.no_grad()
 def read_all(sensor: ImageSensor, codes: TensorDict, size: int, seed: int = 0) -> TensorDict:
-    """The same for whole collections, a demo at a time, from the same random numbers each time."""
+    """Reads whole collections, a demo at a time, from the same random numbers each time."""
     generator = torch.Generator().manual_seed(seed)
     return torch.cat([read_head(sensor, part, size, generator) for part in codes.split(1)])
 
@@ -104,7 +104,7 @@ def with_missing(readings: TensorDict) -> TensorDict:
 
 
 def blackouts(count: int, steps: int, seed: int = 0) -> Tensor:
-    """Where the black frames begin, ``[count]``: some time after the start, and some before the end."""
+    """Draws where the black frames begin, ``[count]``: some time after the start, and some before the end."""
     margin = min(BLACK, max((steps - BLACK) // 3, 1))
     low, high = margin, max(steps - BLACK - margin, margin + 1)
     return torch.randint(low, high, (count,), generator=torch.Generator().manual_seed(seed))

@@ -31,7 +31,7 @@ JOINT_UNIT, PLACE_UNIT = 0.02, 0.0025
 
 
 class TurnedWrist(nn.Module):
-    """What the better sensor reads: J6 by twice its angle, and by the angle itself.
+    """Encodes what the better sensor reads: J6 by twice its angle, and by the angle itself.
 
     The fingers look the same after half a turn: a network that must name J6 itself hedges between two answers until it
     sees the label on one side of the hand. Half of (cos, sin) of 2 J6 has one answer, and turns by one radian a radian.
@@ -81,7 +81,7 @@ class Statistics:
 
     @classmethod
     def of(cls, states: Tensor, pool: FramePool) -> Statistics:
-        """Of sequences ``[N, T, 10]`` and of pictures."""
+        """Takes statistics of sequences ``[N, T, 10]`` and of pictures."""
         flat = states.flatten(0, -2)
         changes = (states[..., :7].diff(dim=-2, n=order) for order in (1, 2, 3))
         pixels = pool.pixels[:: max(len(pool) // 500, 1)].float() / 255
@@ -96,7 +96,7 @@ class Statistics:
 
 
 def _near(reading: Tensor, near: Tensor | None = None) -> Tensor:
-    """Of a sensor that reads J6 itself."""
+    """Encodes what a sensor reads that reads J6 itself."""
     return reading[..., WRIST] if near is None else near
 
 
@@ -134,7 +134,7 @@ def keypoint_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
 
 
 def glimpse_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
-    """The same with a second look at the gripper. Flipout learns how large its noise is; dropout's is what it is."""
+    """Builds one with a second look at the gripper. Flipout learns how large its noise is; dropout's is what it is."""
     head = {"num_cells": (128, 64), "layer": "flipout"}
     return _sensor(facts, GlimpseTrunk(keypoint_trunk(), facts.size), samples, *_moments(facts), **head)
 
@@ -214,7 +214,7 @@ class NearForecast(SubModel):
 
 
 def disturb(frames: TensorDict, generator: torch.Generator, times: int = 1) -> TensorDict:
-    """What a camera does to training frames: a third get salt and pepper, a third another exposure.
+    """Disturbs training frames as a camera does: a third get salt and pepper, a third another exposure.
 
     Args:
         frames: with pixels.

@@ -40,12 +40,11 @@ class Study(Collections):
     """A UR5 that one camera watches: joints, gripper and end effector, with every filter that is registered.
 
     collect: demos into --root. table: collect what is missing, train, test. pictures: videos and plots of what a table
-    left in --out. frontier: error against milliseconds a step of the filters that a table left there. limits: how far
-    simple filters get on its sensors' readings. members: DEnKFs that are trained with few members, by localisation.
-    What was broken off goes on where it stopped. See the README beside.
+    left in --out. frontier: error against milliseconds a step of the filters that a table left there. members: DEnKFs
+    that are trained with few members, by localisation. What was broken off goes on where it stopped. See the README.
     """
 
-    command: Positional[Literal["collect", "table", "pictures", "frontier", "limits", "members"]] = "table"
+    command: Positional[Literal["collect", "table", "pictures", "frontier", "members"]] = "table"
     filters: some_of(sorted(FILTERS)) = tuple(sorted(FILTERS))
     sensors: some_of(sorted(SENSORS)) = ("glimpse", "paper")
     trainings: some_of(TRAININGS) = TRAININGS
@@ -60,7 +59,7 @@ class Study(Collections):
 
 
 class Base:
-    """What all filters of a sensor, a training and a seed share: sensor, statistics, motions, features of demos.
+    """Holds what all filters of a sensor, a training and a seed share: sensor, statistics, motions, features of demos.
 
     Args:
         study: the study.
@@ -124,7 +123,7 @@ class Base:
         return sensor, facts
 
     def folder(self, kind: str) -> Path:
-        """Of the sensor of a kind with this training and seed."""
+        """Returns the folder of the sensor of a kind with this training and seed."""
         return self.study.out / "sensors" / f"{self.training}-{kind}-{self.seed}"
 
     def _pasted(self, pool: FramePool) -> tuple[FramePool, Domain]:
@@ -178,7 +177,7 @@ class Base:
         return recipe, model, out
 
     def readings(self, sensor: ImageSensor, domain: str) -> dict[str, TensorDict]:
-        """What a sensor reads of the test demos, in all conditions."""
+        """Returns what a sensor reads of the test demos, in all conditions."""
         clean, salted = (self.codes("test", condition, domain) for condition in ("clean", "salt_and_pepper"))
         return conditions_of(read_all(sensor, clean, MEMBERS), read_all(sensor, salted, MEMBERS))
 
@@ -221,7 +220,7 @@ def run_jobs(
 
 
 def members_of(name: str) -> int:
-    """How many members a filter has in the table."""
+    """Returns how many members a filter has in the table."""
     return MEMBERS if name == "denkf" else 1
 
 

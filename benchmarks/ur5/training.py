@@ -20,7 +20,7 @@ from benchmarks.ur5.sensors import unit_of
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.training import Stage
-from torch_denkf.training.parts import parameters_without
+from torch_denkf.training.stage import parameters_without
 
 INFLATIONS = (0.75, 0.85, 1.0, 1.15, 1.3, 1.5, 1.75, 2.0, 2.4)
 KEPT = (("belief", "mean"), ("belief", "var"), ("belief", "ensemble"), "state", "observed")

@@ -1,1 +1,1 @@
-"""How many members does an ensemble with fast sensors need?"""
+"""A simulated robot on wheels, which the study of members and tests of motions share."""

@@ -1,4 +1,4 @@
-"""What only the Backprop KF has: a learned sensor with a learned R in front of a linear system, learned as well."""
+"""Tests what only the Backprop KF has: a learned sensor with a learned R in front of a learned linear system."""
 
 import torch
 from tensordict import TensorDict

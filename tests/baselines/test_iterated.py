@@ -46,7 +46,7 @@ def linear(size, *, noise=None, initial=None, **kwargs):
 
 @pytest.mark.parametrize("iterations", [1, 4])
 def test_without_process_noise_it_is_the_kalman_smoother(float64, iterations):
-    """Of a linear system one iteration is the ETKF, and further ones change nothing."""
+    """Equals the ETKF after one iteration of a linear system, and further ones change nothing."""
     etkf = linear_denkf("etkf")
     frames = drive(3, 7)
     expected = FixedLag(etkf, 1).sequence(frames.copy())

@@ -1,4 +1,4 @@
-"""What the studies share: options, jobs that are done once, rows that survive their file."""
+"""Tests what the studies share: options, jobs that are done once, rows that survive their file."""
 
 from functools import partial
 

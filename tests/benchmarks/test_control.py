@@ -81,7 +81,7 @@ def test_a_memory_is_the_same_in_steps_and_in_slices(arm):
 
 
 def test_advantages_and_targets_are_those_of_a_constant_critic():
-    """Where values are c, each step is worth f r + (gamma - 1) c, and those to come fade by gamma lambda.
+    """Compares with a closed form: each step is worth f r + (gamma - 1) c, and those to come fade by gamma lambda.
 
     The end of an episode is a time limit: what comes after it is worth c, too.
     """

@@ -1,4 +1,4 @@
-"""How the study's filters learn from readings, against the exact filter and closed forms."""
+"""Compares the filters that the study learns from readings with the exact filter and closed forms."""
 
 import math
 

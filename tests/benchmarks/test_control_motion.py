@@ -1,4 +1,4 @@
-"""How a cart starts and when its episode ends, and the motion of the filter that learns it, by hand."""
+"""Compares with values by hand: how a cart starts, when its episode ends, and the motion that its filter learns."""
 
 import math
 

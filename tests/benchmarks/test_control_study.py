@@ -1,4 +1,4 @@
-"""What a run of the study is made of, who may see what, and which runs the tables are of."""
+"""Tests the parts of a run of the study, who may see what, and which runs the tables are of."""
 
 import time
 

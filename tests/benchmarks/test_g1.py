@@ -1,4 +1,4 @@
-"""The parts of the G1 study that a wrong table could come from: roles, cameras, baselines, scores, tables."""
+"""The parts of the G1 study that a wrong table could come from: roles and scores."""
 
 import math
 
@@ -6,24 +6,20 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from benchmarks.g1.baselines import smoothed
 from benchmarks.g1.motion import with_rates
-from benchmarks.g1.recordings import Recordings, Roles, drawn_recording
+from benchmarks.g1.recordings import JOINTS, Recordings, Roles, drawn_recording
 from benchmarks.g1.scores import scores
-from benchmarks.g1.targets import ARM
 from torch_denkf.data import LeRobotReplay
 
 COUNT, STEPS, MEMBERS, FEATURES = 4, 60, 8, 5
 
 
-def readings(error=0.0, target=ARM, spread=0.01):
+def readings(error=0.0, spread=0.01):
     """A sensor that is wrong by ``error`` everywhere, of sines."""
     generator = torch.Generator().manual_seed(0)
-    phase = torch.rand(COUNT, 1, target.size, generator=generator)
+    phase = torch.rand(COUNT, 1, JOINTS, generator=generator)
     truth = (torch.arange(STEPS).view(1, -1, 1) / 10 + 6.3 * phase).sin()
-    samples = (
-        truth.unsqueeze(-2) + error + spread * torch.randn(COUNT, STEPS, MEMBERS, target.size, generator=generator)
-    )
+    samples = truth.unsqueeze(-2) + error + spread * torch.randn(COUNT, STEPS, MEMBERS, JOINTS, generator=generator)
     seen = torch.ones(COUNT, STEPS, 1, dtype=torch.bool)
     encoding = torch.randn(COUNT, STEPS, FEATURES, generator=generator)
     out = TensorDict(
@@ -56,26 +52,6 @@ def test_no_episode_has_two_roles(tmp_path):
     assert first.sensor != second.sensor
 
 
-# Cameras --------------------------------------------------------------------------------------------------------------
-
-
-# Motion and filters ---------------------------------------------------------------------------------------------------
-
-
-# Baselines ------------------------------------------------------------------------------------------------------------
-
-
-def test_exponential_filter_against_its_closed_form():
-    reading = torch.zeros(1, 6, 1)
-    reading[:, 0] = 1.0  # taken as it is; then zeros: 0.7^t
-    seen = torch.ones(1, 6, 1, dtype=torch.bool)
-    out = smoothed(reading, seen, torch.full((1,), 5.0), 0.3)
-    torch.testing.assert_close(out.flatten(), 0.7 ** torch.arange(6.0))
-    seen[:, [0, 3]] = False
-    out = smoothed(reading, seen, torch.full((1,), 5.0), 0.3)
-    assert out.flatten().tolist() == [5.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-
-
 # Scores and tables ----------------------------------------------------------------------------------------------------
 
 
@@ -84,8 +60,8 @@ def test_scores_leave_out_what_does_not_count():
     clean["valid"][1:, 30:] = False
     mean = clean["state"] + torch.tensor([0.01] * 6 + [0.08])
     mean[:, 0], mean[2, 40:] = 99.0, 99.0
-    row = scores(ARM, mean, torch.full_like(mean, 0.03**2), clean)
+    row = scores(mean, torch.full_like(mean, 0.03**2), clean)
     assert row["joint_mae_deg"] == pytest.approx(math.degrees(0.02), rel=1e-4)
-    assert row["n7"] == pytest.approx(math.degrees(0.08), rel=1e-4)
+    assert row["wrist_yaw_deg"] == pytest.approx(math.degrees(0.08), rel=1e-4)
     assert row["coverage90"] == pytest.approx(6 / 7)  # 0.08 is outside of 1.645 x 0.03
-    assert row["cover_n7"] == 0.0
+    assert row["wrist_yaw_coverage90"] == 0.0

@@ -1,4 +1,4 @@
-"""What the pair with dynamax compares is the same on both sides; needs the packages of ``[bench]``."""
+"""Compares the two sides of the pair with dynamax; needs the packages of ``[bench]``."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What losses, smoothers, cars, replays and saved folders refuse: the message names the argument and has its value."""
+"""Arguments of cars, replays and saved folders: the message names the argument and has its value."""
 
 import hashlib
 import json
@@ -12,17 +12,14 @@ from tensordict import TensorDict
 from benchmarks.common.lorenz96 import lorenz96_step
 from tests.borders.test_constructors import NAN, refuses
 from tests.filters.factories import linear_denkf, linear_kalman
-from tests.filters.particle_for_tests import bootstrap
 from torch_denkf.applications.car.kitti.gaps import bridge_gaps
 from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
 from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.applications.car.odometry.training import train_car_filter
 from torch_denkf.applications.reacher import reacher
 from torch_denkf.deployment.folder import WEIGHTS, described, load_folder, save_folder
-from torch_denkf.modules import LearnedTransition, NoisyTransition
-from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, TransitionLoss
+from torch_denkf.objectives import GaussianLoss, TransitionLoss
 from torch_denkf.pretrained import from_pretrained, save_pretrained
-from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
 
 INF = math.inf
 
@@ -33,40 +30,12 @@ def scored(make, **options):
     return loss(TensorDict({"observation": torch.zeros(2, 3, 2), "state": torch.zeros(2, 3, 2)}, [2, 3]))
 
 
-def ensemble_loss(**options):
-    return DEnKFLoss(linear_denkf("etkf"), sensor=0.0, **options)
-
-
 def gaussian_loss(**options):
     return GaussianLoss(linear_kalman(), sensor=0.0, **options)
 
 
-def mixture_loss(**options):
-    return MixtureLoss(bootstrap(8, resampling="soft"), **options)
-
-
 def one_step(**options):
     return TransitionLoss(linear_denkf("etkf"), **options)
-
-
-LOSSES = [
-    *[(make, {"state_scale": [1.0] * 3}, "3 entries", "2 dimensions") for make in (ensemble_loss, gaussian_loss)],
-    *[(make, {"state_scale": [1.0] * 3}, "3 entries", "2 dimensions") for make in (mixture_loss, one_step)],
-    (gaussian_loss, {"state_scale": torch.ones(2, 3)}, "one number a dimension", "[2, 3]"),
-    (gaussian_loss, {"state_scale": [1.0, INF, 1.0]}, "3 entries"),
-    (gaussian_loss, {"dims": [0, 2]}, "[0, 2]", "has 2"),
-    (mixture_loss, {"dims": [5]}, "[5]", "has 2"),
-    (mixture_loss, {"component_std": INF}, "got inf"),
-    (one_step, {"spread": INF}, "got inf"),
-    (one_step, {"members": 0}, "got 0"),
-    (one_step, {"members": 1}, "got 1", "mse"),
-]
-
-
-@pytest.mark.parametrize("case", LOSSES, ids=lambda case: f"{case[0].__name__}-{case[1]}")
-def test_losses(case):
-    make, options, *words = case
-    refuses(lambda: scored(make, **options), *options, *words)
 
 
 def test_a_scale_of_one_number_and_one_member_for_the_mean_pass():
@@ -75,13 +44,7 @@ def test_a_scale_of_one_number_and_one_member_for_the_mean_pass():
     assert scored(one_step, members=1, score="mse")["loss_transition"].isfinite()
 
 
-STILL = LearnedTransition(torch.nn.Linear(2, 2))
-NOISE = linear_denkf("etkf")["noise"]
 REFUSED = {
-    "a dimension twice": (lambda: NoisyTransition(STILL, NOISE, [0, 0]), "dims", "[0, 0]"),
-    "lag": (lambda: RTSSmoother(linear_kalman(), -1), "lag", "got -1"),
-    "no lag": (lambda: FixedLag(linear_kalman(), 0), "lag", "got 0"),
-    "damping": (lambda: EnRTS(linear_denkf("etkf"), damping=1.5), "damping", "got 1.5"),
     "gaps": (lambda: bridge_gaps(TensorDict({}), 0), "longest", "got 0"),
     "step": (lambda: lorenz96_step(torch.zeros(4), dt=-0.05), "dt", "got -0.05"),
     "step nan": (lambda: lorenz96_step(torch.zeros(4), dt=NAN), "dt", "got nan"),
@@ -89,9 +52,6 @@ REFUSED = {
     "no root": (lambda: train_car_filter("out", rendered=3, leave_out=["09"]), "{'leave_out': ['09']}", "--root"),
 }
 WRONG_TYPES = {
-    "lag": (lambda: RTSSmoother(linear_kalman(), 1.5), "lag", "1.5"),
-    "lag, text": (lambda: EnKS(linear_denkf("etkf"), "x"), "lag", "'x'"),
-    "filter": (lambda: FixedLag(None, 2), "filter", "None"),
     "gaps": (lambda: bridge_gaps(TensorDict({}), 1.5), "longest", "1.5"),
     "settings": (lambda: car_filter(colour="red"), "colour", "dt"),
     "a number for a name": (lambda: from_pretrained(3), "name_or_folder", "3"),

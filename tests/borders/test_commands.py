@@ -1,4 +1,4 @@
-"""What commands refuse of words and files: the message names the option or the file."""
+"""Checks the words and files of commands: the message names the option or the file."""
 
 import pytest
 

@@ -92,6 +92,7 @@ def test_version_3(tmp_path):
     refuses(tmp_path, "file-000.parquet", "lists episode 1 twice")
     for key, value, words in (
         ("data/file_index", None, ["row with gaps"]),
+        ("videos/observation.images.top/file_index", 0.5, ["gaps or fractions", "0.5"]),
         ("length", -3, ["length in", "got -3"]),
         ("videos/observation.images.top/from_timestamp", float("nan"), ["from_timestamp of episode 1", "got nan"]),
     ):
@@ -101,6 +102,16 @@ def test_version_3(tmp_path):
     parquet.write_table(table, file)
     write_info(tmp_path, "v3.0", True, "mkv", video_path="../../{video_key}-{chunk_index}-{file_index}")
     refuses(tmp_path, INFO, "'video_path'", "outside of the data set")
+
+
+def test_columns_of_another_kind(root):
+    """Names that are no list are none; pictures are dictionaries of bytes or a path."""
+    info = json.loads((root / INFO).read_text())
+    info["features"]["action"]["names"] = 3
+    (root / INFO).write_text(json.dumps(info))
+    assert open_all(root)[:]["action"].shape == (16, 2)
+    edit_table(root / DATA, **{"observation.images.top": pa.array(["x"] * ROWS)})
+    refuses(root, "'observation.images.top' of episode 0", "no pictures", "'x'")
 
 
 def set_stamps(root, stamps):

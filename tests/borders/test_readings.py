@@ -7,17 +7,15 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import ExcludeTransform, TransformedEnv
 
-from tests.filters.factories import M, S, linear_denkf, linear_kalman, linear_system, toy_denkf
-from tests.filters.gaussian_for_tests import linear_filter
+from tests.filters.factories import M, S, linear_denkf, linear_system, toy_denkf
+from tests.filters.test_contract import FILTERS as CONTRACT
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf import RejectReadings
-from torch_denkf.baselines import LSTMFilter
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter, ParticleFilter
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
     FromSensor,
-    GaussianLikelihood,
     GaussianPrior,
     LearnedLikelihood,
     LearnedTransition,
@@ -34,32 +32,17 @@ REJECTED = ("info", "rejected")
 BAD = [float("nan"), float("inf"), -float("inf"), 1e25, -2e18]
 
 
-def particles(scheme, **kwargs):
-    likelihood = GaussianLikelihood(observation_key="observation")
-    return ParticleFilter(
-        LearnedTransition(StochasticMLP(2, 2, (8,))),
-        None,
-        LinearObservation(torch.eye(2)),
-        likelihood,
-        noise=ConstantNoise([0.5, 0.3], in_key="observation"),
-        initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=16),
-        resampling=scheme,
-        **kwargs,
-    )
-
-
-def learned_particles(**kwargs):
+def learned_particles():
     return ParticleFilter(
         LearnedTransition(StochasticMLP(S, S, (8,))),
         VectorSensor(M, 2, ensemble_size=1, num_cells=(8,), layer="none"),
         Select([0, 1]),
         LearnedLikelihood(2, 2, num_cells=(8,), encoding_key=("sensor", "ensemble")),
         initial=GaussianPrior([0.0] * S, [1.0] * S, ensemble_size=16),
-        **kwargs,
     )
 
 
-def local(**kwargs):
+def local():
     return DEnKF(
         transition=LearnedTransition(StochasticMLP(2, 2, (8,))),
         sensor=None,
@@ -69,7 +52,6 @@ def local(**kwargs):
             torch.tensor([[0.0], [1.0]]), torch.tensor([[0.0], [1.0]]), 1.0, observation_key="observation"
         ),
         initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=16),
-        **kwargs,
     )
 
 
@@ -78,36 +60,21 @@ def from_sensor(**kwargs):
     return linear_denkf("etkf", initial=start, **kwargs)
 
 
+ONE = ("Kalman", "EKF", "UKF", "Backprop KF", "DEnKF etkf", "DEnKF perturbed", "DEnKF sakov", "LSTM")
+ONE += tuple(f"particles, {scheme}" for scheme in ("systematic", "soft", "transport"))
 #: Filters by name, the entry that they read, and whether its components are hidden one by one.
-FILTERS = {
-    "Kalman": (linear_kalman, "observation", True),
-    "EKF": (lambda **kwargs: linear_filter("EKF", **kwargs), "observation", True),
-    "UKF": (lambda **kwargs: linear_filter("UKF", **kwargs), "observation", True),
-    "BackpropKF": (lambda **kwargs: linear_filter("BackpropKF", **kwargs), "observation", True),
-    "etkf": (lambda **kwargs: linear_denkf("etkf", **kwargs), "observation", True),
-    "perturbed": (lambda **kwargs: linear_denkf("perturbed", noisy=True, **kwargs), "observation", True),
-    "sakov": (lambda **kwargs: linear_denkf("sakov", **kwargs), "observation", True),
+FILTERS = {name: (CONTRACT[name], "observation", True) for name in ONE} | {
     "local": (local, "observation", True),
-    "sensor": (lambda **kwargs: toy_denkf(action=False, **kwargs), "measurement", False),
-    "systematic": (lambda **kwargs: particles("systematic", **kwargs), "observation", True),
-    "soft": (lambda **kwargs: particles("soft", **kwargs), "observation", True),
-    "transport": (lambda **kwargs: particles("transport", **kwargs), "observation", True),
+    "sensor": (lambda: toy_denkf(action=False), "measurement", False),
     "learned likelihood": (learned_particles, "measurement", False),
-    "LSTM": (
-        lambda **kwargs: LSTMFilter(
-            None, state_dim=2, observation_key="observation", observation_dim=2, hidden_size=6, **kwargs
-        ),
-        "observation",
-        True,
-    ),
 }
 ALL = pytest.mark.parametrize("name", FILTERS)
 
 
-def make(name, **options) -> Filter:
-    """The same weights each time."""
+def make(name) -> Filter:
+    """Makes a filter with the same weights each time."""
     torch.manual_seed(7)
-    return FILTERS[name][0](**options)
+    return FILTERS[name][0]()
 
 
 def frames_of(name, *batch, value=float("nan"), masked=False):
@@ -173,7 +140,7 @@ def test_a_bad_reading_raises_with_the_key(name, value):
     assert filter.step(check(td))["belief", "mean"].isfinite().all()
 
 
-@pytest.mark.parametrize("name", ["Kalman", "etkf", "systematic"])
+@pytest.mark.parametrize("name", ["Kalman", "DEnKF etkf", "particles, systematic"])
 def test_readings_that_no_step_uses_may_be_anything(name):
     """Left out of a step, or of a reset that does not look at them."""
     _, key, _ = FILTERS[name]

@@ -44,6 +44,7 @@ LINES = {
     "rows 0": ({"rows": 0}, f"{MANIFEST}:2", "rows must be", "got 0"),
     "rows a float": ({"rows": 8.5}, f"{MANIFEST}:2", "rows must be", "8.5"),
     "above": ({"file": "../demo-000001.npz"}, f"{MANIFEST}:2", "../demo-000001.npz"),
+    "a zero byte": ({"file": "demo\0.npz"}, f"{MANIFEST}:2", "outside of its folder"),
     "twice": ({"demo": 0}, f"{MANIFEST}:2", "demo 0 is listed in another line"),
 }
 

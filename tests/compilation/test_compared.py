@@ -1,4 +1,4 @@
-"""What a compiler gets wrong is refused; what rounding does is not."""
+"""Raises for what a compiler gets wrong, and not for what rounding does."""
 
 import re
 
@@ -74,7 +74,7 @@ def rows_of_a_jacobian(state):
 @pytest.mark.slow
 @pytest.mark.skipif(VERSION >= (2, 15), reason="right in torch 2.15; Select avoids it for torch 2.13")
 def test_torch_still_adds_up_the_rows_of_a_jacobian_of_index_select():
-    """Where torch 2.13 is no longer supported, `Select` may use index_select again, and this test may go."""
+    """Tells when torch 2.13 is no longer supported: then `Select` may use index_select again, and this test may go."""
     state = torch.zeros(4)
     assert rows_of_a_jacobian(state).equal(torch.eye(4)[:2])
     found = torch.compile(rows_of_a_jacobian)(state)
@@ -98,7 +98,7 @@ def ekf():
 
 
 def fused():
-    """The same numbers forget each step what they were, and are anew with a variance of .1."""
+    """Makes numbers that forget each step what they were, and are drawn again with a variance of .1."""
     motion = LinearTransition(0.0 * torch.eye(4), 0.1 * torch.eye(4))
     sensor = FusedSensor(Select([0, 1]), [0.5, 0.5], observation_key="observation")
     return FusedFilter(motion, {"gps": sensor}, initial=MomentPrior(torch.zeros(4), torch.eye(4)))

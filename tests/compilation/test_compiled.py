@@ -67,7 +67,7 @@ def test_inductor_gives_the_eager_sequence_and_gradients_for_a_seed(dtype):
 
 @pytest.mark.skipif(not has_compiler(), reason="a compiler is asked for, and dynamo alone is in its place")
 def test_what_changes_after_compiling_is_noticed(monkeypatch):
-    """Of what torch.compile checks before a call some is left out; not that."""
+    """Leaves out some of what torch.compile checks before a call, and not that."""
     compile = torch.compile
 
     def traced(function, *, options, **others):

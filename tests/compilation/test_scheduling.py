@@ -1,4 +1,4 @@
-"""How loops are bundled into functions: short ones, which all steps share; the oracle is the same function, eager."""
+"""Tests how loops are bundled into functions: short ones, which all steps share; the oracle is the eager function."""
 
 import pytest
 import torch

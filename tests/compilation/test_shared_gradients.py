@@ -9,7 +9,7 @@ from torch_denkf.compilation.shared_gradients import shared, sharing
 
 
 class Chain(nn.Module):
-    """The same layers in each step, on what the step before left."""
+    """Applies the same layers in each step, on what the step before left."""
 
     def __init__(self):
         super().__init__()

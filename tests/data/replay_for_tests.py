@@ -1,4 +1,4 @@
-"""What tests of the data sets share: ways to ask for slices, what holds for them, and a bar that counts."""
+"""Holds what tests of the data sets share: ways to ask for slices, what holds for them, and a bar that counts."""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""What all data sets share: shapes of samples, splits, options; and what filters make of their samples."""
+"""Tests what all data sets share: shapes of samples, splits, options; and what filters make of their samples."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from torchrl.data import SliceSampler
 
 import torch_denkf
 import torch_denkf.data
-from tests.data.replay_for_tests import check_contract, check_slices, ways_to_slice
+from tests.data.replay_for_tests import check_contract, check_slices, check_statistics, ways_to_slice
 from torch_denkf.applications.car import write_drives
 from torch_denkf.data import Episode, EpisodeReplay, LeRobotReplay
 from torch_denkf.data.episodes import hashed_share
@@ -37,6 +37,36 @@ def test_a_split_keeps_the_contract():
     assert [e.name for e in data.episodes] == ["run1", "run2", "run3", "run5", "run6", "run7", "run8", "run9"]
     assert data[:]["state"][:, 0].unique_consecutive().tolist() == [1, 2, 3, 5, 6, 7, 8, 9]
     assert data.root is None
+
+
+def test_rollouts_are_episodes_with_statistics_of_all_that_was_seen():
+    """What a mask hides, pictures and readings, counts nowhere; the rows are the root's."""
+    shape = [4, ROWS]
+    seen, read = torch.rand(*shape, 1) < 0.5, torch.rand(*shape, 1) < 0.5
+    root = TensorDict({"state": torch.randn(*shape, 2), "action": torch.randn(*shape, 1).double()}, shape)
+    root["pixels"] = torch.randint(256, (*shape, 3, 4, 4), dtype=torch.uint8) * seen[..., None, None]
+    root["encoder"], root["observed"], root["encoder_observed"] = torch.randn(*shape, 2) * read, seen, read
+    done = (torch.arange(ROWS) == ROWS - 1).reshape(1, ROWS, 1).expand(*shape, 1)
+    rollouts = root.copy().set("next", root.roll(-1, 1)).set(("next", "done"), done).set("done", torch.zeros_like(done))
+    data = EpisodeReplay.from_rollouts(rollouts, 0.1, split="all", num_slices=2, slice_len=5)
+    check_contract(data)
+    assert data[:]["state"].equal(root["state"].flatten(0, 1))
+    assert data[:]["pixels"].equal(root["pixels"].flatten(0, 1) / 255)
+    numbers = {key: root[key].float().flatten(0, 1).numpy() for key in ("state", "action")}
+    numbers["encoder"] = root["encoder"][read.squeeze(-1)].numpy()
+    check_statistics(data.statistics, **numbers)
+    pixels = root["pixels"][seen.squeeze(-1)].double() / 255
+    torch.testing.assert_close(data.statistics["pixels", "mean"].flatten().double(), pixels.mean((0, 2, 3)))
+    assert sorted(data.statistics.keys()) == ["action", "encoder", "pixels", "state"]
+    held = EpisodeReplay.from_rollouts(rollouts, 0.1, split="validation", validation_share=0.5)
+    assert {episode.name for episode in held.episodes} == {
+        str(k) for k in range(4) if hashed_share(str(k), "validation") < 0.5
+    }
+    with pytest.raises(ValueError, match="ends before its last row"):
+        EpisodeReplay.from_rollouts(rollouts.roll(1, 1), 0.1)
+    for strange in (root["pixels"] / 255, root["pixels"].movedim(2, -1)):
+        with pytest.raises(ValueError, match=r"uint8 \[T, C, H, W\]"):
+            EpisodeReplay.from_rollouts(rollouts.set("pixels", strange), 0.1)
 
 
 # Samples --------------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What is said of an ensemble that is too narrow for its readings."""
+"""Tests the warning of an ensemble that is too narrow for its readings."""
 
 import warnings
 
@@ -16,7 +16,7 @@ STEP, NOISE, STEPS = 0.3, 0.1, 80
 
 
 def walk_filter(process_noise, members=32, **options):
-    """Of two walks, both of which are read."""
+    """Filters two walks, both of which are read."""
     return DEnKF(
         LearnedTransition(nn.Identity(), residual=False),
         None,

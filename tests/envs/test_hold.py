@@ -15,7 +15,7 @@ def held_env(**kwargs):
 
 
 def by_hand(data):
-    """What is held in data ``[B, T]``, row by row and step by step; an episode begins where its step is 0."""
+    """Returns what is held in data ``[B, T]``, row by row and step by step; an episode begins where its step is 0."""
     held = torch.zeros_like(data["observation"])
     for row in range(data.shape[0]):
         last = torch.zeros_like(held[0, 0])

@@ -165,7 +165,7 @@ def linear_denkf(scheme="etkf", *, ensemble_size=6, noisy=False, control=None, i
 
 
 def believing(threshold, **kwargs):
-    """The same, which believes the covariances that are significant."""
+    """Makes a filter that localises by significance."""
     analysis = EnsembleAnalysis("etkf", observation_key="observation", localisation="significance", threshold=threshold)
     return linear_denkf(**kwargs).with_modules(analysis=analysis)
 
@@ -190,7 +190,7 @@ def assert_equal(first, second, keys, *, atol=0.0):
 
 
 def stepwise(filter, frames):
-    """The same as ``filter.sequence(frames)``, by single steps as in an environment."""
+    """Takes single steps as in an environment; equals ``filter.sequence(frames)``."""
     time = frames.ndim - 1
     rows, out = frames.unbind(time), []
     for t, row in enumerate(rows):
@@ -216,7 +216,7 @@ def make_dyadic(module):
 
 
 def has_compiler():
-    """Whether inductor finds a C++ compiler."""
+    """Tells if inductor finds a C++ compiler."""
     try:
         need_compiler()
     except RuntimeError:

@@ -1,4 +1,4 @@
-"""What the tests of EKF, UKF and Backprop KF share: one linear system in all of them, and one that is not linear."""
+"""Holds what the tests of EKF, UKF and Backprop KF share: one linear system in all, and one that is not linear."""
 
 import torch
 from tensordict import TensorDict

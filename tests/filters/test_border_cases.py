@@ -1,4 +1,4 @@
-"""What a user meets at the border: stored beliefs, groups, no rows, outputs on request, guards, frame skips."""
+"""Tests borders that a user meets: stored beliefs, groups, no rows, outputs on request, guards, frame skips."""
 
 import pytest
 import torch

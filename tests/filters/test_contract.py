@@ -1,4 +1,4 @@
-"""What every filter promises, whatever its belief: one table of filters, one list of promises.
+"""Tests what every filter promises, whatever its belief: one table of filters, one list of promises.
 
 The oracles are the filter's own: another way to compute the same, which must agree. That the numbers are right is
 shown in each filter's own file, against a Kalman filter.

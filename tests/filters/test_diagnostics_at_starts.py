@@ -1,4 +1,4 @@
-"""What stands beside a belief that starts: zeros, or the update's own where the start is updated."""
+"""Tests diagnostics next to a belief that resets: zeros, or the update's own where the reset is updated."""
 
 import pytest
 import torch

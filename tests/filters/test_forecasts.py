@@ -1,4 +1,4 @@
-"""Which entry is the forecast of which, and modules that undo each other."""
+"""Tests which entry is the forecast of which, and modules that undo each other."""
 
 import pytest
 import torch

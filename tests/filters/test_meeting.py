@@ -1,4 +1,4 @@
-"""Where two features meet: actions and noise, marks and stored beliefs, divergence and gradients, groups, readings."""
+"""Tests where two features meet: actions and noise, marks and stored beliefs, divergence and gradients, groups."""
 
 import pytest
 import torch

@@ -54,7 +54,7 @@ def test_a_step_without_a_frame_is_the_forecast(float64, make):
 
 @pytest.mark.parametrize("observed", [None, True])
 def test_a_prediction_does_not_resample_and_leaves_the_mask_alone(float64, observed):
-    """Where there is no frame, particles and weights go on as they are, whatever the mask of the last frame said."""
+    """Keeps particles and weights as they are where there is no frame, whatever the mask of the last frame said."""
     filter, (F, *_) = bootstrap(50, noisy=False), linear_system()
     td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
     td["belief", "log_weight"] = torch.randn(50).log_softmax(-1)

@@ -1,4 +1,4 @@
-"""How large the noise is that a filter draws in bulk, and what happens where nothing says so."""
+"""Tests the size of the noise that a filter draws in bulk, and what happens where nothing says so."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What a filter writes is its own memory, and what it was given is copied."""
+"""Tests that what a filter writes is its own memory, and that what it was given is copied."""
 
 import pytest
 import torch

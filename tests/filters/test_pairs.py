@@ -186,7 +186,7 @@ def weighted(readings, noise, mean, cov):
 
 
 def run(way, filter, frames, start=None, tmp_path=None):
-    """What the filter writes on ``[ROWS, T]``; from a stored belief, if there is one: that of the first element."""
+    """Runs the filter on ``[ROWS, T]``; from a stored belief, if there is one: that of the first element."""
     if way in ("sequence", "compiled"):
         if way == "compiled":
             filter.compile(chunk=2, backend="eager")

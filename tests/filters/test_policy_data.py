@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def policy_data(filter, *, anew=()):
-    """What a filter in a policy leaves on ``[2, 7]``: the belief before each step; and what each step gives."""
+    """Returns a policy's data ``[2, 7]``: the belief before each step; and what each step gives."""
     frames, rows, steps = TensorDict({"observation": torch.randn(2, 7, 2)}, [2, 7]), [], []
     belief = filter.step(filter.initialise(frames[:, 0].copy()).update(frames[:, 0]))
     for t in range(7):

@@ -25,7 +25,7 @@ def named(name, prefix="imu"):
 
 
 def moved(frames, prefix="imu"):
-    """The same frames, the noise under the prefix."""
+    """Copies the frames, with the noise under the prefix."""
     out = frames.copy()
     if out.get("noise", None) is not None:
         out[prefix] = TensorDict({"noise": out.pop("noise")}, out.batch_size)

@@ -1,4 +1,4 @@
-"""What holds of filters for any batch, precision, scale, order of members and unit."""
+"""Tests filters for any batch, precision, scale, order of members and unit."""
 
 import torch
 from hypothesis import given

@@ -44,7 +44,7 @@ def camera(*front, observed_key="observed", initial=None):
 
 
 class Count(SubModel):
-    """How many frames came, in an entry of its own."""
+    """Counts frames in an entry of its own."""
 
     def __init__(self):
         super().__init__(nn.Identity(), ["flat", "count"], ["count"])

@@ -113,7 +113,7 @@ def turned(turn, value):
 
 
 def turned_beliefs(filter, turn, data):
-    """What a filter believes of data, and what of the same in a world that is turned."""
+    """Filters data, and the same data in a world that is turned."""
     other = data.clone()
     for key in ("start", "pose"):
         other[key] = turned(turn, data[key])

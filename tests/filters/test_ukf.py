@@ -1,4 +1,4 @@
-"""What only the UKF has: parameters of its points, and covariances without full rank. The rest is in ``test_ekf``."""
+"""Tests what only the UKF has: parameters of its points, and covariances without full rank; see ``test_ekf``."""
 
 import pytest
 import torch

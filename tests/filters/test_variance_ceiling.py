@@ -1,4 +1,4 @@
-"""What a variance ceiling holds, and what it leaves alone. Oracles: closed forms, and the filter without a ceiling."""
+"""Tests what a variance ceiling clamps. Oracles: closed forms, and the filter without a ceiling."""
 
 import warnings
 

@@ -482,7 +482,7 @@ def test_the_length_of_a_readings_quaternion_does_not_matter(space):
 
 @pytest.mark.parametrize("space", [SO3(), SE2(), SE3(), Opposite(SE3()), Product(SE2(), Euclidean(2)), Flat(3, [1])])
 def test_a_mask_is_narrowed_to_whole_rotations_and_vectors(space):
-    """Where a mask hides one number, none that it mixes with is told; what is told does not depend on it."""
+    """Says nothing of numbers that a hidden number mixes with; what is told does not depend on it."""
     for hidden in range(space.tangent_dim):
         observed = torch.arange(space.tangent_dim) != hidden
         points, tangents = space.told(observed)

@@ -35,7 +35,7 @@ def kalman_filter():
 
 
 def ensemble_filter(size, seed):
-    """The same quantities of REPEATS independent filters: [REPEATS, STEPS, 3 + 6 + 1]."""
+    """Returns the same quantities of REPEATS independent filters: [REPEATS, STEPS, 3 + 6 + 1]."""
     generator = torch.Generator().manual_seed(seed)
 
     def randn(dim):

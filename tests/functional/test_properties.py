@@ -1,4 +1,4 @@
-"""What holds of the mathematics for any shape, precision, scale, order of members and unit."""
+"""Tests the mathematics for any shape, precision, scale, order of members and unit."""
 
 import math
 

@@ -90,7 +90,7 @@ def test_rows_are_resampled_by_themselves(scheme, batch):
 
 
 def counts_of(picked, particles):
-    """How often each of the particles was picked, ``[N, E]``."""
+    """Counts how often each of the particles was picked, ``[N, E]``."""
     return (picked.unsqueeze(-2) == particles.unsqueeze(-3)).all(-1).sum(-2)
 
 

@@ -6,14 +6,19 @@ from tensordict import TensorDict
 from torchrl.envs import RenameTransform, TransformedEnv, check_env_specs
 from torchrl.modules.utils import get_env_transforms_from_module
 
+from tests.data.lerobot.lerobot_folder import actions, joints, write_version_2
 from tests.filters.factories import assert_equal, linear_system, toy_denkf
 from tests.objectives.test_kept_noise import log_ratio, make_policy, toy_fused, toy_particles
 from tests.transforms.envs_for_tests import toy_base_env
 from torch_denkf import DEnKF, DEnKFTransform, KalmanFilter, LinearGaussianEnv
+from torch_denkf.data import LeRobotReplay
 from torch_denkf.envs import LateActions
+from torch_denkf.functional.manifolds import SE2, SE3
 from torch_denkf.fusion import BeliefAhead, FusedFilter, FusedSensor
 from torch_denkf.modules import (
+    AroundState,
     ConstantNoise,
+    GaussianAround,
     GaussianPrior,
     LearnedTransition,
     LinearObservation,
@@ -21,6 +26,8 @@ from torch_denkf.modules import (
     MomentPrior,
     Select,
 )
+from torch_denkf.motions import ConstantTwist
+from torch_denkf.motions.readings import PoseOf
 
 pytestmark = pytest.mark.usefixtures("float64")
 
@@ -123,6 +130,62 @@ def test_a_transition_that_knows_the_length_of_its_step(seconds):
     now = filter.initialise({"dt": [0.04], "observation": [0.0]})
     out = BeliefAhead(filter, seconds, dt=0.1, dt_key="dt")(now)
     torch.testing.assert_close(out["ahead", "belief", "mean"], out["belief", "mean"] + 2 * seconds)
+
+
+@pytest.mark.parametrize("space", [SE2(), SE3()], ids=["SE2", "SE3"])
+@pytest.mark.parametrize("start", [GaussianAround, AroundState], ids=["moments", "ensemble"])
+def test_a_pose_goes_on_along_its_screw(space, start):
+    """At a constant twist the pose is x exp(k dt xi), and its tangent J^k P J^kT, J by finite differences."""
+    dt, D = 0.1, space.tangent_dim
+    motion = ConstantTwist(space, dt)
+    options = {} if start is GaussianAround else {"ensemble_size": 4 * D + 1}
+    initial = start([1e-4] * 2 * D, space=motion.space, **options)
+    sensor = FusedSensor(PoseOf(motion.space), [0.1] * D, reading_space=space)
+    filter = FusedFilter(motion, {"pose": sensor}, initial=initial, process_noise=[0.0] * 2 * D)
+    pose = space.exp(0.7 * torch.randn(2, D))
+    state = torch.cat([pose, torch.randn(2, D)], -1)
+    now = filter.initialise(TensorDict({"state": state, "pose": pose}, [2]))
+    out = BeliefAhead(filter, K, each=True)(now)
+    mean, twist = out["belief", "mean"], out["belief", "mean"][..., -D:]
+    for k in range(K):
+        expected = torch.cat([space.plus(mean[..., :-D], (k + 1) * dt * twist), twist], -1)
+        found = out["ahead", "belief", "mean"][:, k]
+        assert motion.space.distance(found, expected).max() < 1e-6
+
+    def moved(tangent):
+        one = motion.space.plus(mean[0], tangent)
+        return torch.cat([space.plus(one[:-D], K * dt * one[-D:]), one[-D:]])
+
+    base, steps = moved(torch.zeros(2 * D)), 1e-6 * torch.eye(2 * D)
+    J = torch.stack([motion.space.minus(moved(step), base) for step in steps], -1) / 1e-6
+    wide = (J @ J.mT).diagonal() * 1e-8
+    tolerance = 1e-3 if start is GaussianAround else 0.02
+    torch.testing.assert_close(out["ahead", "belief", "var"][0, -1], wide, rtol=tolerance, atol=0)
+
+
+def test_a_recorded_chunk_runs_after_the_inference_delay(tmp_path):
+    """The joints go half of the way to their command; a policy's chunk runs from two rows after its picture on."""
+    pytest.importorskip("pyarrow")
+    write_version_2(tmp_path, [9] * 5)
+    data = LeRobotReplay(tmp_path, dims=[0, 1], size=(8, 8), cache=None, split="all", num_slices=2, slice_len=9)
+    rows = torch.stack([data[9 * number : 9 * number + 9] for number in (0, 1)])
+    one = torch.eye(2)
+    start = {"mean": torch.zeros(2), "cov": one}
+    filter = KalmanFilter(0.5 * one, one, process_noise=[0.1] * 2, noise=[1e-6] * 2, control=0.5 * one, **start)
+    commands = rows["action"].unfold(1, K, 1).mT  # of rows t, t + 1 and t + 2
+    rows = TensorDict({key: rows[key][:, : 9 - K + 1].double() for key in ("state", "action")}, [2, 9 - K + 1])
+    rows = rows.update({"observation": rows["state"], NEXT: commands.double()})
+    out = filter.sequence(rows)
+    found = BeliefAhead(filter, K, each=True)(out.copy())["ahead", "belief", "mean"]
+    for episode in (0, 1):
+        by_hand = joints(episode, 9)[:, :2].astype("float64")
+        for t in range(1, 9 - K + 1):
+            state = by_hand[t]
+            for k in range(K):
+                state = 0.5 * state + 0.5 * actions(episode, 9)[t + k]
+                torch.testing.assert_close(found[episode, t, k], torch.from_numpy(state), rtol=0, atol=1e-5)
+    late = BeliefAhead(filter, "delay", most=K)(out.set("delay", torch.full((2, 9 - K + 1, 1), 2)))
+    torch.testing.assert_close(late["ahead", "belief", "mean"], found[:, :, 1])
 
 
 def late_world(filter, **transform):

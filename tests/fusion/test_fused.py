@@ -220,7 +220,7 @@ def moved_and_read(steps, late, reading, *, mean, cov, noise):
 @pytest.mark.parametrize("update_at_reset", [False, True])
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
 def test_a_late_reading_is_of_the_step_it_says_or_of_none(float64, kind, update_at_reset):
-    """Of every step of the episode; not of one before, not of one to come, not of one beyond the lag."""
+    """Draws every step of the episode; not one before, not one to come, not one beyond the lag."""
     members, (F, Q, _, _) = torch.randn(7, 2), linear_system()
     if kind == "Kalman":
         motion, initial = LinearTransition(F, Q), MomentPrior(torch.tensor([1.0, -1.0]), torch.diag(torch.rand(2)))
@@ -622,7 +622,7 @@ def test_errors_that_last_in_an_ensemble(float64):
 
 
 def test_each_component_of_a_reading_has_its_own_error(float64):
-    """Of the second sensor, behind the error of the first: one Kalman filter of all three readings is the oracle."""
+    """Puts the second sensor behind the error of the first: one Kalman filter of all three readings is the oracle."""
     F, Q, H, _ = linear_system()
     h, r, start = torch.cat([H[:1], H]), torch.tensor([0.5, 0.7, 0.9]), (torch.ones(2), torch.eye(2))
     errors = [FadingBias(*given, trainable=False) for given in (([0.8], 6.0), ([1.5, 0.4], [20.0, 2.0]))]

@@ -44,7 +44,7 @@ def fused(kind, parts, std, q, r, *, space=None, reading_space=None, **sensor):
 
 
 def orientations(kind, **sensor):
-    """Of the log of orientations."""
+    """Reads the log of orientations."""
     parts = Turning(), None, Orientation()
     return fused(kind, parts, STD, Q, R, space=SPACE, reading_space=SO3(), **sensor)
 

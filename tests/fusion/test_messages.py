@@ -92,7 +92,7 @@ def test_start(float64):
 
 
 def test_what_drives_is_the_mean_since_the_row_before(float64):
-    """Of a parabola that is sampled finely: its integral. Beyond the samples it stays."""
+    """Integrates a parabola that is sampled finely: its integral. Beyond the samples it stays."""
     stamps = np.linspace(1.0, 3.0, 2001)
     log = [(stamp, "imu", [stamp**2, 1.0]) for stamp in stamps] + [(stamp, "gps", [0.0]) for stamp in (0.5, 3.5)]
     log += [(2.0003, "imu", [np.nan, 0.0])]

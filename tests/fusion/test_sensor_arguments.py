@@ -1,4 +1,4 @@
-"""What a sensor of several is told, and what it refuses."""
+"""Tests what a sensor of several is told, and what it raises."""
 
 from __future__ import annotations
 

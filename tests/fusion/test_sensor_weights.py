@@ -27,7 +27,7 @@ from torch_denkf.smoothers import FixedLag
 
 
 class Constant(nn.Module):
-    """The same weights everywhere; keeps what it was given."""
+    """Sets the same weights everywhere; keeps what it was given."""
 
     def __init__(self, *weights):
         super().__init__()

@@ -154,7 +154,7 @@ def of_losses() -> dict[str, list[float]]:
 
 
 def of_monitors() -> dict[str, list[float]]:
-    """What watches innovations, and what answers to them."""
+    """Watches innovations, and answers to them."""
     torch.manual_seed(10)
     data = TensorDict({"observation": torch.randn(2, 9, 2)}, [2, 9])
     data["observation"][:, 5] += 6.0
@@ -181,7 +181,7 @@ def of_weights() -> dict[str, list[float]]:
 
 
 def of_studies() -> dict[str, list[float]]:
-    """What studies compute on their smoke settings, by their own code; those named so in single precision."""
+    """Computes the studies' smoke settings by their own code; those named so in single precision."""
     before = torch.get_default_dtype()
     try:
         found = {**of_chaotic_systems(), **of_fusion_and_odometry()}

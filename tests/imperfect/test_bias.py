@@ -75,7 +75,7 @@ START = [0.1, 0.1, *STD]
 
 
 def beside_the_oracle(filter):
-    """What a filter makes of the readings, and the means and covariances that are right."""
+    """Returns what a filter makes of the readings, and the means and covariances that are right."""
     readings = simulate()[1]
     out = filter.sequence(TensorDict({"reading": torch.tensor(readings).unsqueeze(-1)}, [STEPS]))
     return out, *map(torch.tensor, augmented_kalman_filter(readings, START))

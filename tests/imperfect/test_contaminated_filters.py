@@ -6,14 +6,10 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torch.testing import assert_close
-from torchrl.envs import TransformedEnv
 
 from tests.filters import test_spaces as spaces
-from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import FixedEnsemble, linear_denkf, linear_kalman, linear_system
-from tests.imperfect.test_visible_filters import CERTAIN, KINDS, MAKERS, certain, frames
-from torch_denkf import DEnKFTransform
-from torch_denkf.deployment import export_step, load_step
+from tests.imperfect.test_visible_filters import CERTAIN, KINDS, MAKERS, certain, contaminated, frames
 from torch_denkf.functional.manifolds import SO3
 from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
 from torch_denkf.imperfect import Contaminated
@@ -28,63 +24,6 @@ from torch_denkf.modules import (
 )
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss
 from torch_denkf.smoothers import EnRTS, FixedLag, RTSSmoother
-
-
-def contaminated(filter, share="visible", **options):
-    """The filter, whose readings are wrong in the share that an entry says."""
-    return filter.with_modules(analysis=Contaminated(filter["analysis"], share, **options))
-
-
-@pytest.mark.parametrize("name", MAKERS)
-def test_steps_are_the_sequence_and_the_compiled_sequence(float64, name):
-    divergence = 0.0 if name == "particles" else 0.1
-    filter, td = contaminated(MAKERS[name](), width=4.0, divergence=divergence), frames(2, 6)
-    filter.draw_noise(td)
-    whole, belief = filter.sequence(td.copy()), None
-    share = whole["info", "outlier"]
-    assert ((share > 0) & (share < 1)).any()
-    for t in range(6):
-        row = td[:, t].copy()
-        out = filter.initialise(row) if belief is None else filter.step(row.update(belief))
-        belief = out.select(*filter.belief_keys)
-        for key in filter.belief_keys:
-            assert_close(belief[key], whole[key][:, t], rtol=0, atol=1e-12)
-    compiled = filter.compile(chunk=2, backend="eager").sequence(td.copy())
-    for key in filter.out_keys:
-        assert_close(compiled[key], whole[key], rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ["etkf", "Kalman", "EKF"])
-def test_a_start_in_the_middle_is_a_start(float64, name):
-    filter, td = contaminated(MAKERS[name]()), frames(2, 8)
-    td["is_init"][:, 5] = True
-    whole, late = filter.sequence(td.copy()), filter.sequence(td[:, 5:].copy())
-    for key in filter.belief_keys:
-        assert_close(whole[key][:, 5:], late[key], rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ["etkf", "Kalman"])
-def test_it_goes_through_an_environment(float64, name):
-    filter, td = contaminated(MAKERS[name]()), frames(2, 6)
-    td["action"] = torch.zeros(2, 6, 1)
-    env = TransformedEnv(ReplayedFrames(td), DEnKFTransform(contaminated(MAKERS[name]())))
-    out = env.rollout(5, auto_reset=True)["next"]
-    whole = filter.sequence(td.copy())
-    for key in (("belief", "mean"), ("belief", "var")):
-        assert_close(out[key], whole[key][:, 1:], rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ["etkf", "Kalman"])
-def test_a_packaged_step_is_the_step(name, tmp_path):
-    filter, td = contaminated(MAKERS[name](), 0.3, width=4.0), frames(4).exclude("is_init", "visible")
-    row = filter.initialise(td[0])
-    step = load_step(export_step(filter, row, tmp_path / "step.pt2", compiled=False))
-    row = filter.draw_noise(row.select(*filter.carry_keys).update(td[1]))
-    with torch.no_grad():
-        found = step({key: row[tuple(key.split("."))] for key in step.inputs})
-        out = filter.step(row)
-    for key, value in found.items():
-        assert_close(value, out[tuple(key.split("."))], rtol=1e-5, atol=1e-5, equal_nan=True)
 
 
 @pytest.mark.parametrize("name", CERTAIN)

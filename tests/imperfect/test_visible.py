@@ -237,7 +237,7 @@ def test_p_of_one_and_of_zero(name, dtype):
 
 @pytest.mark.parametrize("name", [*SEVERAL, "particles"])
 def test_masks_are_heeded(name):
-    """Where nothing is observed the forecast stays bit for bit, whatever p; NaN spoils neither value nor gradient."""
+    """Keeps the forecast bit for bit where nothing is observed, whatever p; NaN spoils neither value nor gradient."""
     likelihood = GaussianLikelihood(observation_key=KEY)
     inner = ParticleAnalysis(likelihood) if name == "particles" else SEVERAL[name]()
     update = TensorDictSequential(*([likelihood] if name == "particles" else []), Visible(inner))

@@ -16,7 +16,7 @@ from tests.filters.particle_for_tests import bootstrap
 from torch_denkf import EKF, UKF, DEnKF, DEnKFTransform, ParticleFilter
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.fusion import FusedFilter, FusedSensor
-from torch_denkf.imperfect import Visibility, Visible
+from torch_denkf.imperfect import Contaminated, Visibility, Visible
 from torch_denkf.imperfect.mixture import mix_moments
 from torch_denkf.modules import (
     DiagonalNoise,
@@ -52,6 +52,16 @@ def heeds(filter):
     return filter.with_modules(analysis=Visible(filter["analysis"], visible_key="visible"))
 
 
+def contaminated(filter, share="visible", **options):
+    """The filter, whose readings are wrong in the share that an entry says."""
+    return filter.with_modules(analysis=Contaminated(filter["analysis"], share, **options))
+
+
+#: What a filter's analysis is wrapped in, by the share that it writes.
+WRAPPED = {"visible": heeds, "outlier": contaminated}
+BOTH = pytest.mark.parametrize("share", WRAPPED)
+
+
 def frames(*batch):
     """Readings, masks, starts and p."""
     torch.manual_seed(0)
@@ -63,13 +73,14 @@ def frames(*batch):
     return td
 
 
+@BOTH
 @pytest.mark.parametrize("name", MAKERS)
-def test_steps_are_the_sequence_and_the_compiled_sequence(float64, name):
-    filter, td = heeds(MAKERS[name]()), frames(2, 6)
+def test_steps_are_the_sequence_and_the_compiled_sequence(float64, name, share):
+    options = {"width": 4.0, "divergence": 0.1 * (name != "particles")} if share == "outlier" else {}
+    filter, td = WRAPPED[share](MAKERS[name](), **options), frames(2, 6)
     filter.draw_noise(td)
     whole, belief = filter.sequence(td.copy()), None
-    share = whole["info", "visible"]
-    assert ((share > 0) & (share < 1)).any()
+    assert ((whole["info", share] > 0) & (whole["info", share] < 1)).any()
     for t in range(6):
         row = td[:, t].copy()
         out = filter.initialise(row) if belief is None else filter.step(row.update(belief))
@@ -81,30 +92,36 @@ def test_steps_are_the_sequence_and_the_compiled_sequence(float64, name):
         assert_close(compiled[key], whole[key], rtol=0, atol=1e-12)
 
 
+@BOTH
 @pytest.mark.parametrize("name", ["etkf", "Kalman", "EKF"])
-def test_a_start_in_the_middle_is_a_start(float64, name):
-    filter, td = heeds(MAKERS[name]()), frames(2, 8)
+def test_a_start_in_the_middle_is_a_start(float64, name, share):
+    filter, td = WRAPPED[share](MAKERS[name]()), frames(2, 8)
     td["is_init"][:, 5] = True
     whole, late = filter.sequence(td.copy()), filter.sequence(td[:, 5:].copy())
     for key in filter.belief_keys:
         assert_close(whole[key][:, 5:], late[key], rtol=0, atol=1e-12)
 
 
+@BOTH
 @pytest.mark.parametrize("name", ["etkf", "Kalman"])
-def test_it_goes_through_an_environment(float64, name):
-    filter, td = heeds(MAKERS[name]()), frames(2, 6)
+def test_it_goes_through_an_environment(float64, name, share):
+    filter, td = WRAPPED[share](MAKERS[name]()), frames(2, 6)
     td["action"] = torch.zeros(2, 6, 1)
-    env = TransformedEnv(ReplayedFrames(td), DEnKFTransform(heeds(MAKERS[name]())))
+    env = TransformedEnv(ReplayedFrames(td), DEnKFTransform(WRAPPED[share](MAKERS[name]())))
     out = env.rollout(5, auto_reset=True)["next"]
     whole = filter.sequence(td.copy())
     for key in (("belief", "mean"), ("belief", "var")):
         assert_close(out[key], whole[key][:, 1:], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["etkf", "EKF", "UKF"])
-def test_a_packaged_step_is_the_step(name, tmp_path):
-    filter, td = heeds(MAKERS[name]()), frames(4)
-    td = td.exclude("is_init")
+@pytest.mark.parametrize(
+    ("share", "name"),
+    [("visible", "etkf"), ("visible", "EKF"), ("visible", "UKF"), ("outlier", "etkf"), ("outlier", "Kalman")],
+)
+def test_a_packaged_step_is_the_step(name, share, tmp_path):
+    options = {"share": 0.3, "width": 4.0} if share == "outlier" else {}
+    filter, td = WRAPPED[share](MAKERS[name](), **options), frames(4).exclude("is_init")
+    td = td.exclude("visible") if options else td
     row = filter.initialise(td[0])
     step = load_step(export_step(filter, row, tmp_path / "step.pt2", compiled=False))
     row = filter.draw_noise(row.select(*filter.carry_keys).update(td[1]))

@@ -97,7 +97,7 @@ def test_a_scaled_innovation_is_a_scaled_shift_of_the_mean():
 
 
 def test_entries_that_are_aligned_go_through_the_wrapper_all_the_same():
-    """What aligns in front of a wrapper, and hands on what it made, gets what the wrapper makes, and not the inside."""
+    """Aligns in front of a wrapper, hands on what it made, and gets what the wrapper makes, and not the inside."""
     around = ScaledInnovation(EnsembleAnalysis("etkf", reading_space=Euclidean(1) * Circle()), 0.5)
     td = frame()
     td["forecast", "observation"][..., 1] += torch.pi

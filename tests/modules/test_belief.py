@@ -14,7 +14,7 @@ BATCHES = [(), (3,), (2, 3)]
 
 
 def assert_moments(td, mean, std):
-    """Of the ensemble drawn, within five standard errors; mean and var are those of the ensemble."""
+    """Draws an ensemble whose moments are right within five standard errors; mean and var are those of the ensemble."""
     ensemble = td["belief", "ensemble"]
     mean, std = mean.expand(ensemble[..., 0, :].shape), std.expand(ensemble[..., 0, :].shape)
     torch.testing.assert_close(td["belief", "mean"], ensemble.mean(-2), rtol=0, atol=1e-12)

@@ -161,7 +161,7 @@ def test_seven_members_follow_forty_variables(float64):
 
 
 def test_gradients_equal_finite_differences(float64):
-    """Of the error after three steps with respect to log R, through the module and the dynamics."""
+    """Differentiates the error after three steps by log R, through the module and the dynamics."""
     run, filter = lorenz_run(6, batch=2, steps=3), lorenz_filter(6, members=4, trainable=True)
     run["noise", "initial"] = torch.randn(2, 3, 4, 6)
     run = filter.draw_noise(run)

@@ -22,7 +22,7 @@ def random_points(space, *shape):
 
 
 def frame(motion, *batch, still=False):
-    """What drives a motion."""
+    """Returns what drives a motion."""
     actions = ACTIONS.get(type(motion), {})
     return {key: torch.zeros(*batch, n) if still else torch.randn(*batch, n) for key, n in actions.items()}
 

@@ -47,7 +47,7 @@ def test_a_circle_at_constant_speed():
 
 @pytest.mark.parametrize("turn", [1e-9, 1e-3, 0.09, 0.11, 1.0, 5.0])
 def test_turn_and_its_integrals_are_a_matrix_exponential(turn):
-    """Of [[w, f, 0], [0, 0, 1], [0, 0, 0]]: its last two columns hold the integrals of the turn, times f."""
+    """Exponentiates [[w, f, 0], [0, 0, 1], [0, 0, 0]]: its last two columns hold the integrals of the turn, times f."""
     rate, force = turn * torch.nn.functional.normalize(torch.randn(3), dim=0), torch.randn(3)
     generator = torch.zeros(5, 5)
     generator[:3, :3], generator[:3, 3], generator[3, 4] = skew(rate), force, 1.0
@@ -144,7 +144,7 @@ BODY = """
 
 
 def simulate(seconds, timestep, place="0 0 0", turn="1 0 0 0"):
-    """What the sensors read before each of many steps, [N, 6], and the poses [N, 10], of a body that is pushed."""
+    """Returns the readings before each of many steps, [N, 6], and the poses [N, 10], of a body that is pushed."""
     model = mujoco.MjModel.from_xml_string(BODY.format(timestep=timestep, place=place, turn=turn))
     data = mujoco.MjData(model)
     data.qvel[:] = [0.5, -0.3, 0.2, 1.0, -2.0, 0.7]

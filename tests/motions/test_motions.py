@@ -1,4 +1,4 @@
-"""What all motions must do: precision, batches, Jacobians, one graph, shapes that are named; and their noise."""
+"""Tests all motions: precision, batches, Jacobians, one graph, shapes that are named; and their noise."""
 
 import math
 

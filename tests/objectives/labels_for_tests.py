@@ -84,6 +84,6 @@ def gaps():
 
 
 def normal_crps(mean, std, y):
-    """Of a Gaussian, by scipy."""
+    """Scores a Gaussian by scipy."""
     z = (y - mean) / std
     return std * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - math.pi**-0.5)

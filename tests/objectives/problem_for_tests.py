@@ -1,4 +1,4 @@
-"""What tests of objectives start from: frames with the truth, weights of one term, what counts, and training."""
+"""Holds what tests of objectives start from: frames with the truth, weights of one term, what counts, and training."""
 
 import torch
 

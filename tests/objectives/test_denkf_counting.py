@@ -1,4 +1,4 @@
-"""Which elements count: masks, starts, padding; and how terms are reduced."""
+"""Tests which elements count: masks, resets, padding; and how terms are reduced."""
 
 import pytest
 import torch

@@ -33,7 +33,7 @@ def gradients(value, module):
 
 
 def agree(value, expected, module, **close):
-    """The same number and the same gradient."""
+    """Compares the number and the gradient."""
     torch.testing.assert_close(value, expected, **(close or {"rtol": 1e-10, "atol": 1e-12}))
     for got, due in zip(gradients(value, module), gradients(expected, module), strict=True):
         assert got.isfinite().all()

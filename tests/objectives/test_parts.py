@@ -67,7 +67,7 @@ def test_the_sensor_alone_is_the_term_of_the_whole(score):
 
 
 def test_another_sensor_and_its_readings_need_not_be_there():
-    """Of two sensors one is trained, with its noise model; the other one's reading is missing."""
+    """Trains one of two sensors, with its noise model; the other one's reading is missing."""
     first, second = (
         VectorSensor(3, OBS, ensemble_size=4, in_key="a"),
         VectorSensor(3, OBS, in_key="b", out_key="b_read"),

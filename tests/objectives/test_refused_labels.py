@@ -1,4 +1,4 @@
-"""What a loss cannot score is refused by name: labels of another shape, another kind of belief, what is no key."""
+"""Names what a loss cannot score: labels of another shape, another kind of belief, what is no key."""
 
 from functools import partial
 

@@ -1,4 +1,4 @@
-"""What the transition gets where the state before is the true one; oracle: a transition that repeats it."""
+"""Tests what the transition gets where the state before is the true one; oracle: a transition that repeats it."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What is said where an extra is missing, and that pyplot is left alone."""
+"""Tests the error where an extra is missing, and that pyplot is left alone."""
 
 import sys
 

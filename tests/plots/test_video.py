@@ -51,7 +51,7 @@ def test_frames_come_back(tmp_path, ending):
 
 
 def blue(frame):
-    """Where a band or a line of the belief is."""
+    """Finds a band or a line of the belief."""
     return frame[..., 2].astype(int) - frame[..., 0] > 30
 
 

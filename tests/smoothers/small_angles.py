@@ -23,7 +23,7 @@ def rotating():
 
 
 def linear():
-    """The same of plain numbers."""
+    """Returns the same of plain numbers."""
     move = nn.Linear(6, 6, bias=False)
     move.weight.data = torch.eye(6)
     move.weight.data[:3, 3:] = -DT * torch.eye(3)

@@ -1,4 +1,4 @@
-"""What smoothers do at borders: of episodes, of masks, of the batch, of what they can be made of."""
+"""Tests smoothers at borders: of episodes, of masks, of the batch, of what they can be made of."""
 
 from functools import partial
 

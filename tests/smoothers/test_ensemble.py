@@ -79,7 +79,7 @@ def test_members_with_the_exact_moments_give_the_exact_means(float64):
 
 @pytest.mark.parametrize("scheme", ["sensor", "perturbed", "etkf", "sakov"])
 def test_step_by_step_is_the_recording(float64, scheme):
-    """What FixedLag says at t + lag is what EnKS says of t; at the end of an episode, what is there by then."""
+    """Equals EnKS at t what FixedLag says at t + lag; at the end of an episode, what is there by then."""
     filter, lag = toy_denkf(scheme), 3
     frames = toy_frames([2, 9], resets=False)
     frames["is_init"] = torch.zeros(2, 9, 1, dtype=torch.bool)

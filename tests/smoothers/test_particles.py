@@ -59,7 +59,7 @@ def test_ancestors_of_many_particles_say_the_same_later(float64):
 
 
 def fewest(out, size):
-    """How many particles counted at least, in each row."""
+    """Returns the least effective number of particles in each row."""
     ess = out["info", "ess"]
     return torch.where(ess > 0, ess, size).amin(1, keepdim=True)  # 0 at a start
 

@@ -23,7 +23,7 @@ def test_what_was_written_is_read(file):
 
 
 def test_equal_content_gives_equal_bytes(tmp_path):
-    """Of texts that are one object here, and two equal ones there; likewise of a list."""
+    """Writes texts that are one object here, and two equal ones there; likewise lists."""
     word, shared = "learning", [1, 2]
     equal = "".join(["lear", "ning"])
     assert equal is not word

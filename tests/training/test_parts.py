@@ -38,7 +38,7 @@ def test_a_part_is_trained_once_and_then_read(tmp_path):
 
 
 def test_a_training_that_was_broken_off_ends_as_an_unbroken_one(tmp_path):
-    """Of 20 updates 8 are saved when the training fails in the 11th."""
+    """Saves 8 of 20 updates when the training fails in the 11th."""
     results = {}
     for name in ("whole", "broken"):
         torch.manual_seed(0)

@@ -1,4 +1,4 @@
-"""What ``torchrun`` starts in test_distributed: trains, and leaves the first gradient and the last parameters."""
+"""Runs what ``torchrun`` starts in test_distributed: trains, and leaves the first gradient and the last parameters."""
 
 import sys
 from pathlib import Path

@@ -19,7 +19,7 @@ def forked_env(workers, *args, **kwargs):
 
 
 class Changed(Transform):
-    """What a function makes of each frame, that of a reset and those of steps."""
+    """Returns what a function makes of each frame, that of a reset and those of steps."""
 
     def __init__(self, change):
         super().__init__()

@@ -13,7 +13,7 @@ from torch_denkf.transforms import DEnKFTransform
 
 
 def one_step(env, filter, without=()):
-    """What a step of ``env`` gives the filter, as an example to export from."""
+    """Returns what a step of ``env`` gives the filter, as an example to export from."""
     filtered = TransformedEnv(env, DEnKFTransform(filter))
     start = filtered.rand_action(filtered.reset())
     example = filtered.step(start)["next"].select(*(key for key in ("observation", "observed") if key not in without))
@@ -38,7 +38,7 @@ def packages(tmp_path_factory):
 
 
 def envs(packages, name, **options):
-    """The same environment with and without the package."""
+    """Makes the same environment with and without the package."""
     filter, path, make_env, batch = packages[name]
     length = [4, 6, 30] if batch else 4
     out = []

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, Unpack, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,10 +16,11 @@ from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.envs.transforms import Transform
 
-from torch_denkf.data.episodes import ROW, Episode, check_rows, roles_of, rows_of, select_episodes
+from torch_denkf.data.episodes import ROW, Episode, check_rows, hashed_tests, roles_of, rows_of, select_episodes
 from torch_denkf.data.options import ReplayOptions, check_options
+from torch_denkf.data.pictures import float_pictures
 from torch_denkf.data.slices import check_episode_lengths, choose_sampler, slices_of
-from torch_denkf.data.statistics import mean_and_std
+from torch_denkf.data.statistics import mean_and_std, picture_statistics
 
 __all__ = ["EpisodeReplay"]
 
@@ -113,6 +114,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     #: Readings whose statistics are numbers of the rows.
     _numbers: Sequence[str] = ("state", "action")
+    _stored: Tensor | None = None  # pictures of rollouts, uint8 ``[N, C, H, W]``
 
     def __init__(
         self,
@@ -158,6 +160,57 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         )
         if transform is not None:
             self.append_transform(transform)
+
+    @classmethod
+    def from_rollouts(
+        cls, rollouts: Iterable[TensorDictBase], dt: float, *, test_share: float = 0.0, **options: Unpack[ReplayOptions]
+    ) -> EpisodeReplay:
+        """Returns a data set of what environments showed, with statistics of all its numbers and of its pictures.
+
+        The rows are those of the root, each with the action that leads to the next one.
+
+        Args:
+            rollouts: ``[T]`` each, one episode; a batch of them ``[B, T]`` will do.
+            dt: seconds of a step.
+            test_share: share of the episodes that are for tests, by a hash of their numbers.
+            **options: of the class.
+
+        Raises:
+            ValueError: if an episode ends within a rollout, or ``"pixels"`` are not uint8 ``[T, C, H, W]``.
+
+        Example:
+            >>> from torch_denkf.envs import NoisyPendulumEnv
+            >>> rollouts = NoisyPendulumEnv(noise=0.1, batch_size=[3]).rollout(20)
+            >>> data = EpisodeReplay.from_rollouts(rollouts, dt=0.05, num_slices=4, slice_len=5)
+            >>> data.sample()["observation"].shape, sorted(data.statistics.keys())
+            (torch.Size([4, 5, 2]), ['action', 'observation', 'state'])
+        """
+        parts, episodes = [], []
+        for number, rollout in enumerate(rollouts):
+            if rollout.ndim != 1 or rollout["next", "done"][:-1].any():
+                raise ValueError(
+                    f"A rollout is one episode, [T]; that of number {number} is {list(rollout.shape)}, or ends before "
+                    "its last row: roll out with break_when_any_done=True, or split it there."
+                )
+            step = torch.arange(len(rollout)).unsqueeze(-1)
+            times = {"step": step, "time": dt * step.double()}
+            kept = rollout.exclude("next", "collector", "done", "terminated", "truncated", "is_init", "step_count")
+            parts.append(kept.cpu().apply(lambda x: x.float() if x.is_floating_point() else x).update(times))
+            episodes.append(Episode(str(number), sum(map(len, parts[:-1])), len(rollout)))
+        rows = cast(TensorDictBase, torch.cat(parts))
+        pixels, pictures = rows.pop("pixels", None), None
+        if pixels is not None:
+            if pixels.dtype != torch.uint8 or pixels.ndim != 4 or pixels.shape[1] > pixels.shape[3]:
+                raise ValueError(
+                    f"'pixels' of a rollout are uint8 [T, C, H, W]; got {pixels.dtype} {list(pixels.shape)}. Leave "
+                    "ToTensorImage out; PermuteTransform((-1, -3, -2)) brings the channels to the front."
+                )
+            pictures = partial(float_pictures, pixels)
+        data = cls(rows, episodes, for_tests=hashed_tests(test_share), pictures=pictures, **options)
+        numbers = {key: value for key, value in rows.items() if isinstance(value, Tensor) and value.ndim == 2}
+        data._numbers = [key for key, value in numbers.items() if value.is_floating_point() and key != "time"]
+        data._stored = pixels
+        return data
 
     def draw(self, generator: torch.Generator, length: int | None = None) -> TensorDictBase:
         """Draws a sample with all randomness from a generator, as a :class:`torch_denkf.training.Stage` asks for.
@@ -253,7 +306,10 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:
         """Returns statistics of the pixels of some rows of the whole data set; None without pictures."""
-        return None
+        if self._stored is None:
+            return None
+        seen = self._all_rows.get("observed", None)
+        return picture_statistics(self._stored, index if seen is None else index[seen.squeeze(-1)[index]])
 
     def _is_downloaded(self) -> bool:
         return self.root is None or self.root.is_dir()

@@ -56,7 +56,7 @@ class SaltAndPepper(ImageDisturbance):
         generator: torch.Generator | None = None,
     ):
         if not isinstance(fraction, (int, float)) or not 0.0 <= fraction <= 0.5:
-            raise ValueError(f"fraction is the share of white pixels and that of black ones, <= 0.5; got {fraction}.")
+            raise ValueError(f"fraction is the share of white pixels and that of black ones, <= 0.5; got {fraction!r}.")
         super().__init__(p, in_keys=in_keys, generator=generator)
         self.fraction = fraction
 
@@ -240,7 +240,7 @@ class OccludingBox(ImageDisturbance):
         for name, shares in (("size", size), ("position", position)):
             good = isinstance(shares, Sequence) and all(isinstance(s, (int, float)) and 0 <= s <= 1 for s in shares)
             if shares is not None and (not good or len(shares) != 2):
-                raise ValueError(f"{name} is a share of the height and one of the width, in [0, 1]; got {shares}.")
+                raise ValueError(f"{name} is a share of the height and one of the width, in [0, 1]; got {shares!r}.")
         if fill not in ("black", "blur", "noise"):
             raise ValueError(f'fill is "black", "blur" or "noise"; got {fill!r}.')
         super().__init__(p, in_keys=in_keys, generator=generator)

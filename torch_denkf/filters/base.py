@@ -385,7 +385,7 @@ class Filter(Checked, TensorDictSequential):
         drawn: Entries = {}
         if self.keeps_noise:
             places = (*dict(structure.modules), *([] if reset is None else ["initial"]))
-            entries.update(self.draws.missing(entries, size, places=places))
+            entries.update(drawn := self.draws.missing(entries, size, places=places))
         if reset is None:
             written = self.take_step(entries, size)
         else:

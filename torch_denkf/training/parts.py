@@ -1,19 +1,17 @@
-"""A sensor, then a filter, then both: training of one part, and the parameters of some."""
+"""A sensor, then a filter, then both: training of one part."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from tensordict.nn import TensorDictSequential
 from torch import nn
 
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 from torch_denkf.training.stage import Stage
 from torch_denkf.training.trainer import FilterTrainer
 
-__all__ = ["parameters_without", "train_part"]
+__all__ = ["train_part"]
 
 M = TypeVar("M", bound=nn.Module)
 
@@ -53,33 +51,3 @@ def train_part(part: M, stage: Stage, *, out: Path | str, **settings: Any) -> M:
     if trainer.processes.is_main:
         write_checkpoint(file, {stage.name: part.state_dict()})
     return part
-
-
-def parameters_without(model: TensorDictSequential, names: Iterable[str]) -> list[nn.Parameter]:
-    """Parameters of a filter without those of some of its modules: what a stage trains while these stay as they are.
-
-    Args:
-        model: a filter, or another one with named modules.
-        names: of the modules to leave out, as in ``model[name]``.
-
-    Returns:
-        the parameters, in the model's order.
-
-    Raises:
-        KeyError: if the model has no module of a name.
-
-    Example:
-        >>> from tensordict.nn import TensorDictModule, TensorDictSequential
-        >>> from collections import OrderedDict
-        >>> line = lambda: TensorDictModule(nn.Linear(1, 1), ["x"], ["x"])
-        >>> model = TensorDictSequential(OrderedDict(sensor=line(), noise=line()))
-        >>> len(parameters_without(model, ["noise"])), len(parameters_without(model, []))
-        (2, 4)
-    """
-    names = list(names)
-    modules = dict(model.module.named_children())
-    strange = sorted(set(names) - modules.keys())
-    if strange:
-        raise KeyError(f"the filter has no module {strange}; it has {list(modules)}.")
-    left_out = {id(parameter) for name in names for parameter in modules[name].parameters()}
-    return [parameter for parameter in model.parameters() if id(parameter) not in left_out]

@@ -15,7 +15,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR, LambdaLR, LRScheduler, O
 
 from torch_denkf._checks import check_count, check_number
 
-__all__ = ["Stage"]
+__all__ = ["Stage", "parameters_without"]
 
 _SCHEDULES = ("one_cycle", "cosine", "constant")
 
@@ -35,6 +35,9 @@ class Stage:
         parameters: what is trained: parameters, or groups as torch's optimisers take them,
             ``[{"params": ..., "lr": ...}, ...]``. By default all parameters of ``loss`` (if that is a module, else of
             the trainer's model) that require gradients.
+        frozen: names of modules of the model, a filter's places, that stay as they are, such as ``["camera_sensor"]``.
+            A sensor that learned few demonstrations by heart reads them too well, so that noise learned on them is too
+            small: freeze it, and learn the noise on episodes that it has not seen.
         lr: learning rate; the peak for ``"one_cycle"``, the start for ``"cosine"``.
         weight_decay: of AdamW, per unit of learning rate.
         schedule: ``"one_cycle"``, ``"cosine"`` (to zero), ``"constant"``, or ``schedule(optimiser, updates)``, which
@@ -46,6 +49,7 @@ class Stage:
 
     Raises:
         ValueError: on a bad name, no updates, an unknown schedule, or lengths that say nothing about update 0.
+        TypeError: if ``frozen`` is one name and no list of them.
 
     Example:
         >>> from tensordict import TensorDict
@@ -69,6 +73,7 @@ class Stage:
     lengths: Mapping[int, int] | None = None
     validate: Callable[[], Mapping[str, float]] | None = None
     monitor: str | None = None
+    frozen: Iterable[str] = ()
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not re.fullmatch(r"[\w-]+", self.name):
@@ -86,6 +91,9 @@ class Stage:
             check_count(f"one of the lengths of stage {self.name!r}", length)
         if self.lengths is not None and 0 not in self.lengths:
             raise ValueError(f"Stage {self.name!r}: lengths {dict(self.lengths)} lack the length from update 0 on.")
+        if isinstance(self.frozen, str):
+            raise TypeError(f"Stage {self.name!r}: frozen is a list of names, [{self.frozen!r}].")
+        object.__setattr__(self, "frozen", tuple(self.frozen))
         if self.parameters is not None:  # often generators, which would be empty the second time
             parameters = [
                 {**entry, "params": list(entry["params"])} if isinstance(entry, dict) else entry
@@ -113,6 +121,10 @@ class Stage:
             given = list(self.parameters)
         groups = given if given and isinstance(given[0], dict) else [{"params": given}]
         groups = [dict(group) for group in groups]  # the optimiser adds its settings to them
+        if self.frozen:
+            left = {id(parameter) for parameter in parameters_without(model, self.frozen)}
+            for group in groups:
+                group["params"] = [parameter for parameter in group["params"] if id(parameter) in left]
         trained, held = [p for group in groups for p in group["params"]], {id(p) for p in model.parameters()}
         if not trained:
             raise ValueError(f"Stage {self.name!r} has no parameters to train; give parameters=...")
@@ -191,3 +203,33 @@ def only_trainable(model: nn.Module, parameters: Iterable[nn.Parameter]) -> Iter
         for parameter, flag in before:
             parameter.requires_grad_(flag)
             parameter.grad = None
+
+
+def parameters_without(model: nn.Module, names: Iterable[str]) -> list[nn.Parameter]:
+    """Parameters of a filter without those of some of its modules: what a stage trains while these stay as they are.
+
+    Args:
+        model: a filter, or another one with named modules.
+        names: of the modules to leave out, as in ``model[name]``.
+
+    Returns:
+        the parameters, in the model's order.
+
+    Raises:
+        KeyError: if the model has no module of a name.
+
+    Example:
+        >>> from tensordict.nn import TensorDictModule, TensorDictSequential
+        >>> from collections import OrderedDict
+        >>> line = lambda: TensorDictModule(nn.Linear(1, 1), ["x"], ["x"])
+        >>> model = TensorDictSequential(OrderedDict(sensor=line(), noise=line()))
+        >>> len(parameters_without(model, ["noise"])), len(parameters_without(model, []))
+        (2, 4)
+    """
+    names = list(names)
+    modules = dict(getattr(model, "module", model).named_children())
+    strange = sorted(set(names) - modules.keys())
+    if strange:
+        raise KeyError(f"the filter has no module {strange}; it has {list(modules)}.")
+    left_out = {id(parameter) for name in names for parameter in modules[name].parameters()}
+    return [parameter for parameter in model.parameters() if id(parameter) not in left_out]

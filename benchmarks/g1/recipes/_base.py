@@ -1,4 +1,4 @@
-"""How to compose, train and tune a filter; the registry."""
+"""Composes, trains and tunes a filter; the registry."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from benchmarks.common.arms import ArmRecipe, AtRest
 from benchmarks.common.recipes import Registry
 from benchmarks.g1.baselines import SPREAD_CELLS
 from benchmarks.g1.motion import FADING, BiasedReading, Motion
-from benchmarks.g1.sensors import Statistics
-from benchmarks.g1.targets import Target
+from benchmarks.g1.recordings import JOINTS
+from benchmarks.g1.sensors import JOINT_UNIT, Statistics
 from torch_denkf.filters import Filter
 from torch_denkf.modules import DiagonalNoise, LearnedObservation, ScaledNoise, SubModel
 
@@ -49,10 +49,9 @@ class RatesAndBias(SubModel):
 
 
 class G1Recipe(ArmRecipe):
-    """A filter of D numbers of a robot, behind a trained sensor. All carry them in the first D entries of their mean.
+    """A filter of an arm's joints behind a trained sensor. All carry them in the first entries of their mean.
 
     Args:
-        target: what is estimated.
         facts: statistics of the training episodes.
         motion: trained before; the filter gets a copy.
         error: root mean square error of the sensor, ``[D]``, on episodes that it has not seen.
@@ -61,14 +60,11 @@ class G1Recipe(ArmRecipe):
         spread: the variance of the sensor's errors as a function of the encoding, fitted before.
     """
 
-    encoders = False  # whether some joints have noisy encoders
-    fitted = True  # whether R and the noise of the bias begin as the fitted variance of the sensor's errors
     members = MEMBERS
     longer = 1  # times as many updates as others
 
     def __init__(
         self,
-        target: Target,
         facts: Statistics,
         motion: Motion,
         error: Tensor,
@@ -76,9 +72,9 @@ class G1Recipe(ArmRecipe):
         encoding: int,
         spread: DiagonalNoise,
     ):
-        self.target, self.facts, self.motion = target, facts, deepcopy(motion)
+        self.facts, self.motion = facts, deepcopy(motion)
         self.error, self.start, self.encoding, self.spread = error, start, encoding, spread
-        self.dims, self.unit = range(target.size), torch.full((target.size,), target.unit)
+        self.dims, self.unit = range(JOINTS), torch.full((JOINTS,), JOINT_UNIT)
 
     def belief(self, std: Tensor) -> TensorDictModuleBase:
         """The belief around the state ``"start"``."""
@@ -89,40 +85,39 @@ class G1Recipe(ArmRecipe):
 
     def _of_sensor(self, share: float, out_key: NestedKey) -> DiagonalNoise:
         """A share of the sensor's errors, from what it sees; before training as it was fitted."""
-        root = (self.spread.variance + self.spread.floor).sqrt() if self.fitted else self.error
+        root = (self.spread.variance + self.spread.floor).sqrt()
         keys = {"in_features": self.encoding, "in_key": ("sensor", "encoding"), "out_key": out_key}
-        noise = DiagonalNoise(self.target.size, r=share * root, num_cells=SPREAD_CELLS, **keys)
-        if self.fitted:
-            noise.module.load_state_dict(self.spread.module.state_dict())
+        noise = DiagonalNoise(JOINTS, r=share * root, num_cells=SPREAD_CELLS, **keys)
+        noise.module.load_state_dict(self.spread.module.state_dict())
         return noise
 
     @property
     def white(self) -> float:
-        """What R holds of the sensor's errors before training: all, where the state holds no bias."""
+        """Returns R's share of the sensor's errors before training: all, where the state holds no bias."""
         return WHITE if self.bias else 1.0
 
     @property
     def noisy(self) -> list[int]:
         """Dimensions of the state that the process noise acts on: the numbers follow from their rates."""
-        return list(range(self.target.size, self.size))
+        return list(range(JOINTS, self.size))
 
     @property
     def rates(self) -> list[int]:
         """Dimensions of the state that are rates."""
-        return list(range(self.target.size, 2 * self.target.size))
+        return list(range(JOINTS, 2 * JOINTS))
 
     def observation(self) -> SubModel:
         """H."""
-        return LearnedObservation(BiasedReading(self.target.size, self.target.encoders if self.encoders else ()))
+        return LearnedObservation(BiasedReading())
 
     @property
     def process_std(self) -> Tensor:
-        """What motion and bias do not know before training: accelerations; biases stay as large."""
+        """Returns what motion and bias do not know before training: accelerations; biases stay as large."""
         slow = (1 - FADING**2) ** 0.5 * SLOW * self.error
         return torch.cat([SURPRISE * self.motion.acceleration, slow])[: len(self.noisy)]
 
     def _process_noise(self) -> SubModel:
-        motion, size = self.motion, self.target.size
+        motion, size = self.motion, JOINTS
         blind = self.size - 2 * size
         rates = DiagonalNoise(
             size,
@@ -140,13 +135,13 @@ class G1Recipe(ArmRecipe):
 
     def _initial(self, std: Tensor, rates: float) -> TensorDictModuleBase:
         whole = torch.cat([std, rates * self.motion.rate, SLOW * self.error])[: self.size]
-        return AtRest(self.belief(whole), self.size, self.target.size, "start")
+        return AtRest(self.belief(whole), self.size, JOINTS, "start")
 
     def build(self) -> Filter:
         """The filter, on readings; episodes begin somewhere where those of the training do."""
         return Filter(self.modules(), initial=self._initial(self.start, 0.3))
 
     def for_training(self, model: Filter) -> Filter:
-        """The same filter, sharing all parameters, for windows that begin near what the sensor says."""
+        """Returns the same filter, sharing all parameters, for windows that begin near what the sensor says."""
         parts = OrderedDict((name, model[name]) for name in model.module)
         return Filter(parts, initial=self._initial(2**0.5 * self.error, 1.0))

@@ -18,13 +18,6 @@ class DEKF(Extended, _Start):
 
 
 @register
-class DEKFActions(DEKF):
-    """The same, told the commands."""
-
-    actions = True
-
-
-@register
 class DUKF(Unscented, _Start):
     """See :class:`benchmarks.common.gaussian.Unscented`."""
 

@@ -6,6 +6,7 @@ from collections import OrderedDict
 
 from benchmarks.common.arms import AtRest
 from benchmarks.g1.recipes._base import G1Recipe, register
+from benchmarks.g1.recordings import JOINTS
 from torch_denkf.baselines import LSTMFilter
 from torch_denkf.baselines.lstm_cell import with_memory
 from torch_denkf.modules import GaussianAround
@@ -22,7 +23,7 @@ class LSTM(G1Recipe):
     longer = 6
 
     def modules(self):
-        size, motion = self.target.size, self.motion
+        size, motion = JOINTS, self.motion
         whole = LSTMFilter(
             None,
             features=self.encoding,
@@ -38,8 +39,7 @@ class LSTM(G1Recipe):
         return OrderedDict((name, whole[name]) for name in ("transition", "lstm"))
 
     def _initial(self, std, rates):
-        size = self.target.size
-        return with_memory(AtRest(GaussianAround(std, state_key="start"), size, size, "start"), HIDDEN)
+        return with_memory(AtRest(GaussianAround(std, state_key="start"), JOINTS, JOINTS, "start"), HIDDEN)
 
     def loss(self, model):
         return GaussianLoss(model, transition=0.0, sensor=0.0, dims=self.dims, state_scale=self.unit)

@@ -1,1 +1,1 @@
-"""Where inputs come in: a module for each border, with a function ``cases`` that returns its damaged inputs."""
+"""Holds the borders where inputs come in: a module for each, with a function ``targets`` of what may be wrong."""

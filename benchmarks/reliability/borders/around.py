@@ -26,9 +26,7 @@ from torch_denkf.functional import sigma_points
 from torch_denkf.functional.unscented import unscented_moments, unscented_weights
 
 NAN, INF = float("nan"), float("inf")
-CALIBRATION = d.Wrong(
-    {"three numbers": (1.0, 1.0, 1.0), "zero": (0.0, 40.0, 35.0, 11.0), "nan": (NAN, 40.0, 35.0, 11.0), "text": "ab"}
-)
+CALIBRATION = d.of((1.0, 1.0, 1.0), (0.0, 40.0, 35.0, 11.0), (NAN, 40.0, 35.0, 11.0), "ab")
 NO_FILTER = d.Wrong({"nothing": None, "text": "x", "no filter": torch.nn.Linear(2, 2)})
 
 
@@ -41,14 +39,10 @@ def _flow(transform: Any) -> Any:
 
 
 def _transforms() -> Iterator[Subject]:
-    bounds = d.Wrong(
-        {"upside down": (2.0, 1.0), "nan": (NAN, 1.0), "inf": (0.0, INF), "one number": (1.0,), "text": "ab"}
-    )
-    shares = d.Wrong(
-        {"beyond one": (1.5, 0.5), "negative": (-0.5, 0.5), "nan": (NAN, 0.5), "one number": (0.5,), "text": "ab"}
-    )
+    bounds = d.of((2.0, 1.0), (NAN, 1.0), (0.0, INF), (1.0,), "ab")
+    shares = d.of((1.5, 0.5), (-0.5, 0.5), (NAN, 0.5), (0.5,), "ab")
     kernel = d.COUNT | {"even": 4, "three numbers": (3, 3, 3)}
-    fraction = d.Wrong({"negative": -0.1, "beyond a half": 0.7, "nan": NAN, "text": "x"})
+    fraction = d.of(-0.1, 0.7, NAN, "x")
     camera = lambda: {"calibration": (40.0, 40.0, 35.0, 11.0)}  # noqa: E731
     calibration = CALIBRATION | {"negative": (-4.0, 40.0, 35.0, 11.0)}
     yield Subject(envs.MissingFrames, use=_pictures)
@@ -97,13 +91,13 @@ def _linear() -> dict[str, Any]:
 def _environments() -> Iterator[Subject]:
     roll = lambda env: env.rollout(3)  # noqa: E731
     stretches = {
-        "start": d.Wrong({"negative": -1, "beyond": 100, "unknown": "somewhere", "a fraction": 1.5}),
-        "length": d.Wrong({"one": 1, "negative": -1, "beyond": 100, "text": "x"}),
-        "batch_size": d.Wrong({"negative": [-1], "text": "x", "a fraction": [1.5]}),
+        "start": d.of(-1, 100, "somewhere", 1.5),
+        "length": d.of(1, -1, 100, "x"),
+        "batch_size": d.of([-1], "x", [1.5]),
     }
     data = {
-        "data": d.Wrong({"nothing": None, "text": "x"}),
-        "episodes": d.Wrong({"unknown": "z", "beyond": 7, "none": []}),
+        "data": d.of(None, "x"),
+        "episodes": d.of("z", 7, []),
     }
     linear = {
         "transition": d.matrix(2, 2),
@@ -129,7 +123,7 @@ def _tracked(**given: Any) -> Any:
 
 
 def _no_moments(points: torch.Tensor) -> bool:
-    """What functions of tensors promise where an element of a batch has no result: that it is NaN, and no other one.
+    """Checks what functions of tensors promise where an element of a batch has no result: that it alone is NaN.
 
     They look at no values, which under ``torch.compile`` and on a GPU would cost more than they do. Of sigma points
     without a covariance nothing finite may be left in their moments.
@@ -163,7 +157,7 @@ def _track() -> dict[str, d.Wrong]:
         "fps": d.POSITIVE,
         "height": d.POSITIVE,
         "pitch": d.FINITE | {"a right angle": 1.57},
-        "black_level": d.Wrong({"negative": -1, "beyond": 300, "text": "x"}),
+        "black_level": d.of(-1, 300, "x"),
         "calibration": CALIBRATION,
     }
 
@@ -179,8 +173,8 @@ def _car() -> Iterator[Subject]:
     points = {
         "cov": d.Wrong(covariances),
         "mean": None,
-        "alpha": d.Wrong({"zero": 0.0, "nan": NAN}),
-        "kappa": d.Wrong({"minus the dimension": -2.0, "nan": NAN}),
+        "alpha": d.of(0.0, NAN),
+        "kappa": d.of(-2.0, NAN),
     }
     updates = dict.fromkeys(("sensor", "filter", "end_to_end", "length"), d.COUNT)
     named = dict.fromkeys(updates, ("Updates",))

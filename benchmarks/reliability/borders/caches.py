@@ -30,7 +30,7 @@ READERS: dict[str, tuple[Callable[[], Path], Callable[..., TensorDict]]] = {
 
 
 def _again(name: str, change: d.Change, folder: Path) -> tuple[TensorDict, TensorDict, list[str]]:
-    """What is read the first time, and again with a changed entry; and what is left half written."""
+    """Returns what is read the first time, and again with a changed entry; and what is left half written."""
     sound, read = READERS[name]
     root, cache = copied(sound(), folder), folder / "cache"
     first = read(root, cache).clone()
@@ -78,7 +78,7 @@ def _pickle_inside(entry: Path) -> None:
 
 
 def _half_written(entry: Path) -> None:
-    """What a process that was killed leaves, with the lock of none."""
+    """Leaves what a process that was killed leaves, with the lock of none."""
     left = entry.parent / ".writing-killed"
     left.mkdir()
     shutil.copytree(entry, left / "entry")
@@ -98,7 +98,7 @@ ENTRIES = d.Wrong(
         "a file more": lambda entry: (entry / "more").write_text("x"),
     }
 )
-NO_FOLDER = d.Wrong({"in a file": "file/below", "in a device": "/dev/null/below", "a number": 3})
+NO_FOLDER = d.of("file/below", "/dev/null/below", 3)
 
 
 def _nowhere(name: str, cache: Any, folder: Path) -> TensorDict:

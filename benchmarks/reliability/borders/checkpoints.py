@@ -12,12 +12,13 @@ from tensordict import TensorDict
 
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.case import apart, workshop
-from benchmarks.reliability.damage import MISSING, fields, put, same
+from benchmarks.reliability.damage import same
+from benchmarks.reliability.documents import edited
 from benchmarks.reliability.hostile import PICKLES, npz_of_zeros
 from benchmarks.reliability.target import Folder, Subject, Target, targets_of
 from tests.training.problem import make_trainer
 from torch_denkf.training import FilterTrainer, Stage
-from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
+from torch_denkf.training.checkpoint import read_checkpoint
 
 UPDATES = 4
 LAST = "last.pt"
@@ -60,40 +61,18 @@ READ = Folder("checkpoints", partial(_run, "done"), _read)
 RESUMED = {name: Folder("checkpoints", partial(_run, name), _resume) for name in ("begun", "done")}
 
 
-def in_checkpoint(change: d.Change) -> d.Change:
-    """Changes what is in a checkpoint, and writes it as the library does."""
-
-    def act(file: Path) -> None:
-        content = read_checkpoint(file)
-        change(content)
-        write_checkpoint(file, content)
-
-    return act
+def _first(content: dict[str, Any]) -> str:
+    """Returns the name of the first matrix of the weights."""
+    return next(name for name, value in content["model"].items() if value.is_floating_point() and value.ndim > 1)
 
 
 def in_first(change: Any) -> d.Change:
-    """Changes the first matrix of a dictionary of weights."""
-
-    def act(weights: dict[str, torch.Tensor]) -> None:
-        name = next(name for name, value in weights.items() if value.is_floating_point() and value.ndim > 1)
-        put((name,), change)(weights)
-
-    return act
+    """Changes the first matrix of the weights."""
+    return lambda content: d.put(("model", _first(content)), change)(content)
 
 
-WEIGHTS = {
-    "a weight of NaN": lambda value: value * NAN,
-    "a weight of another shape": lambda value: value[..., :1].contiguous(),
-    "a weight less": MISSING,
-}
-
-
-def _in_model(change: d.Change, content: dict[str, Any]) -> None:
-    change(content["model"])
-
-
-TEXT = d.types("text")
-PLACE = d.types("text", "negative", beyond=10**6)
+TEXT = d.of("x")
+PLACE = d.of("x", -3, 10**6)
 FIELDS = {
     "stage": PLACE,
     "update": PLACE,
@@ -101,13 +80,16 @@ FIELDS = {
     **dict.fromkeys(("model", "settings", "best"), TEXT | {"empty": {}}),
     "updates": d.Wrong({}),
 }
-CONTENT = (fields(FIELDS) | {"another seed": put(("settings", "seed"), 99)}) | {
-    what: partial(_in_model, in_first(value)) for what, value in WEIGHTS.items()
+CONTENT = d.fields(FIELDS) | {
+    "another seed": d.put(("settings", "seed"), 99),
+    "a weight of NaN": in_first(lambda value: value * NAN),
+    "a weight of another shape": in_first(lambda value: value[..., :1].contiguous()),
+    "a weight less": in_first(d.MISSING),
 }
 #: What the end does not depend on.
 HARMLESS = {
-    "without last_metrics": lambda content: content.pop("last_metrics"),
-    "a weight of another precision": partial(_in_model, in_first(torch.Tensor.double)),
+    "without last_metrics": d.put(("last_metrics",), d.MISSING),
+    "a weight of another precision": in_first(torch.Tensor.double),
 }
 
 
@@ -125,30 +107,29 @@ def _checkpoints() -> Iterator[Target]:
     best = (LAST, "best_sensor.pt")
     yield RESUMED["done"].target("resume, best files there", nothing, _right, best, LAST)
     for name, folder in RESUMED.items():
-        yield folder.target(f"resume, {name}", CONTENT.each(in_checkpoint), file=LAST)
-        yield folder.target(f"resume, {name}, harmless", d.Wrong(HARMLESS).each(in_checkpoint), _right, file=LAST)
-    outside = in_checkpoint(put(("best", "stage"), "../../outside"))
+        yield folder.target(f"resume, {name}", CONTENT.each(edited), file=LAST)
+        yield folder.target(f"resume, {name}, harmless", d.Wrong(HARMLESS).each(edited), _right, file=LAST)
+    outside = edited(d.put(("best", "stage"), "../../outside"))
     yield RESUMED["begun"].one("resume, a best stage outside", outside, LAST, file=LAST)
 
 
-EVERY = d.types("text", "negative", "a fraction", zero=0)
 SETTINGS = {
-    **dict.fromkeys(("updates", "validate_every", "save_every", "log_every"), EVERY),
-    "max_skipped": d.types("text", "negative"),
-    "seed": d.types("text", "negative", "a fraction"),
-    "keep": d.Wrong({"unknown": "worst", "a number": 3}),
-    "monitor": d.Wrong({"unknown": "beauty"}),
-    "loggers": d.Wrong({"unknown": ("paper",)}),
-    "device": d.Wrong({"unknown": "abacus", "a number that is not there": "cuda:77"}),
-    "out": d.Wrong({"a file": "file"}),
+    **dict.fromkeys(("updates", "validate_every", "save_every", "log_every"), d.of("x", -3, 1.5, 0)),
+    "max_skipped": d.of("x", -3),
+    "seed": d.of("x", -3, 1.5),
+    "keep": d.of("worst", 3),
+    "monitor": d.of("beauty"),
+    "loggers": d.of(("paper",)),
+    "device": d.of("abacus", "cuda:77"),
+    "out": d.of("file"),
 }
 STAGE = {
-    "name": d.Wrong({"a path": "../x", "empty": "", "a number": 3}),
+    "name": d.of("../x", "", 3),
     "lr": d.POSITIVE,
     "weight_decay": d.NOT_NEGATIVE.but("inf"),
-    "schedule": d.Wrong({"unknown": "weekly", "a number": 3}),
+    "schedule": d.of("weekly", 3),
     "clip": d.POSITIVE.but("inf"),
-    "lengths": d.Wrong({"without the first": {5: 4}, "negative": {0: -4}, "text": "x"}),
+    "lengths": d.of({5: 4}, {0: -4}, "x"),
 }
 
 

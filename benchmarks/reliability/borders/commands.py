@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 
 import torch_denkf.cli.command as command_module
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.borders import kitti, pretrained, recordings, ur5
+from benchmarks.reliability.borders import kitti, pretrained, ur5
 from benchmarks.reliability.case import Refused, apart, workshop
-from benchmarks.reliability.damage import copied, gone, in_lines, on_row
+from benchmarks.reliability.damage import copied, gone
+from benchmarks.reliability.documents import WORDS, edited
 from benchmarks.reliability.target import Target
 from torch_denkf.applications.car import track
 from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
@@ -95,12 +96,12 @@ COMMANDS: dict[str, dict[str, Any]] = {
 }
 FRACTIONS = st.floats(0.01, 9.99).map(lambda number: round(number, 2)).filter(lambda number: number % 1)
 BELOW = st.integers(-(10**6), -1).map(str)
-PITCH = d.Wrong({"text": "x", "nan": "nan", "inf": "inf"})
+PITCH = d.of("x", "nan", "inf")
 NUMBER = d.Wrong({**PITCH.named, "negative": "-1"}, d.drawn(BELOW))
 WHOLE = d.Wrong({"text": "x", "a fraction": "1.5", "negative": "-1"}, d.drawn(FRACTIONS.map(str) | BELOW))
 POSITIVE, AT_LEAST_ONE = NUMBER | {"zero": "0"}, WHOLE | {"zero": "0"}
-NO_FOLDER = d.Wrong({"a file": "path.csv", "in a file": "path.csv/below", "in a device": "/dev/null/x"})
-NOTHING = d.Wrong({"not there": "nowhere", "empty": ""})
+NO_FOLDER = d.of("path.csv", "path.csv/below", "/dev/null/x")
+NOTHING = d.of("nowhere", "")
 NO_FILE = NOTHING | {"a folder": "kitti", "another file": "path.csv"}
 WITHOUT_DRIVES = {"a folder without drives": "ur5"}
 #: Wrong values of options, where they mean the same in all commands.
@@ -109,8 +110,8 @@ OPTIONS = {
     "--calibration": NO_FILE,
     "--times": NO_FILE,
     "--checkpoint": NOTHING | {"a folder without one": "kitti"},
-    "--camera": d.Wrong({"unknown": "image_9"}),
-    "--size": d.Wrong({"zero": "0 10", "negative": "-4 10", "one number": "10", "text": "a b"}),
+    "--camera": d.of("image_9"),
+    "--size": d.of("0 10", "-4 10", "10", "a b"),
     "--pitch": PITCH,
     **dict.fromkeys(("--height", "--fps", "--focal"), POSITIVE),
     **dict.fromkeys(("--seed", "--sensor-updates", "--filter-updates", "--end-to-end-updates"), WHOLE),
@@ -145,7 +146,7 @@ WRONG: dict[str, dict[str, d.Wrong]] = {
         missing=NUMBER | {"beyond one": "1.5"},
     ),
     "plot": {
-        "": d.Wrong({"not there": "nowhere", "a folder without one": "kitti"}),
+        "": d.of("nowhere", "kitti"),
         **_of("out", level=POSITIVE | {"one": "1"}),
     },
     "render-kitti": _of(
@@ -212,7 +213,7 @@ def _nothing(root: Path) -> None:
 
 
 def act(name: str, changes: dict[str, Any], change: d.Change, folder: Path) -> str:
-    """What a command says of a changed copy, with changed words."""
+    """Returns what a command says of a changed copy, with changed words."""
     root = copied(base(), folder)
     change(root)
     given = {option: value for option, value in {**COMMANDS[name], **changes}.items() if value is not LEFT_OUT}
@@ -246,11 +247,18 @@ FILES: dict[str, tuple[str, ...]] = {
     "plot": ("path.csv",),
     "collect-ur5": (f"ur5/{ur5.DEMO}", f"ur5/{ur5.MANIFEST}"),
 }
-CELLS = {"text": "far", "nan": "nan"}
-PATH = {f"a cell of {what}": on_row(3, recordings.cell(2, value)) for what, value in CELLS.items()} | {
-    "a cell less": on_row(3, recordings.FIFTH["a column less in a row"]),
-    "only a header": recordings.LINES["only a header"],
-    "another header": on_row(0, lambda line: "a,b,c"),
+PATH: dict[str, d.Change] = {
+    **{f"a cell of {value}": d.put((3, 2), value) for value in ("far", "nan")},
+    "a cell less": d.put((3,), lambda row: row[:-1]),
+    "only a header": lambda rows: rows[:1],
+    "another header": d.put((0,), ["a", "b", "c"]),
+}
+#: What each of three poses may be: three of them are a drive.
+POSES: dict[str, d.Change] = {
+    **{f"{value} in place {place}": d.put((1, place), value) for value in WORDS.named.values() for place in (0, 3)},
+    **{f"pose 1 {what}": d.put((1,), change) for what, change in kitti.POSES.without("an empty line").named.items()},
+    "eleven numbers": d.put((1, 11), d.MISSING),
+    "three poses 1e7 m apart": lambda rows: [[*row[:11], str(1e7 * number)] for number, row in enumerate(rows)],
 }
 
 
@@ -282,10 +290,8 @@ def _files() -> Iterator[Target]:
         changes = {} if name != "collect-ur5" else {"--out": "ur5", "--verify": None}
         for file in files:
             yield _target(name, Path(file).name, file, wrong, changes, rights=rights(name, file, changes))
-    yield _target("plot", "path.csv's lines", "path.csv", d.Wrong(PATH).each(in_lines))
-    far = lambda lines: [kitti.number(11, str(1e7 * row))(line) for row, line in enumerate(lines)]  # noqa: E731
-    poses = kitti.POSES.but("an empty line").each(lambda change: on_row(1, change)) | {"three poses 1e7 m apart": far}
-    three = poses.each(lambda change: in_lines(lambda lines: change(lines[:3])))
+    yield _target("plot", "path.csv's lines", "path.csv", d.Wrong(PATH).each(edited))
+    three = d.Wrong(POSES).each(lambda change: edited(lambda rows: (some := rows[:3], change(some) or some)[1]))
     given = {"--poses": "kitti/poses", "--names": "town"}
     yield _target("render-kitti", "pose 1", f"kitti/{kitti.POSE_FILE}", three, given, within=20.0)
 
@@ -305,6 +311,6 @@ def targets() -> Iterator[Target]:
             use = lambda option, folder, name=name: act(name, {option: LEFT_OUT}, _nothing, folder)  # noqa: E731
             without = d.Wrong({"left out": option})
             yield Target("commands", f"{name} without {option}", (option,), use, without, within=WITHIN, needs=base)
-    no_words = d.Wrong({"an unknown command": ["fly"], "an option that is none": ["info", "--loud"]})
+    no_words = d.of(["fly"], ["info", "--loud"])
     yield Target("commands", "words", ("fly", "--loud"), lambda words, folder: run(words), no_words)
     yield from _files()

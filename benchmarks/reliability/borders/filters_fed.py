@@ -1,4 +1,4 @@
-"""What filters and smoothers read: in a step, in a sequence, and in an environment."""
+"""Damages what filters and smoothers read: in a step, in a sequence, and in an environment."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Fed:
     types: bool = True
 
     def seeded(self) -> Any:
-        """The same one each time."""
+        """Makes the same one each time."""
         torch.manual_seed(0)
         return self.make()
 
@@ -70,7 +70,7 @@ class Fed:
         return frames
 
     def run(self, run: str, change: Change) -> TensorDict:
-        """What comes of damaged frames."""
+        """Returns what comes of damaged frames."""
         return RUNS[run](self.seeded(), change(self, self.frames()))
 
 
@@ -150,7 +150,7 @@ Change = Callable[[Fed, TensorDict], TensorDict]
 
 @dataclass(frozen=True)
 class Damage:
-    """What is done to frames, and whether a result is right, given whom they were fed to, how, and what was done."""
+    """Changes frames, and judges a result, given whom they were fed to, how, and what was done."""
 
     change: Change
     right: Callable[[Fed, str, Damage, TensorDict], bool] | None = None

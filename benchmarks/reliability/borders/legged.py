@@ -67,23 +67,19 @@ def log() -> TensorDict:
 
 # -------------------------------------------------------------------------------------------------------- arguments
 
-NAME = d.Wrong({"unknown": "tail", "a number": 3, "nothing": None, "empty": ""})
-FOOT_NAMES = d.Wrong(
-    {"unknown": ["left", "tail"], "one name": "left", "numbers": [1, 2], "none": [], "twice the same": ["left"] * 2}
-)
-JOINT_NAMES = d.Wrong(
-    {
-        "unknown": ["left_hip", "left_knee", "right_hip", "tail"],
-        "too few": ["left_hip", "left_knee"],
-        "twice the same": ["left_hip", "left_knee", "right_hip", "right_knee", "left_hip"],
-        "one name": "left_hip",
-        "numbers": [0, 1, 2, 3],
-    }
+NAME = d.of("tail", 3, None, "")
+FOOT_NAMES = d.of(["left", "tail"], "left", [1, 2], [], ["left"] * 2)
+JOINT_NAMES = d.of(
+    ["left_hip", "left_knee", "right_hip", "tail"],
+    ["left_hip", "left_knee"],
+    ["left_hip", "left_knee", "right_hip", "right_knee", "left_hip"],
+    "left_hip",
+    [0, 1, 2, 3],
 )
 MODEL = d.Wrong({"nothing": None, "text": "robot.xml", "a module": torch.nn.Linear(1, 1)})
-OTHERS = d.Wrong({"a number": 0.1, "text": "none", "a dictionary": {"gyro": 0.1}})
+OTHERS = d.of(0.1, "none", {"gyro": 0.1})
 ROBOT: dict[str, d.Wrong | None] = {"model": MODEL, "feet": FOOT_NAMES, "imu": NAME}
-SEED = d.Wrong({"text": "x", "a fraction": 0.5, "negative": -1})
+SEED = d.of("x", 0.5, -1)
 
 
 def _rolled(env: Any) -> Any:
@@ -127,8 +123,8 @@ def _subjects() -> Iterator[Subject]:
         "gravity": d.FINITE | {"nothing": None},
     }
     learned = {**ROBOT, "joints": JOINT_NAMES, "rows": d.COUNT, "rate": d.POSITIVE, "lasts": d.POSITIVE | {"less": 0.5}}
-    forces = d.Wrong({"text": "much", "a number": 3.0, "one dimension": torch.ones(2), "nan": torch.full((3, 2), NAN)})
-    before = d.Wrong({"numbers": torch.ones(2), "too wide": torch.ones(3, dtype=torch.bool), "text": "all"})
+    forces = d.of("much", 3.0, torch.ones(2), torch.full((3, 2), NAN))
+    before = d.of(torch.ones(2), torch.ones(3, dtype=torch.bool), "all")
     threshold = {"on": d.FINITE | {"below the other": 5.0}, "off": d.FINITE | {"above the other": 50.0}}
     some = {"force": torch.tensor([[0.0, 30.0]] * 3), "on": 20.0, "off": 10.0}
     built = lambda **more: {"model": model(), **NAMES, **more}  # noqa: E731

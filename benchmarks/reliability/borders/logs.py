@@ -19,8 +19,8 @@ import torch
 from hypothesis import strategies as st
 
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.borders.lerobot import in_json
 from benchmarks.reliability.case import apart, workshop
+from benchmarks.reliability.documents import edited
 from benchmarks.reliability.target import Target
 from tests.data.lerobot.lerobot_folder import write_version_2, write_version_3
 from tests.data.recordings.own_files import SIZE, write_csv, write_images
@@ -239,13 +239,11 @@ def _one(message: Any, folder: Path) -> Any:
 
 MASKED = np.ma.masked_equal([1.0], 1.0)
 OPTIONS = {
-    "driving": d.Wrong({"unknown": ["imu"]}),
-    "delays": d.Wrong({"unknown": {"imu": 1.0}, "nan": {"gps": NAN}, "inf": {"gps": INF}, "text": {"gps": "late"}}),
+    "driving": d.of(["imu"]),
+    "delays": d.of({"imu": 1.0}, {"gps": NAN}, {"gps": INF}, {"gps": "late"}),
     "start": d.FINITE | {"behind the last": 30.0, "in ns": 1.7e18},
-    "unit": d.Wrong({"unknown": "h", "a number": 3, "nothing": None}),
-    "origin": d.Wrong(
-        {"unknown": {"imu": 1.0}, "nan": {"gps": NAN}, "too long": {"gps": [1.0, 2.0]}, "text": {"gps": "x"}}
-    ),
+    "unit": d.of("h", 3, None),
+    "origin": d.of({"imu": 1.0}, {"gps": NAN}, {"gps": [1.0, 2.0]}, {"gps": "x"}),
     "dtype": d.Wrong({"int64": torch.int64, "bool": torch.bool, "of numpy": np.float32, "text": "float32"}),
 }
 MESSAGES = d.Wrong(
@@ -303,7 +301,7 @@ def _length(episode: int, length: int) -> d.Change:
 
 
 def _info(**changes: Any) -> d.Change:
-    return lambda root: in_json(lambda content: content.update(changes))(root / "meta/info.json")
+    return lambda root: edited(lambda content: content.update(changes))(root / "meta/info.json")
 
 
 def _renamed(name: str) -> d.Change:
@@ -311,7 +309,7 @@ def _renamed(name: str) -> d.Change:
         def rename(content: dict) -> None:
             content["features"][name] = content["features"].pop("action")
 
-        in_json(rename)(root / "meta/info.json")
+        edited(rename)(root / "meta/info.json")
 
     return act
 
@@ -338,9 +336,7 @@ CHOICES = {
         {"unknown": [9], "none": [], "a number": 3, "text": "0", "a fraction": [0.5], "nested": [[0]]},
         d.drawn(st.integers(4, 99)).map(lambda one: (one[0], [one[1]])),
     ),
-    "origin": d.Wrong(
-        {"a number": 3.0, "unknown": {"joints": 1.0}, "nan": {"state": NAN}, "short": {"state": [1.0, 2.0]}}
-    ),
+    "origin": d.of(3.0, {"joints": 1.0}, {"state": NAN}, {"state": [1.0, 2.0]}),
 }
 
 

@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.borders.checkpoints import WEIGHTS as CHANGES
-from benchmarks.reliability.borders.checkpoints import in_first
-from benchmarks.reliability.borders.lerobot import in_json
-from benchmarks.reliability.damage import fields, same
+from benchmarks.reliability.damage import same
+from benchmarks.reliability.documents import edited
 from benchmarks.reliability.hostile import PICKLES, npz_of_zeros
 from benchmarks.reliability.target import Folder, Subject, Target, targets_of
 from torch_denkf import _registered
@@ -29,61 +27,34 @@ from torch_denkf.pretrained import from_pretrained, save_pretrained
 CONFIG, WEIGHTS = "config.json", "weights.safetensors"
 FOLDERS = _registered.weights()
 LOADERS: dict[str, Callable[[Path], Any]] = {"reacher": from_pretrained, "car-odometry": load_car_filter}
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
 
 
 def _weights(name: str, folder: Path) -> Any:
     return dict(LOADERS[name](folder).state_dict())
 
 
-def in_config(change: d.Change) -> d.Change:
-    """Changes the description, and its checksum, as somebody with bad intentions would."""
-
-    def act(file: Path) -> None:
-        in_json(change)(file)
-        content = json.loads(file.read_text())
-        if isinstance(content, dict):
-            file.write_text(described(content))
-
-    return act
-
-
 def signed(change: d.Change) -> d.Change:
-    """Changes the file of weights, and its checksum, as somebody with bad intentions would."""
+    """Changes the description or the weights, and the checksums, as somebody with bad intentions would."""
 
     def act(file: Path) -> None:
         change(file)
-        if file.is_file():
+        config = file.with_name(CONFIG)
+        if file.name == WEIGHTS and file.is_file():
             digest = hashlib.sha256(file.read_bytes()).hexdigest()
-            in_config(lambda content: content.update(sha256=digest))(file.with_name(CONFIG))
+            edited(d.put(("sha256",), digest))(config)
+        content = json.loads(config.read_text())
+        if isinstance(content, dict):
+            config.write_text(described(content))
 
     return act
-
-
-def in_weights(change: d.Change) -> d.Change:
-    """Changes the weights."""
-
-    def act(file: Path) -> None:
-        tensors = load_file(file)
-        change(tensors)
-        save_file(tensors, file)
-
-    return signed(act)
 
 
 def _header(size: int) -> d.Change:
     return signed(d.written(lambda data: struct.pack("<Q", size) + data[8:]))
 
 
-FIELDS = {
-    "format": d.types("nothing", "a list", "a fraction", another="x/9"),
-    "builder": d.types("nothing", "a fraction", unknown="os.system") | {"a path": "../x", "a list": ["reacher"]},
-    "settings": d.types("nothing", "a list", "text"),
-    "sha256": d.types("nothing", "a fraction", another="0" * 64, empty=""),
-}
-NOTHING = d.types("nothing")
-VECTOR = d.types("text", nan=[NAN] * 4, short=[0.0])
-ANOTHER = {"colour": d.Wrong({"no such setting": "red"})}
+ANOTHER = {"colour": d.of("red")}
 #: Settings of a car's filter.
 CAR = {
     "ensemble_size": d.LARGE_COUNT,
@@ -94,41 +65,32 @@ CAR = {
     "size": d.SIZE,
     **ANOTHER,
 }
+VECTOR = d.of("x", [NAN] * 4, [0.0], [])
 SETTINGS: dict[str, dict[str, d.Wrong]] = {
     "reacher": {
-        "ensemble_size": d.LARGE_COUNT | NOTHING,
-        "encoder_std": d.POSITIVE | NOTHING,
-        "state_mean": VECTOR | NOTHING | {"empty": []},
+        "ensemble_size": d.LARGE_COUNT,
+        "encoder_std": d.POSITIVE,
+        "state_mean": VECTOR,
         "state_std": VECTOR | {"zero": [0.0] * 4, "negative": [-1.0] * 4},
-        "num_cells": d.types("text", others=[8, 8], empty=[], huge=[10**9, 10**9]) | {"negative": [-8]},
+        "num_cells": d.of("x", [8, 8], [], [10**9, 10**9], [-8]),
         **ANOTHER,
     },
     "car-odometry": {
         **CAR,
         **{name: CAR[name].but("a matrix") for name in ("velocity_std", "velocity_mean")},
-        "ensemble_size": d.LARGE_COUNT | NOTHING,
-        "dt": d.POSITIVE | NOTHING,
         "features": d.COUNT | {"others": 8},
     },
 }
-DAMAGE = d.Wrong(
-    {
-        **CHANGES,
-        "a weight of infinity": lambda value: value + INF,
-        "a weight of whole numbers": lambda value: value.long(),
-    }
-).each(in_first) | {"a weight more": lambda tensors: tensors.update(more=torch.ones(2)), "no weights": dict.clear}
-HEADERS = {"no bytes": _header(0), "a terabyte": _header(1 << 40), "2^63 bytes": _header((1 << 63) + 5)}
-NAMES = {
-    "unknown": "walker",
-    "outside": "../../etc",
-    "absolute": "/etc",
-    "empty": "",
-    "a zero byte": "a\0b",
-    "a number": 3,
+#: Changes of weights that have the right names.
+CHANGES: dict[str, d.Change] = {
+    "a weight more": lambda tensors: {**tensors, "more": torch.ones(2)},
+    "no weights": lambda tensors: {},
+    "a weight of whole numbers": lambda tensors: {name: value.long() for name, value in tensors.items()},
 }
+HEADERS = {"no bytes": _header(0), "a terabyte": _header(1 << 40), "2^63 bytes": _header((1 << 63) + 5)}
+NAMES = d.of("walker", "../../etc", "/etc", "", "a\0b", 3)
 SAVED = {
-    "builder": d.Wrong({"none": None}),
+    "builder": d.of(None),
     "settings": d.Wrong({"that JSON does not know": {"a": object()}, "with NaN": {"a": NAN}, "of text": "x"}),
     "training": d.Wrong({"that JSON does not know": {"a": object()}}),
 }
@@ -148,15 +110,18 @@ def _folders(name: str) -> Iterator[Target]:
     for file, wrong in ((CONFIG, d.BYTES), (WEIGHTS, d.SEALED)):
         yield folder.target(f"{name}, {file}", wrong.each(d.written), right, file=file)
         yield folder.target(f"{name}, {file} in its place", d.PLACES, file=file, within=4)
-    yield folder.target(f"{name}, fields", fields(FIELDS).each(in_config), file=CONFIG)
+    config = ("format", "builder", "settings", "sha256")
+    loose = lambda place: place[0] == "settings"  # noqa: E731
+    yield from folder.document(CONFIG, right, skip=lambda place: place[0] not in config, loose=loose, then=signed)
     for setting, values in SETTINGS[name].items():
-        wrong = fields({("settings", setting): values}, missing=False).each(in_config)
+        wrong = values.each(lambda value, setting=setting: signed(edited(d.put(("settings", setting), value))))
         yield folder.target(f"{name}, {setting}", wrong, words=(CONFIG, setting), file=CONFIG)
-    yield folder.target(f"{name}, weights", DAMAGE.each(in_weights), file=WEIGHTS)
-    half = in_weights(in_first(torch.Tensor.half))
-    yield folder.one(
-        f"{name}, a weight of half precision", half, WEIGHTS, file=WEIGHTS, right=partial(right, near=1e-2)
-    )
+    first, last = (sorted(load_file(FOLDERS[name] / WEIGHTS))[at] for at in (0, -1))
+    yield from folder.document(WEIGHTS, None, skip=lambda place: place[0] not in (first, last), then=signed)
+    yield folder.target(f"{name}, weights", d.Wrong(CHANGES).each(edited).each(signed), file=WEIGHTS)
+    half = signed(edited(lambda tensors: {**tensors, first: tensors[first].half()}))
+    near = partial(right, near=1e-2)
+    yield folder.one(f"{name}, a weight of half precision", half, WEIGHTS, file=WEIGHTS, right=near)
     yield folder.target(f"{name}, a header of", HEADERS, file=WEIGHTS)
     hostile = {what: signed(d.instead(write)) for what, write in PICKLES.items()}
     yield folder.target(f"{name}, weights that are", hostile, file=WEIGHTS, within=4)
@@ -168,6 +133,6 @@ def targets() -> Iterator[Target]:
     for name in LOADERS:
         yield from _folders(name)
     also = {"name_or_folder": ("config.json", "trained filter")}
-    names = Subject(from_pretrained, wrong={"name_or_folder": d.Wrong(NAMES)}, also=also)
+    names = Subject(from_pretrained, wrong={"name_or_folder": NAMES}, also=also)
     yield from targets_of("pretrained", names, said=True)
     yield from targets_of("pretrained", Subject(_saved, wrong=SAVED, name="save_pretrained"))

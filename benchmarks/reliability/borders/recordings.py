@@ -13,12 +13,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as parquet
 import torch
-from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.case import apart, workshop
-from benchmarks.reliability.damage import finite, gone, in_lines, leaves, on_row, same, same_but
+from benchmarks.reliability.damage import finite, gone, kept, leaves, same
+from benchmarks.reliability.documents import edited
 from benchmarks.reliability.target import Folder, Subject, Target, targets_of
 from tests.data.recordings.own_files import SIZE, write_csv, write_images, write_video
 from torch_denkf.applications.car.kitti.trajectories import write_trajectory
@@ -80,67 +80,37 @@ def _shown(result: TensorDict, camera: str = "images") -> bool:
 # ------------------------------------------------------------------------------------------------------------ tables
 
 
-def cell(column: int, value: str) -> Callable[[str], str]:
-    """Another value in a row of comma-separated ones."""
-
-    def change(line: str) -> str:
-        words = line.split(",")
-        words[column] = value
-        return ",".join(words)
-
-    return change
-
-
-NO_NUMBER = d.Wrong(
-    {
-        "nan": "nan",
-        "inf": "inf",
-        "a word": "far",
-        "empty": "",
-        "a comma for a point": '"1,5"',
-        "hexadecimal": "0x1f",
-        "1e400": "1e400",
-        "NULL": "NULL",
-        "two points": "1.2.3",
-    },
-    d.drawn(st.text("abcxyz?!", min_size=1, max_size=8).map("?".__add__)),
-)
 TIMES = {"back": "0.05", "the same": "0.3", "an hour on": "3600.4", "1e300": "1e300", "negative": "-3"}
-FIFTH: dict[str, Callable[[str], Any]] = {
-    "a column less in a row": lambda line: line.rsplit(",", 1)[0],
-    "a column more in a row": lambda line: line + ",1",
-    "an open quote": lambda line: '"' + line,
-    "a line of a megabyte": lambda line: "9" * (1 << 20),
-    "an empty line": lambda line: "\n" + line,
+FIFTH: dict[str, Any] = {
+    "an open quote": lambda row: ['"' + row[0], *row[1:]],
+    "a line of a megabyte": lambda row: ["9" * (1 << 20)],
+    "an empty line": lambda row: ["\n" + row[0], *row[1:]],
 }
-LINES: dict[str, Callable[[list[str]], list[str]]] = {
-    **{what: on_row(5, change) for what, change in FIFTH.items()},
-    "no header": lambda lines: lines[1:],
-    "only a header": lambda lines: lines[:1],
-    "one row": lambda lines: lines[:2],
-    "an empty name": on_row(0, lambda line: "time,,y"),
-    "no time": on_row(0, lambda line: "u,x,y"),
-    "sorted backwards": lambda lines: [lines[0], *lines[:0:-1]],
+TABLES: dict[str, d.Change] = {
+    "no header": lambda rows: rows[1:],
+    "only a header": lambda rows: rows[:1],
+    "one row": lambda rows: rows[:2],
+    "an empty name": d.put((0, 1), ""),
+    "no time": d.put((0, 0), "u"),
+    "sorted backwards": lambda rows: [rows[0], *rows[:0:-1]],
+    **{what: d.put((5,), change) for what, change in FIFTH.items()},
 }
 
 
 def _tables() -> Iterator[Target]:
-    ends = {"cut by a byte": OWN.equal}
     parquet_file, named = "table.parquet", {"table": "table.parquet"}
-    yield OWN.target("table.csv", d.FILE, file="table.csv", rights=ends)
+    yield OWN.target("table.csv", d.FILE, file="table.csv", rights={"cut by a byte": OWN.equal})
     yield OWN.target(parquet_file, d.BYTES.but().each(d.written), OWN.equal, file=parquet_file, options=named)
     yield OWN.target(f"{parquet_file} in its place", d.PLACES, file=parquet_file, options=named)
-    for row in (1, 5, ROWS):
-        for column, name in enumerate(("time", "x", "y")):
-            wrong = NO_NUMBER.each(lambda value, row=row, column=column: in_lines(on_row(row, cell(column, value))))
-            yield OWN.target(f"{name} in row {row}", wrong, file="table.csv")
-    times = d.Wrong(TIMES).each(lambda value: in_lines(on_row(5, cell(0, value))))
+    names = lambda place: place[0] == 0 or len(place) == 1  # noqa: E731  # names, and rows that may be missing
+    yield from OWN.document("table.csv", None, ("table",), skip=names, but=("--1",))
+    yield from OWN.document(parquet_file, None, ("table",), skip=lambda place: len(place) < 2, options=named)
+    times = d.Wrong(TIMES).each(lambda value: edited(d.put((5, 0), value)))
     # An hour's gap in a table is one: readings are as they stand there.
     yield OWN.target("time goes on by", times, file="table.csv", rights={"an hour on": finite})
     rights = dict.fromkeys(("an empty name", "an empty line"), OWN.equal)  # a column is a column
-    yield OWN.target(
-        "table.csv's lines", d.Wrong(LINES).each(in_lines), None, ("table.csv", "table"), "table.csv", rights=rights
-    )
+    lines = d.Wrong(TABLES).each(edited)
+    yield OWN.target("table.csv's lines", lines, None, ("table.csv", "table"), "table.csv", rights=rights)
 
 
 def _renamed(name: str) -> d.Change:
@@ -189,14 +159,14 @@ def _pictures() -> Iterator[Target]:
 # --------------------------------------------------------------------------------------------------------- arguments
 
 TABLE = {
-    "columns": d.Wrong({"unknown": ["z"], "text": "x", "none": [], "a number": 3}),
-    "time": d.Wrong({"unknown": "stamp", "a number": 3}),
-    "unit": d.Wrong({"unknown": "h", "a number": 3}),
-    "sample": d.Wrong({"unknown": "first", "a number": 3}),
+    "columns": d.of(["z"], "x", [], 3),
+    "time": d.of("stamp", 3),
+    "unit": d.of("h", 3),
+    "sample": d.of("first", 3),
     "tolerance": d.POSITIVE.but("inf"),
 }
 REPLAY = {
-    "clock": d.Wrong({"zero": 0.0, "negative": -1.0, "nan": NAN, "inf": INF, "unknown": "sun", "1e12": 1e12}),
+    "clock": d.of(0.0, -1.0, NAN, INF, "sun", 1e12),
     "size": d.SIZE | {"fractions": (1.5, 2.5)},
     "test_share": d.SHARE.but("inf"),
     "batch_size": d.COUNT_OR_NONE,
@@ -233,7 +203,7 @@ def _rows(change: Callable[[TensorDict], Any] = lambda rows: None, fps: Any = 10
 def _row_masked(result: TensorDict) -> bool:
     """Right where the damaged row counts neither as seen nor in a loss, and all others are as without damage."""
     masks = ("observed", "state_observed", ("collector", "mask"))
-    return all(not bool(result[mask][1].any()) for mask in masks) and same_but(result, _rows(), [1], ["observed"])
+    return all(not bool(result[mask][1].any()) for mask in masks) and kept(result, _rows())
 
 
 IN_MEMORY = {
@@ -256,23 +226,9 @@ def _trajectory(**given: Any) -> Any:
 
 
 TRAJECTORY = {
-    "trajectory": d.Wrong(
-        {
-            "nan": torch.full((5, 3), NAN),
-            "two columns": torch.zeros(5, 2),
-            "a vector": torch.zeros(5),
-            "text": "path",
-        }
-    ),
-    "layout": d.Wrong({"another": "csv"}),
-    "times": d.Wrong(
-        {
-            "none": None,
-            "too few": torch.zeros(3),
-            "nan": torch.full((5,), NAN),
-            "backwards": torch.arange(5.0).flip(0),
-        }
-    ),
+    "trajectory": d.of(torch.full((5, 3), NAN), torch.zeros(5, 2), torch.zeros(5), "path"),
+    "layout": d.of("csv"),
+    "times": d.of(None, torch.zeros(3), torch.full((5,), NAN), torch.arange(5.0).flip(0)),
 }
 
 

@@ -11,8 +11,8 @@ import torch
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.borders import filters_fed as fed
 from benchmarks.reliability.borders.around import NO_FILTER
-from benchmarks.reliability.borders.filters_made import parts
 from benchmarks.reliability.target import Subject, Target, targets_of
+from tests.borders.filters_made import parts
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.gaussian_for_tests import linear_filter
 from torch_denkf.baselines import IEnKS
@@ -59,7 +59,7 @@ def _made() -> Iterator[Subject]:
     use = lambda smoother: smoother.sequence(SMOOTHERS[0].frames())  # noqa: E731
     moments, ensemble = (lambda: {"filter": linear_kalman()}), (lambda: {"filter": linear_denkf("etkf")})
     wrong = {"lag": d.COUNT.but("zero"), "filter": NO_FILTER}
-    iterated = {"sensor": d.Wrong({"text": "x"}), "variance_ceiling": None}
+    iterated = {"sensor": d.of("x"), "variance_ceiling": None}
     yield Subject(RTSSmoother, moments, use, wrong)
     yield Subject(EnRTS, ensemble, use, {**wrong, "damping": d.POSITIVE | {"beyond one": 1.5}})
     yield Subject(EnKS, ensemble, use, wrong)

@@ -38,7 +38,7 @@ SMALL, LARGE = "size=64k", "size=400m"
 
 @dataclass(frozen=True)
 class Writer:
-    """What writes to a folder.
+    """Writes to a folder.
 
     Args:
         write: writes; returns what can be compared.

@@ -1,4 +1,4 @@
-"""How to compose, train and tune a filter; the registry."""
+"""Composes, trains and tunes a filter; the registry."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class UR5Recipe(ArmRecipe):
 
     @property
     def process_std(self) -> Tensor:
-        """What motion and bias do not know before training: 0.5 mm, usual jerks; biases stay as large."""
+        """Returns what motion and bias do not know before training: 0.5 mm, usual jerks; biases stay as large."""
         slow = (1 - FADING**2) ** 0.5 * WHITE * self.error
         return torch.cat([torch.full((3,), 0.0005), self.facts.jerk, slow])
 
@@ -97,7 +97,7 @@ class UR5Recipe(ArmRecipe):
 
     @property
     def start_std(self) -> Tensor:
-        """How wrong training windows begin, ``[24]``."""
+        """Returns how wrong training windows begin, ``[24]``."""
         # As far as a filter is off in the long run, or it learns to hold on to where it began.
         wrong = torch.maximum(2 * INITIAL * self.facts.scale, self.error)
         return torch.cat([wrong, 0.3 * self.facts.rate, 0.5 * self.facts.acceleration])
@@ -117,7 +117,7 @@ class UR5Recipe(ArmRecipe):
         return Filter(parts, initial=self.initial())
 
     def behind(self, model: Filter, *, training: bool = False) -> Filter:
-        """The same filter, sharing all parameters, on readings; from a wrong ``"start"`` in training."""
+        """Returns the same filter, sharing all parameters, on readings; from a wrong ``"start"`` in training."""
         parts = OrderedDict((name, model[name]) for name in model.module if name not in ("black", "sensor"))
         if not training:
             return Filter(parts, initial=model.initial)

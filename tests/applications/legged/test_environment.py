@@ -67,7 +67,7 @@ def test_feet_that_stand_press_the_floor_and_carry_the_robot(log):
 
 
 def test_feet_slide_on_ice():
-    """How far standing feet move along the floor, of the robot's own way."""
+    """Measures how far standing feet move along the floor, of the robot's own way."""
     slides = []
     for friction in (1.5, 0.1):
         env = quadruped_env(PERFECT, friction=friction)

@@ -100,7 +100,7 @@ def test_noise_is_that_of_steps_in_the_sensors_axes():
 
 
 def test_a_turn_of_the_world_is_not_seen_in_what_feet_say():
-    """Of any size: so no update is mistaken about where up is."""
+    """Scales by any size: so no update is mistaken about where up is."""
     space = LeggedSpace(2)
     torch.manual_seed(0)
     state = space.exp(torch.randn(space.tangent_dim))

@@ -160,7 +160,7 @@ def test_episodes_that_are_not_there(tmp_path, episodes, match):
 
 @pytest.mark.parametrize("cached", [False, True])
 def test_large_numbers(tmp_path, cached):
-    """Of encoders that count to 2.1e9, float32 swallows steps of 7; behind an origin they are there."""
+    """Counts encoders up to 2.1e9: float32 swallows steps of 7; behind an origin they are there."""
     root = tmp_path / "robot"
     write_version_2(root, [40])
     file = root / "data/chunk-000/episode_000000.parquet"

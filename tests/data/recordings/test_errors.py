@@ -1,4 +1,4 @@
-"""What is wrong with one's own files is said with the file, the line and the column."""
+"""Raises for one's own files with the file, the line and the column."""
 
 from functools import partial
 

@@ -171,7 +171,7 @@ def test_the_log_of_a_car():
 
 
 def queued(rate, count=2000):
-    """Of 5 % of the stamps the step is 0.2 ms, of 2 % it is 0.16 s; the others make up for both."""
+    """Steps by 0.2 ms at 5 % of the stamps, and by 0.16 s at 2 %; the others make up for both."""
     steps = np.full(count, 1 / rate)
     order = np.random.default_rng(0).permutation(count)
     steps[order[: count // 20]], steps[order[-count // 50 :]] = 2e-4, 0.16

@@ -1,4 +1,4 @@
-"""What two processes of test_sharded do: each analyses its components, and leaves the results."""
+"""Runs the two processes of test_sharded: each analyses its components, and leaves the results."""
 
 from pathlib import Path
 

@@ -98,7 +98,7 @@ class Layout:
             names = list(names.values())
         if isinstance(names, list):
             names = [name for part in names for name in (part if isinstance(part, list) else [part])]
-        if not names or len(names) != self.width(key):
+        if not isinstance(names, list) or len(names) != self.width(key):
             return None
         return tuple(str(name) for name in names)
 
@@ -292,11 +292,10 @@ def _episodes_of_version_3(root: Path, info: dict, camera: str) -> tuple[list[Ep
     for file in files:
         for entry in read_table(file, keys).to_pylist():
             try:
-                number, length, chunk, part = (int(entry[key]) for key in keys[:4])
-                where = [int(entry[key]) for key in keys[4:6]]
+                number, length, chunk, part, *where = (_whole(entry[key]) for key in keys[:6])
                 begin = float(entry[keys[6]]) if video else 0.0
             except (TypeError, ValueError) as error:
-                raise ValueError(f"{file} has a row with gaps, {entry}; download it again") from error
+                raise ValueError(f"{file} has a row with gaps or fractions, {entry}; download it again") from error
             for name, value in (("episode_index", number), ("length", length)):
                 check_count(f"{name} in {file}", value, least=0)
             check_number(f"from_timestamp of episode {number} in {file}", begin, least=0)
@@ -307,6 +306,13 @@ def _episodes_of_version_3(root: Path, info: dict, camera: str) -> tuple[list[Ep
             data = _inside(root, info, "data_path", chunk_index=chunk, file_index=part)
             episodes.append(EpisodeFiles(number, length, data, shown, begin))
     return episodes, files
+
+
+def _whole(value: Any) -> int:
+    """Returns a whole number, which may be stored as a float, or raises a ``ValueError``."""
+    if int(value) != value:
+        raise ValueError(f"{value} is no whole number")
+    return int(value)
 
 
 def _inside(root: Path, info: dict, name: str, **place: Any) -> Path:
@@ -394,7 +400,16 @@ def vectors(table, file: Path, key: str, width: int) -> np.ndarray:
 
 
 def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict | None) -> np.ndarray | None:
-    """Decodes an image of a parquet file, or of a file that it names, to RGB ``[H, W, 3]``; None if that fails."""
+    """Decodes an image of a parquet file, or of a file that it names, to RGB ``[H, W, 3]``; None if that fails.
+
+    Raises:
+        ValueError: if the column holds no pictures.
+    """
+    if not isinstance(value, dict | None):
+        raise ValueError(
+            f"{camera!r} of episode {episode} in {root} holds no pictures with bytes or path, but {value!r:.80}; "
+            "download the data set again"
+        )
     data = (value or {}).get("bytes")
     if data is None:
         names = [(value or {}).get("path")]

@@ -21,7 +21,7 @@ class Source:
 
     Attributes:
         names: of the columns.
-        headless: whether the file has none, so that they are others' names.
+        headless: whether the file has no names, so that these were given.
         asides: names of columns that are read only where they are asked for.
     """
 
@@ -30,20 +30,20 @@ class Source:
     asides: tuple[str, ...] = ()
 
     def column(self, name: str) -> np.ndarray:
-        """The numbers of a column ``[n]``; NaN for what is none."""
+        """Returns the numbers of a column ``[n]``, NaN for text."""
         raise NotImplementedError
 
     def stamps(self, name: str) -> np.ndarray:
-        """A column of times ``[n]``, in which dates are numbers, too, with its nanoseconds where another has them."""
+        """Returns a column of times ``[n]``, dates as seconds, with the nanoseconds that another column has."""
         rest = nanoseconds_beside(name, self.names)
         return self.column(name) if rest is None else self.column(name) + 1e-9 * self.column(rest)
 
     def empty(self, name: str) -> np.ndarray:
-        """Cells that are there and hold nothing, bool ``[n]``."""
+        """Marks cells that are there and hold nothing, bool ``[n]``."""
         return np.zeros(len(self.column(name)), bool)
 
     def cell(self, name: str, row: int) -> Any:
-        """The content of a cell, for messages."""
+        """Returns the content of a cell, for messages."""
         return self.column(name)[row]
 
     def place(self, row: int) -> str:
@@ -201,7 +201,7 @@ def read_numbers(
     if columns is None or source.headless:
         columns = [name for name in (columns or there) if name not in own]
         read = {name: source.column(name) for name in columns}
-        if not source.headless:  # a column of text is none to read
+        if not source.headless:  # columns of text are left out
             read = {name: column for name, column in read.items() if not len(column) or np.isfinite(column).any()}
     else:
         read = {name: source.column(name) for name in columns}

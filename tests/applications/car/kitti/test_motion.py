@@ -22,7 +22,7 @@ def drive():
 
 @pytest.fixture
 def count(monkeypatch):
-    """How often image_motion was called."""
+    """Counts the calls of image_motion."""
     calls = []
 
     def counted(*args, **kwargs):
@@ -79,7 +79,7 @@ def calibration(drive):
 
 
 def wider(drive):
-    """The same bytes in another shape."""
+    """Keeps the bytes in another shape."""
     drive["image"] = drive["image"].reshape(ROWS, 1, 75, 100)
 
 

@@ -113,7 +113,7 @@ def test_the_homography_is_the_pinhole_projection():
 
 
 def correlation(a, b, where):
-    """Of the fine structure only: flat parts agree under any motion."""
+    """Compares the fine structure only: flat parts agree under any motion."""
     a, b = (image - cv2.blur(image, (19, 7)) for image in (a, b))
     return np.corrcoef(a[where], b[where])[0, 1]
 

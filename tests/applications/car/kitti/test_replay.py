@@ -71,7 +71,7 @@ def test_all_rows(root):
 
 
 def test_statistics_by_hand(root):
-    """Of the training drives alone: numpy, from the PNGs of those two drives."""
+    """Takes the training drives alone: numpy, from the PNGs of those two drives."""
     data = open_dataset(root, ["hill", "town"])
     frames, differences, states = [], [], []
     for name in ("hill", "town"):

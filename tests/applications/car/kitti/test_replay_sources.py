@@ -1,4 +1,4 @@
-"""Which drives and cameras a data set consists of: made by hand, and real frames where they are."""
+"""Checks which drives and cameras a data set consists of: made by hand, and real frames where they are."""
 
 from functools import partial
 

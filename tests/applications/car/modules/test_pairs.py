@@ -154,7 +154,7 @@ def test_neighbours_are_read_however_fast_the_filter_believes_itself(float64):
 
 
 def test_a_slow_camera_is_read_again_when_the_car_slows_down(float64):
-    """What the filter hardly knows may be within reach: else a speed that is believed too large stays for ever."""
+    """Keeps what the filter hardly knows within reach: else a speed that is believed too large stays for ever."""
     frames = frames_of(torch.full((91, 2), 6.0) * torch.tensor([1.0, 0.0]), [0] + [0, 0, 3] * 30)
     frames["state"] = torch.tensor([0.0, 0.0, 0.0, 9.0, 0.0]).expand(91, 5)  # believed; in truth 3 x 2 m/s
     torch.manual_seed(0)

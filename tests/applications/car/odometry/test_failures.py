@@ -67,7 +67,7 @@ def test_what_stands_still_before_the_camera_is_told_and_looked_past(tmp_path, c
 
 
 def test_readings_are_velocities(checkpoint, drive):
-    """Of a pair over a gap the mean over its steps, and in real time where frames are not as far apart as trained."""
+    """Takes the mean over the steps of a pair over a gap, in real time where frames are not as far apart as trained."""
     car, images, calibration = from_pretrained(checkpoint), frames_of(drive), calibration_of(drive)
     plain, slow = (list(track(car, images, calibration, fps=fps)) for fps in (1 / 0.103, 1 / 0.12))
     assert plain[0].reading is None

@@ -1,4 +1,4 @@
-"""What a sensor reads of whole drives: pairs over gaps, mirrored drives, windows in other worlds."""
+"""Checks what a sensor reads of whole drives: pairs over gaps, mirrored drives, windows in other worlds."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ LONGEST = 3
 
 
 def readings(values, observed=True, longest=1):
-    """Of two members, half a unit beside the values; of pairs of n steps n times as much, as at a constant speed."""
+    """Reads by two members, half a unit beside the values; for n steps n times as much, as at a constant speed."""
     values = torch.as_tensor(values)
     samples = values.unsqueeze(1) + torch.tensor([-0.5, 0.5])[None, :, None]
     spans = torch.stack([n * samples for n in range(1, LONGEST + 1)], 1)

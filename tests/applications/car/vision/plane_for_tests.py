@@ -34,7 +34,7 @@ def rotation(left: float, up: float) -> np.ndarray:
 
 
 def render(size, calibration, *, position=(0.0, 0.0), left=0.0, up=0.0, samples=3) -> np.ndarray:
-    """What a camera at ``position`` (x to the right and z ahead, in m) sees, uint8 ``[H, W]``.
+    """Draws what a camera at ``position`` (x to the right and z ahead, in m) sees, uint8 ``[H, W]``.
 
     The plane's details are about 0.1 m wide, those of the sky, which is infinitely far, 0.015 rad. Beyond 30 m the
     plane, finer than a pixel there, fades to grey.

@@ -62,7 +62,7 @@ def texture(rows=125, columns=414):
 
 
 def turned(image, left):
-    """What a camera sees of the same things far away after it has turned to the left."""
+    """Draws what a camera sees of the same things far away after it has turned to the left."""
     fx, fy, cx, cy = CALIBRATION
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     return cv2.warpPerspective(image, matrix @ rotation(left, 0, 0) @ np.linalg.inv(matrix), (414, 125))
@@ -109,7 +109,7 @@ def test_what_hides_the_scene_gives_no_corners():
 
 @pytest.mark.parametrize("doubled", [1, 2])
 def test_a_small_image_is_as_good_as_itself_enlarged(doubled):
-    """Where the optical axis is in the enlarged image is read off an enlarged ramp: pixels are not where they were."""
+    """Reads off an enlarged ramp where the optical axis is in the enlarged image: pixels are not where they were."""
     height, width, focal, center = 30, 104, 110.0 / doubled, (50.3, 14.2)
     small = large = pair((height, width), (focal, focal, *center), distance=1.0, turn=0.02)
     ramps = [np.tile(np.arange(size, dtype=np.float32), (2, 1)) for size in (width, height)]

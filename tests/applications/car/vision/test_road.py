@@ -29,7 +29,7 @@ def row_of(pitch):
 
 
 def peak(correlations):
-    """Where the parabola through the largest value and its neighbours is highest, in m."""
+    """Returns the maximum of the parabola through the largest value and its neighbours, in m."""
     k = int(correlations.argmax())
     before, top, after = (float(value) for value in correlations[k - 1 : k + 2])
     return ROAD_SHIFTS[k] + CELL * 0.5 * (before - after) / (before - 2 * top + after)

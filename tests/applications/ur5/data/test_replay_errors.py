@@ -1,4 +1,4 @@
-"""What is wrong with options, folders and files is said with their names and with what to do."""
+"""Raises for wrong options, folders and files with their names and with what to do."""
 
 import json
 import os

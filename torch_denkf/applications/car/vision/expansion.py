@@ -48,8 +48,8 @@ def focus_of_expansion(flow: Tensor) -> Expansion:
     :math:`n(p, e)^T (f(p) - B(p)\,\omega)`, is noise. Gauss-Newton steps minimise it over e and :math:`\omega` with
     Cauchy weights, which ignore what moves on its own, and a weak prior for a car that stands still.
 
-    A frame's error of the focus is about 0.005 rad on KITTI, nearly independent from frame to frame: an error of 4 % in
-    a distance that is measured on the road's plane, which a path averages out, as it does not a camera's unknown pitch.
+    On KITTI the focus is wrong by about 0.005 rad, nearly independently from frame to frame. A distance that is measured
+    on the road's plane is then wrong by 4 %. A path averages these errors out, but not those of an unknown pitch.
 
     Args:
         flow: ``[N, 3, 25, 79]``, motion to the right and down in tangents, and mismatch from 0 to 1; see

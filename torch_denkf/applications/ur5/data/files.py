@@ -271,7 +271,8 @@ def _entry(line: str) -> Entry:
         check_count(name, getattr(entry, name), least=least)
     if entry.rows > _MOST_ROWS or entry.frames > entry.rows:
         raise ValueError(f"a demo has up to {_MOST_ROWS} rows, and no more frames; got {entry.rows} and {entry.frames}")
-    if not isinstance(entry.file, str) or entry.file in ("", "..") or Path(entry.file).name != entry.file:
+    name = entry.file
+    if not isinstance(name, str) or name in ("", "..") or Path(name).name != name or "\0" in name:
         raise ValueError(f"it names a file outside of its folder, {entry.file!r}; such a list may read all of yours")
     if not isinstance(entry.sha256, str):
         raise ValueError(f"sha256 is a checksum in hexadecimal; got {entry.sha256!r}")

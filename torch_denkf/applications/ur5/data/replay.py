@@ -29,9 +29,8 @@ class UR5ExperienceReplay(EpisodeReplay):
     ===================== ============ ===========================================================================
     ``pixels``            [n,3,H,W]    float32 in [0, 1], zero where not observed; not in collections without any
     ``observed``          [n,1]        bool: this step was drawn
-    ``state``             [n,10]       float32, the truth, see :class:`torch_denkf.applications.ur5.UR5TableEnv`: J1..J6
-    rad, the
-                                       gripper's opening rad, x, y, z m
+    ``state``             [n,10]       float32, the truth, see :class:`torch_denkf.applications.ur5.UR5TableEnv`: J1 to
+                                       J6 and the gripper's opening in rad, x, y, z in m
     ``action``            [n,7]        float32, rad: sent in that state, it leads to the next row's
     ``success``           [n,1]        bool: the task is done in that state
     ``task``              [n,1]        int64: 0 pick, 1 push, 2 put-down

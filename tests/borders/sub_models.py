@@ -10,8 +10,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.borders.filters_made import IMAGE_SHAPE, SIGMA
 from benchmarks.reliability.target import Subject, Target, targets_of
+from tests.borders.filters_made import IMAGE_SHAPE, SIGMA
 from torch_denkf import modules as m
 from torch_denkf.applications.car import FlowSensor, UnicycleMotion, UnicycleNoise, UnicycleTransition
 from torch_denkf.applications.car.modules.member_gain import MemberGain
@@ -25,7 +25,7 @@ from torch_denkf.modules.stochastic import FlipoutLinear
 EYE, NAN = torch.eye(2), float("nan")
 BY_COLUMNS = d.matrix(2, 2).but("a row more")
 STDS = d.vector(2, positive=True) | {"a matrix": torch.ones(2, 3)}
-FLOOR = d.Wrong({"negative": -0.1, "nan": NAN, "beyond r": 5.0, "text": "much"})
+FLOOR = d.of(-0.1, NAN, 5.0, "much")
 
 
 def row(states: int = 2) -> TensorDict:
@@ -130,7 +130,7 @@ def _motions() -> Iterator[Subject]:
 
 
 def _observations() -> Iterator[Subject]:
-    reach = d.Wrong({"nan": [NAN], "negative": [-1.0], "zero": [0.0], "text": "far"})
+    reach = d.of([NAN], [-1.0], [0.0], "far")
     yield Subject(m.Select, lambda: {"dims": [0, 1]}, on_row, {"dims": d.indices(2)})
     yield Subject(m.LinearObservation, lambda: {"matrix": EYE.clone()}, on_row, {"matrix": BY_COLUMNS})
     yield Subject(m.LearnedObservation, lambda: {"network": nn.Linear(2, 2)}, on_row)

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.target import Subject, Target, targets_of
+from benchmarks.reliability.target import Subject, Target, annotations, targets_of
 from torch_denkf.baselines import BackpropKF, LSTMFilter
 from torch_denkf.filters import DPF, EKF, UKF, DEnKF, Filter, KalmanFilter, MixtureParticleFilter, ParticleFilter
 from torch_denkf.modules import (
@@ -31,7 +31,7 @@ SIGMA = {
     "beta": d.FINITE,
     "kappa": d.FINITE | {"minus the dimension": -2.0},
 }
-IMAGE_SHAPE = d.Wrong({"two numbers": (24, 24), "zero": (3, 0, 24), "negative": (3, -24, 24), "text": "big"})
+IMAGE_SHAPE = d.of((24, 24), (3, 0, 24), (3, -24, 24), "big")
 
 
 def step_on_zeros(filter: Filter) -> Any:
@@ -58,6 +58,11 @@ def _linear() -> dict[str, Any]:
 def _kalman() -> dict[str, Any]:
     noise = {"process_noise_cov": 0.1 * torch.eye(2), "noise_cov": 0.2 * torch.eye(2)}
     return {**_linear(), **noise, "mean": torch.zeros(2), "cov": torch.eye(2)}
+
+
+def _deviations() -> dict[str, Any]:
+    moments = {"mean": torch.zeros(2), "cov": torch.eye(2)}
+    return {**_linear(), **moments, "process_noise": [0.1, 0.1], "noise": [0.2, 0.2]}
 
 
 def _denkf() -> dict[str, Any]:
@@ -113,7 +118,9 @@ def targets() -> Iterator[Target]:
         "observation": OBSERVATION,
         **dict.fromkeys(("process_noise_cov", "noise_cov", "cov"), d.covariance(2)),
         "control": d.matrix(2, 1).but("a column more"),
+        "process_noise": None,
     }
+    deviations = {**dict.fromkeys(annotations(KalmanFilter)), **dict.fromkeys(("process_noise", "noise"), STDS)}
     backprop = {"transition": TRANSITION, "observation": OBSERVATION, "process_noise_cov": d.covariance(2)}
     lstm = {
         **dict.fromkeys(("features", "observation_dim"), d.COUNT_OR_NONE),
@@ -128,6 +135,7 @@ def targets() -> Iterator[Target]:
     yield from targets_of(
         "filters",
         Subject(KalmanFilter, _kalman, use, kalman, names),
+        Subject(KalmanFilter, _deviations, use, deviations, name="KalmanFilter of deviations"),
         Subject(EKF, _gaussian, use),
         Subject(UKF, _gaussian, use, SIGMA),
         Subject(BackpropKF, _backprop, use, backprop),
