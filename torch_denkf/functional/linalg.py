@@ -33,7 +33,7 @@ def cholesky(matrix: Tensor) -> Tensor:
     if is_written_out(matrix, LARGEST_FACTOR):
         return WrittenOut(matrix).factor()
     factor, info = torch.linalg.cholesky_ex(matrix)
-    return torch.where((info == 0)[..., None, None], factor, torch.nan)
+    return factor.masked_fill((info != 0)[..., None, None], torch.nan)
 
 
 def semidefinite_root(cov: Tensor) -> Tensor:
@@ -227,7 +227,7 @@ def as_covariance(noise: Tensor, mean: Tensor) -> Tensor:
                 [0., nan]])
     """
     if noise.ndim == mean.ndim:
-        return torch.where(noise < 0, torch.nan, noise).diag_embed()
+        return noise.masked_fill(noise < 0, torch.nan).diag_embed()
     return torch.where(is_covariance(noise)[..., None, None], noise, torch.nan)
 
 

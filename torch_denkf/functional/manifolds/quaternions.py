@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -10,31 +12,62 @@ from torch_denkf.functional.kernels.small_system import made_once
 __all__ = ["quaternion_of", "quaternion_product", "rotate", "rotation_matrix", "skew"]
 
 
+class Table:
+    """Picks numbers ``[*, M]`` of ``[*, N]``, times factors: a matrix of a few numbers in two calls.
+
+    Args:
+        places: of the numbers among the N.
+        factors: M of them.
+    """
+
+    def __init__(self, places: Sequence[int], factors: Sequence[float]):
+        self.places, self.factors = list(places), list(factors)
+
+    def __call__(self, numbers: Tensor) -> Tensor:
+        """Returns the numbers."""
+        dtype, device = numbers.dtype, numbers.device
+        places = made_once((self, device), lambda: torch.as_tensor(self.places, device=device))
+        factors = made_once((self, dtype, device), lambda: torch.as_tensor(self.factors, dtype=dtype, device=device))
+        return numbers.index_select(-1, places) * factors
+
+
+#: The matrix of products with a quaternion; its conjugate; its products with i, j and k; and that of cross products.
+_TIMES = Table([0, 1, 2, 3, 1, 0, 3, 2, 2, 3, 0, 1, 3, 2, 1, 0], [1, -1, -1, -1, 1, 1, -1, 1, 1, 1, 1, -1, 1, -1, 1, 1])
+_BACK = Table([0, 1, 2, 3], [1, -1, -1, -1])
+_TURNS = Table([1, 2, 3, 0, 3, 2, 3, 0, 1, 2, 1, 0], [-1, -1, -1, 1, -1, 1, 1, 1, -1, -1, 1, 1])
+_CROSS = Table([0, 2, 1, 2, 0, 0, 1, 0, 0], [0, -1, 1, 1, 0, -1, -1, 1, 0])
+#: The rotation matrix without the identity: twice two products each.
+_FIRST = Table(
+    [2, 3, 1, 0, 1, 0, 1, 0, 1, 3, 2, 0, 1, 0, 2, 0, 1, 2],
+    [-1, -1, 1, -1, 1, 1, 1, 1, -1, -1, 1, -1, 1, -1, 1, 1, -1, -1],
+)
+_SECOND = Table([2, 3, 2, 3, 3, 2, 2, 3, 1, 3, 3, 1, 3, 2, 3, 1, 1, 2], [2] * 18)
+
+
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
     """Multiplies quaternions ``[*, 4]``, w first: the rotation ``second``, then ``first``."""
-    a, b = first[..., :1], first[..., 1:]
-    c, d = second[..., :1], second[..., 1:]
-    w = a * c - (b * d).sum(-1, keepdim=True)
-    return torch.cat([w, torch.addcmul(torch.addcmul(_cross(b, d), c, b), a, d)], -1)
+    return (torch.unflatten(_TIMES(first), -1, (4, 4)) * second.unsqueeze(-2)).sum(-1)
 
 
-def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
-    """Rotates a vector ``[*, 3]`` from the body's axes to the world's by a quaternion ``[*, 4]``."""
+def rotate(quaternion: Tensor, vector: Tensor, *, back: bool = False) -> Tensor:
+    """Rotates a vector ``[*, 3]`` from the body's axes to the world's by a quaternion ``[*, 4]``; or ``back``."""
     w, axis = quaternion[..., :1], quaternion[..., 1:]
     twice = 2 * _cross(axis, vector)
-    return torch.addcmul(vector, w, twice) + _cross(axis, twice)
+    return torch.addcmul(vector, w, twice, value=-1 if back else 1) + _cross(axis, twice)
 
 
 def _cross(first: Tensor, second: Tensor) -> Tensor:
-    if first.ndim != second.ndim:  # torch pads no dimensions
+    if second.ndim == 1:  # torch pads no dimensions
+        second = second.expand_as(first)
+    elif first.ndim != second.ndim:
         first, second = torch.broadcast_tensors(first, second)
     return torch.linalg.cross(first, second)
 
 
 def rotation_matrix(quaternion: Tensor) -> Tensor:
     """Returns the matrix ``[*, 3, 3]`` of a quaternion ``[*, 4]``: its columns are the body's axes in the world's."""
-    axes = torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)
-    return rotate(quaternion.unsqueeze(-2), axes).mT
+    terms = torch.unflatten(_FIRST(quaternion) * _SECOND(quaternion), -1, (3, 3, 2))
+    return terms.sum(-1) + torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)
 
 
 def quaternion_of(matrix: Tensor) -> Tensor:
@@ -54,23 +87,16 @@ def quaternion_of(matrix: Tensor) -> Tensor:
 
 def skew(vector: Tensor) -> Tensor:
     """Returns the matrix ``[*, 3, 3]`` whose product with another vector is the cross product with it."""
-    axes = torch.eye(3, dtype=vector.dtype, device=vector.device)
-    return _cross(vector.unsqueeze(-2), axes).mT
+    return torch.unflatten(_CROSS(vector), -1, (3, 3))
 
 
 def products(point: Tensor) -> Tensor:
     """Returns the products of a point's quaternion with i, j and k, ``[*, 4, 3]``."""
-    w, x, y, z = point[..., :4].unbind(-1)
-    rows = [[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    return torch.unflatten(_TURNS(point), -1, (4, 3))
 
 
 def conjugate(quaternion: Tensor) -> Tensor:
-    return quaternion * made_once(("conjugate", quaternion.dtype, quaternion.device), lambda: _signs(quaternion))
-
-
-def _signs(like: Tensor) -> Tensor:
-    return torch.as_tensor([1.0, -1.0, -1.0, -1.0], dtype=like.dtype, device=like.device)
+    return _BACK(quaternion)
 
 
 def unit(quaternion: Tensor) -> Tensor:
