@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import NormalDist
+from typing import Literal
 
 import torch
 from tensordict import TensorDict
@@ -63,6 +64,7 @@ class Study:
     updates: int = 25  # of the learned noise
     seed: int = 0
     only: str = ""  # run filters alone whose name has this, with the settings of attitude.csv; other rows stay
+    data: tuple[Literal["simulated", "iCub"], ...] = ("simulated", "iCub")  # rows of the others stay, with only
     smoke: bool = False  # one short run: does it run?
 
 
@@ -322,6 +324,8 @@ def main() -> None:
     else:
         options = found_settings(study, settled)
     for name, (make, scored) in logs.items():
+        if name not in study.data:
+            continue
         data = make()
         if not study.only:
             rows += baseline_rows(name, data, scored)
@@ -335,7 +339,7 @@ def main() -> None:
     if study.out is not None:
         study.out.mkdir(parents=True, exist_ok=True)
         COLUMNS.write(rows, study.out / "attitude.csv")
-        if "iCub" in logs:
+        if "iCub" in logs and not study.only:
             mahonys = [row for row in rows if row["data"] == "simulated" and row["filter"].startswith("Mahony")]
             pull = min(mahonys, key=lambda row: row["tilt"])["setting"]
             picture(logs["iCub"][0](), pull, study.out / "attitude.png")

@@ -225,8 +225,9 @@ def again(study: Study, kind: str) -> list[dict]:
     else:
         robots = grounds(study, kind)
         names = f"{kind}, all grounds"
-    file = (study.out or RESULTS) / "validation.csv"
-    best = min((row for row in VALIDATED.read(file) if row["data"] == names), key=lambda row: row["nll"])
+    best = min(
+        (row for row in VALIDATED.read(RESULTS / "validation.csv") if row["data"] == names), key=lambda row: row["nll"]
+    )
     noises = LeggedNoises(**{key: best[key] for key in NOISES})
     variants = {"" if kind == "icub" else ", threshold": {"noises": noises}}
     if kind == "quadruped":

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import torch
 from tensordict import TensorDict
@@ -27,6 +28,7 @@ class Masks:
 
     out: Path | None = None  # folder for masks.md
     runs: Path = Path("runs/members")  # with the manipulator's trained motion, made where missing
+    tasks: tuple[Literal["reacher", "manipulator"], ...] = ("reacher", "manipulator")
     members: tuple[int, ...] = (32, 64, 128, 256, 512)
     draws: int = 4  # of the filter's noise
 
@@ -52,7 +54,7 @@ def manipulator(folder: Path) -> tuple[Callable[[int], Filter], TensorDict, slic
 def main() -> None:
     """Writes the table."""
     study = parse(Masks)
-    tasks = {"reacher": reacher(), "manipulator": manipulator(study.runs / "manipulator")}
+    tasks = {"reacher": reacher, "manipulator": partial(manipulator, study.runs / "manipulator")}
     lines = [
         "# Balanced masks",
         "",
@@ -61,7 +63,8 @@ def main() -> None:
         "",
         *head("task", "members", *(word for masks in MASKS for word in (f"{masks} masks", "held"))),
     ]
-    for name, (make, data, dims) in tasks.items():
+    for name in study.tasks:
+        make, data, dims = tasks[name]()
         for members in study.members:
             cells = []
             for masks in MASKS:

@@ -76,7 +76,7 @@ def chosen(task: Task, study: Study, members: int) -> float | None:
     return min(scores, key=lambda threshold: scores[threshold].error) if scores else None
 
 
-def page(rows: list[dict], study: Study, errors: dict[str, str]) -> str:
+def page(rows: list[dict], study: Study) -> str:
     """The table."""
     lines = [
         "# How many members?",
@@ -86,17 +86,17 @@ def page(rows: list[dict], study: Study, errors: dict[str, str]) -> str:
         "",
         *head("task", "error", "members", "without", "held", "with", "held", "threshold"),
     ]
-    for name in study.tasks:
+    for name in tasks.ERRORS:
         own = pick(rows, task=name)
         for row in own:
             if row["filter"] not in (PLAIN, BELIEVED):
-                lines.append(line(name, errors[name], row["filter"], *cells(row), "", "", ""))
+                lines.append(line(name, tasks.ERRORS[name], row["filter"], *cells(row), "", "", ""))
         for members in study.members:
             sized = [row for row in own if row.get("members") == members]
             without, believed = ((pick(sized, filter=kind) or [{}])[0] for kind in (PLAIN, BELIEVED))
             if sized:
                 threshold = f"{believed['threshold']:g}" if believed else ""
-                lines.append(line(name, errors[name], members, *cells(without), *cells(believed), threshold))
+                lines.append(line(name, tasks.ERRORS[name], members, *cells(without), *cells(believed), threshold))
     lines += ["", *made_by("members")]
     return "\n".join(lines) + "\n"
 
@@ -106,9 +106,9 @@ def cells(row: dict) -> tuple[str, str]:
     return (f"{row['error']:.3g}", f"{row['held']:.0%}") if row else ("", "")
 
 
-def draw(rows: list[dict], study: Study, errors: dict[str, str], file: Path) -> None:
+def draw(rows: list[dict], file: Path) -> None:
     """Errors above, coverage below, against the members; a column a task."""
-    names = [name for name in study.tasks if pick(rows, task=name)]
+    names = [name for name in tasks.ERRORS if pick(rows, task=name)]
     figure, axes = plt.subplots(
         2, len(names), figsize=(2.7 * len(names), 5), sharex=True, squeeze=False, layout="constrained"
     )
@@ -123,7 +123,7 @@ def draw(rows: list[dict], study: Study, errors: dict[str, str], file: Path) -> 
             if row["filter"] not in (PLAIN, BELIEVED):
                 above.axhline(row["error"], color="gray", linewidth=1, label=row["filter"])
         below.axhline(90, color="gray", linewidth=1, linestyle=":")
-        above.set(title=TITLES.get(name, name), ylabel=errors[name], xscale="log")
+        above.set(title=TITLES.get(name, name), ylabel=tasks.ERRORS[name], xscale="log")
         if max(row["error"] for row in own) > 5 * min(row["error"] for row in own):
             above.set_yscale("log")
             above.yaxis.set_major_formatter("{x:g}")
@@ -144,16 +144,14 @@ def main() -> None:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="members-")))
     file = None if study.out is None else study.out / "members.csv"
     rows = COLUMNS.read(file) if file is not None and file.exists() else []
-    errors = {}
     for name in study.tasks:
         task = made(study, name)
-        errors[name] = task.error
         for row in rows_of(task, study, rows):
             rows.append(row)
             print(row, flush=True)
             if file is not None:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 COLUMNS.write(rows, file)
-    write_page(page(rows, study, errors), None if study.out is None else study.out / "members.md")
+    write_page(page(rows, study), None if study.out is None else study.out / "members.md")
     if study.out is not None:
-        draw(rows, study, errors, study.out / "members.png")
+        draw(rows, study.out / "members.png")

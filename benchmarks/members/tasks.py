@@ -28,6 +28,7 @@ from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
 
 __all__ = [
+    "ERRORS",
     "Score",
     "Task",
     "cartpole",
@@ -43,6 +44,16 @@ __all__ = [
 ]
 
 LEVEL = 0.9  # of the intervals
+#: What the error of each task is of, with the unit.
+ERRORS = {
+    "walks": "error of the walks",
+    "reacher": "velocities, rad/s",
+    "cartpole": "velocities",
+    "manipulator": "velocities, rad/s",
+    "lorenz96": "error of the analysis",
+    "wheels": "place, m",
+    "ur5": "joints, degrees",
+}
 WALKS, WALK_STD, READING_STD = 10, 0.1, 0.5  # walks, each step of one, each reading of one
 
 
@@ -60,14 +71,12 @@ class Task:
 
     Attributes:
         name: of the task.
-        error: what its error is of, with the unit.
         score: of a filter with so many members, and the threshold of the significance or ``None``.
         validate: the same on other data, by which the threshold is chosen.
         reference: name and score of a filter without members; ``None`` for none.
     """
 
     name: str
-    error: str
     score: Callable[[int, float | None], Score]
     validate: Callable[[int, float | None], Score]
     reference: tuple[str, Score] | None = None
@@ -102,7 +111,7 @@ def wheels(runs: int = 8, steps: int = 6000) -> Task:
         return filtered(ensemble_filter(members, **localised(threshold)), data, skip, place)
 
     kalman = filtered(gaussian_filter(), test, skip, place)
-    return Task("wheels", "place, m", partial(score, test), partial(score, other), ("EKF", kalman))
+    return Task("wheels", partial(score, test), partial(score, other), ("EKF", kalman))
 
 
 def _walks(runs: int, steps: int, seed: int) -> TensorDict:
@@ -136,7 +145,7 @@ def walks(runs: int = 16, steps: int = 1000) -> Task:
     noises = {"process_noise": [WALK_STD] * WALKS, "noise": [READING_STD] * WALKS}
     exact = KalmanFilter(eye, eye, **noises, mean=torch.zeros(WALKS), cov=WALK_STD**2 * eye, observation_key="reading")
     best = ("Kalman filter", filtered(exact, test, skip))
-    return Task("walks", "error of the walks", partial(score, test), partial(score, other), best)
+    return Task("walks", partial(score, test), partial(score, other), best)
 
 
 def _weather(seeds: int, cycles: int, first: int) -> tuple[Tensor, Tensor]:
@@ -189,7 +198,7 @@ def lorenz96(seeds: int = 4, cycles: int = 600, inflations: tuple[float, ...] = 
             validate(members, threshold)
         return run("test", members, threshold)[chosen[members, threshold]]
 
-    return Task("lorenz96", "error of the analysis", score, validate)
+    return Task("lorenz96", score, validate)
 
 
 def manipulator(folder: Path, demos: int = 100, updates: int = 8000) -> Task:
@@ -206,7 +215,7 @@ def manipulator(folder: Path, demos: int = 100, updates: int = 8000) -> Task:
         localise(shipped, threshold)
         return filtered(shipped, data, 1, slice(2 * arm.joints, None))
 
-    return Task("manipulator", "velocities, rad/s", partial(score, test), partial(score, other))
+    return Task("manipulator", partial(score, test), partial(score, other))
 
 
 def localise(filter: torch.nn.Module, threshold: float | None) -> None:
@@ -243,7 +252,7 @@ def reacher(episodes: int = 10, steps: int = 400) -> Task:
     def score(data: TensorDict, members: int, threshold: float | None) -> Score:
         return filtered(resized(shipped, members, threshold), data, 1, slice(2, 4))
 
-    return Task("reacher", "velocities, rad/s", partial(score, test), partial(score, other))
+    return Task("reacher", partial(score, test), partial(score, other))
 
 
 def _pushes(noise: float, episodes: int, seed: int) -> TensorDict:
@@ -261,7 +270,7 @@ def cartpole(noise: float = 0.3, episodes: int = 20) -> Task:
         localise(filter, threshold)
         return filtered(filter, data, 1, slice(3, 5))
 
-    return Task("cartpole", "velocities", partial(score, test), partial(score, other))
+    return Task("cartpole", partial(score, test), partial(score, other))
 
 
 def ur5(folder: Path, demos: int = 200, others: int = 100) -> Task:
@@ -275,4 +284,4 @@ def ur5(folder: Path, demos: int = 200, others: int = 100) -> Task:
         found = evaluate_ur5_table(resized(shipped, members, threshold), data, cache=folder / "cache", progress=False)
         return Score(found["filter"]["joints, deg"], found["held by 90 % intervals"])
 
-    return Task("ur5", "joints, degrees", partial(score, test), partial(score, other))
+    return Task("ur5", partial(score, test), partial(score, other))

@@ -12,14 +12,12 @@ from torch import Tensor, nn
 
 from benchmarks.sequence07.chosen import FILTER, HALVES, LENS, SLIP_KEPT
 from torch_denkf import Filter, FusedFilter, FusedSensor
-from torch_denkf.functional.draws import exact_draws
 from torch_denkf.functional.manifolds import SE3, Euclidean, Product
 from torch_denkf.modules import (
     AroundState,
     EnsembleAnalysis,
     GaussianAround,
     MappedNoise,
-    NoisyTransition,
     SubModel,
     UKFTransition,
 )
@@ -151,25 +149,6 @@ def noise_paths(slip: bool = True) -> Tensor:
     return through
 
 
-class FewNoises(NoisyTransition):
-    """Process noise of fewer numbers than the tangent has: exact draws of these need fewer members.
-
-    Args:
-        motion: the motion.
-        through: how the noises ``[D, q]`` enter the tangent. Their variances stand under ``"process"``.
-    """
-
-    def __init__(self, motion: CarMotion, through: Tensor):
-        super().__init__(motion, Given("process", ("forecast", "noise"), len(through)), space=motion.space)
-        self.register_buffer("through", through)
-
-    def _add(self, ensemble, entries, call):
-        normal = self._noise(entries, [ensemble], call)[..., : self.through.shape[1]]
-        away = self.space.minus(ensemble, self.space.near(ensemble).unsqueeze(-2))
-        std = entries["process"][..., : self.through.shape[1]].sqrt().unsqueeze(-2)
-        return self.space.plus(ensemble, (exact_draws(normal, away) * std) @ self.through.mT)
-
-
 def speed_before(data: TensorDict) -> Tensor:
     """The last speed that corners have shown before each row, ``[*B, T, 1]`` in m/s."""
     rows = torch.arange(data.shape[-1]).unsqueeze(-1)
@@ -243,7 +222,7 @@ def car_filter(
         initial = AroundState(std, ensemble_size=members, state_key=key, space=motion.space)
         sensors["motion"] = FusedSensor(WhitenedMotion(), [1.0] * 6, observation_key="whitened", **seen)
         made = partial(EnsembleAnalysis, "etkf", **analysis)
-        filter = FusedFilter(FewNoises(motion, through), sensors, initial=initial, analysis=made)
+        filter = FusedFilter(motion, sensors, initial=initial, process_noise=noise, analysis=made)
     else:
         initial = GaussianAround(std, state_key="start", space=SPACE)
         if kind == "UKF":

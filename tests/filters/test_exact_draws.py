@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torch_denkf.applications.car.modules.unicycle_noise import UnicycleNoise
 from torch_denkf.baselines import IEnKS
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.functional.manifolds import SO3, Circle, Euclidean
@@ -13,11 +14,13 @@ from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import (
     AroundState,
+    CholeskyNoise,
     ConstantNoise,
     EnsembleAnalysis,
     GaussianPrior,
     LearnedObservation,
     LearnedTransition,
+    MappedNoise,
     NoisyTransition,
 )
 from torch_denkf.monitoring import Gated
@@ -26,6 +29,7 @@ from torch_denkf.smoothers import FixedLag
 E, S, T = 16, 3, 12
 Q = torch.tensor([0.3, 0.0, 0.1], dtype=torch.float64)
 R = torch.tensor([0.5, 0.2], dtype=torch.float64)
+FORECAST = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}
 
 
 @pytest.fixture(autouse=True)
@@ -218,6 +222,36 @@ def test_noise_of_some_dimensions_before_and_behind_the_motion():
         out = noisy(td.copy())["forecast", "ensemble"]
         torch.testing.assert_close(ensemble_cov(out), expected, rtol=0, atol=1e-10)
         torch.testing.assert_close(out.mean(-2), ensemble.mean(-2) @ f.T, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["variances", "covariance"])
+@pytest.mark.parametrize("dims", [None, [4, 0, 2, 5]])
+@pytest.mark.parametrize("space", [None, Euclidean(7)])
+def test_few_noises_of_many_dimensions_need_few_members(kind, dims, space):
+    """Of two noises in seven dimensions S + 9/8 q + 3 members are exact; of seven they were more."""
+    inner = ConstantNoise(torch.tensor([0.3, 2.0]), **FORECAST)
+    if kind == "covariance":
+        inner = CholeskyNoise(2, r=torch.tensor([0.3, 2.0]), in_features=7, **FORECAST)
+    ensemble, enters = torch.randn(5, 12, 7), torch.eye(7) if dims is None else torch.eye(7)[:, dims]
+    matrix = torch.randn(enters.shape[1], 2)
+    noisy = NoisyTransition(Still(), MappedNoise(inner, matrix), dims, space=space)
+    out = noisy(TensorDict({("belief", "ensemble"): ensemble}, [5]))["forecast", "ensemble"]
+    added, through = out - ensemble, enters @ matrix
+    q = through @ torch.tensor([0.09, 4.0]).diag() @ through.T
+    torch.testing.assert_close(ensemble_cov(added), q.expand(5, 7, 7), rtol=0, atol=1e-10)
+    assert added.mean(-2).abs().max() < 1e-10
+    assert (added.mT @ (ensemble - ensemble.mean(-2, keepdim=True))).abs().max() < 1e-10
+
+
+def test_few_noises_of_a_car_are_exact_with_few_members():
+    """Those of speed and turn rate, through a matrix that depends on the state."""
+    noise = UnicycleNoise(ConstantNoise(torch.tensor([0.3, 0.1]), **FORECAST), dt=0.1)
+    td = TensorDict({("belief", "ensemble"): torch.randn(3, 10, 5)}, [3])
+    added = NoisyTransition(Still(), noise)(td.copy())["forecast", "ensemble"] - td["belief", "ensemble"]
+    mean = td["belief", "ensemble"].mean(-2)
+    q = noise(TensorDict({"belief": {"mean": mean}, "forecast": {"mean": mean}}, [3]))["forecast", "noise"]
+    torch.testing.assert_close(ensemble_cov(added), q, rtol=0, atol=1e-10)
+    assert (added.mT @ (td["belief", "ensemble"] - mean.unsqueeze(-2))).abs().max() < 1e-10
 
 
 @pytest.mark.parametrize("space", [Euclidean(1) * Circle(), SO3()])

@@ -8,6 +8,8 @@ from torch.testing import assert_close
 
 from tests.motions.steps_for_tests import MOTIONS, frame, random_points
 from tests.motions.test_readings import DEEP, READINGS
+from torch_denkf.applications.legged.motion import LeggedMotion, LeggedSpace
+from torch_denkf.applications.legged.readings import FeetInBody, FeetRates
 from torch_denkf.functional.jacobians import jacobian_of_network
 from torch_denkf.functional.manifolds import SO3, Euclidean, Opposite
 from torch_denkf.fusion.parts import JoinedObservation, LinearMembers, OfOwnErrors, StateObservation
@@ -252,6 +254,29 @@ def test_known_readings(float64, monkeypatch, name):
     keys = {"observation_key": "reading", "noise_variance_key": "noise"}
     update = EKFAnalysis(reading, space=space, reading_space=own, **keys)
     assert_close(*known_and_differentiated(monkeypatch, update, td), rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("moves_key", [None, "moves"])
+@pytest.mark.parametrize("name", ["motion", "motion of other steps", "feet", "rates"])
+def test_a_legged_robots(float64, monkeypatch, name, moves_key):
+    """Two feet, which stand or not; the biases turn what they move."""
+    space, batch = LeggedSpace(2), (3,)
+    given = {"imu": torch.randn(3, 6), "legs": {"feet": torch.randn(3, 6)}, "contact": torch.rand(3, 2) > 0.4}
+    given |= {
+        "moves": torch.randn(3, 6),
+        "dt": torch.rand(3, 1),
+        "reading": torch.randn(3, 6),
+        "noise": torch.ones(3, 6),
+    }
+    td = entries(22, *batch, space=space, **given)
+    if name.startswith("motion"):
+        motion = LeggedMotion(2, 0.1 if name == "motion" else "dt", moves_key=moves_key).double()
+        module = moving(motion, 21, space=space)
+    else:
+        observation = FeetInBody(space) if name == "feet" else FeetRates(space, moves_key=moves_key)
+        keys = {"observation_key": "reading", "noise_variance_key": "noise"}
+        module = EKFAnalysis(observation, space=space, **keys)
+    assert_close(*known_and_differentiated(monkeypatch, module, td), rtol=1e-9, atol=1e-9)
 
 
 def test_at_a_landmark_range_and_bearing_have_no_gradient():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import warnings
 import weakref
 from collections.abc import Callable, Iterator, Sequence
@@ -71,7 +72,7 @@ class CudaRecorder:
         """Returns a function that replays what ``run`` launches, and returns the tensors that it returned."""
         graph = torch.cuda.CUDAGraph()
         context = {"pool": self.pool, "stream": self.stream, "capture_error_mode": "thread_local"}
-        with self._prepared(), torch.cuda.graph(graph, **context):
+        with _no_collection(), self._prepared(), torch.cuda.graph(graph, **context):
             results = run()
         self.pool = graph.pool()  # the backward pass reads what the forward pass saved there
 
@@ -80,6 +81,19 @@ class CudaRecorder:
             return results
 
         return replay
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Keeps the garbage collector from freeing an older graph, which would spoil the recording of a new one."""
+    gc.collect()
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 class CapturedSteps(CompiledSteps):

@@ -377,7 +377,7 @@ class Filter(Checked, TensorDictSequential):
         for key in (*structure.carry, *structure.controls):
             if previous_key(key) in entries:
                 entries[key] = entries[previous_key(key)]
-        if not entries.keys() >= structure.must:
+        if not structure.must.issubset(entries):
             diagnosis().check_inputs(structure, type(self).__name__, entries, tensordict)
         # A mark may be that of a slice of data, which goes on from the belief before it.
         known = entries.get(HAS_PREVIOUS)
@@ -385,8 +385,7 @@ class Filter(Checked, TensorDictSequential):
         drawn: Entries = {}
         if self.keeps_noise:
             places = (*dict(structure.modules), *([] if reset is None else ["initial"]))
-            drawn = self.draws.missing(entries, size, places=places)
-            entries.update(drawn)
+            entries.update(self.draws.missing(entries, size, places=places))
         if reset is None:
             written = self.take_step(entries, size)
         else:
@@ -429,7 +428,7 @@ class Filter(Checked, TensorDictSequential):
             without = diagnosis().readings_to_leave_out(self.structure, without)
             diagnosis().check_joined_readings(self.structure, without)
             entries = {key: value for key, value in entries.items() if key not in without}
-        if not entries.keys() >= self.structure.must:
+        if not self.structure.must.issubset(entries):
             diagnosis().check_inputs(self.structure, type(self).__name__, entries, tensordict, without)
         if without:
             written = self.steps.step(entries, Call(size), partial=True)

@@ -112,8 +112,7 @@ def controls_of(structure: Structure, entries: Entries, time: int) -> Entries:
         time: the dimension of time.
     """
     moved = {key: one_earlier(entries[key], time) for key in structure.controls if key in entries}
-    kept = {key: entries[previous_key(key)] for key in structure.controls if previous_key(key) in entries}
-    return moved | kept
+    return moved | {key: entries[previous_key(key)] for key in structure.controls if previous_key(key) in entries}
 
 
 def _or_first(marks: Tensor | None, size: torch.Size, device: torch.device) -> Tensor:

@@ -124,7 +124,7 @@ class Draws:
         else:
             row = {key: value.new_zeros(1, *value.shape[len(size) :]) for key, value in row.items()}
         call = Call(torch.Size([1] if size else []))
-        devices = {value.device for value in row.values() if value.is_cuda}
+        devices = [*dict.fromkeys(value.device for value in row.values() if value.is_cuda)]
         with (
             torch.random.fork_rng(devices=devices),
             set_recurrent_mode(False),

@@ -45,7 +45,7 @@ class Steps(NamedTuple):
         written: Entries = {}
         for place, module in modules:
             part = call._replace(place=place) if call.place == "self" else call.part(place)
-            if not partial or entries.keys() >= {*reads(module)[0]}:
+            if not partial or all(key in entries for key in reads(module)[0]):
                 out = run_module(module, entries, part)
             elif is_sequence(module):
                 out = self.run(named_modules_of(module), dict(entries), part, partial)
@@ -104,9 +104,9 @@ class Steps(NamedTuple):
         written.update(forecast)
         written.update(self.run(structure.posterior, entries, call, partial))
         for key, parts in structure.totals.items():
-            if written.keys() >= {*parts}:
+            if all(part in written for part in parts):
                 written[key] = sum((written[part] for part in parts[1:]), written[parts[0]])
-        if partial and not written.keys() >= {*structure.carry}:
+        if partial and not all(key in written for key in structure.carry):
             raise KeyError(
                 f"Without what is missing no module writes {list(structure.carry)}: give a mask that hides the "
                 "observation, or let the analysis name its reading_keys and its observed_key."
@@ -182,7 +182,7 @@ class Steps(NamedTuple):
         at_start = (*structure.carry, *structure.belief, *structure.forecast_of.values())
         for key in structure.beside if self.update_at_reset else structure.step_keys:
             if key in written and key not in at_start:
-                written[key] = where_rows(fresh, torch.zeros_like(written[key]), written[key])
+                written[key] = where_rows(fresh, written[key].new_zeros(()), written[key])
 
 
 def _unbound(entries: Entries, time: int, count: int) -> list[Entries]:

@@ -182,8 +182,7 @@ class Structure(NamedTuple):
 
 def _judge_of(key: NestedKey, kinds: Sequence[Belief]) -> Belief | None:
     """Returns the kind of belief that has its own ``finite`` for an entry."""
-    own = (kind for kind in kinds if key in kind.carry and type(kind).finite is not Belief.finite)
-    return next(own, None)
+    return next((kind for kind in kinds if key in kind.carry and type(kind).finite is not Belief.finite), None)
 
 
 def _sorted(

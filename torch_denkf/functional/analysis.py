@@ -27,7 +27,7 @@ from torch_denkf._checks import (
 )
 from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
 from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
-from torch_denkf.functional.kernels.small_system import WrittenOut, is_written_out, on_gpu
+from torch_denkf.functional.kernels.small_system import WrittenOut, identity_of, is_written_out, on_gpu
 from torch_denkf.functional.linalg import Solver, inverse_square_root_difference
 
 Scheme = Literal["sensor", "perturbed", "etkf", "sakov"]
@@ -171,14 +171,14 @@ def _in_few_launches(
     joint = torch.cat([predicted, forecast], -1)
     anomalies = joint - joint.mean(-2, keepdim=True)
     gram, cross = (anomalies[..., :dim].mT @ anomalies).split([dim, forecast.shape[-1]], -1)
-    solver = Solver(gram + ((size - 1) * noise).diag_embed())  # (E - 1) S, eq. 9
+    solver = Solver(torch.addcmul(gram, identity_of(gram), noise.unsqueeze(-1), value=size - 1))  # (E - 1) S, eq. 9
     ensemble = forecast + shift @ solver.solve(cross)  # eqs. 11 and 12
     if observed is not None:
         ensemble = torch.where(observed.any(-1)[..., None, None], ensemble, forecast)
     innovation = shift.mean(-2)
     nis = (size - 1) * solver.square(innovation.unsqueeze(-1))
     constant = count * math.log(2 * math.pi) - dim * math.log(size - 1)
-    return Analysis(ensemble, innovation, nis, -0.5 * (nis + solver.log_det() + constant))
+    return Analysis(ensemble, innovation, nis, torch.rsub(nis + solver.log_det(), -0.5 * constant, alpha=0.5))
 
 
 def check_analysis_arguments(

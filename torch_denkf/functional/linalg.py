@@ -238,14 +238,13 @@ def as_covariance(noise: Tensor, mean: Tensor) -> Tensor:
 def _correlation(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Returns correlations with a ridge, standard deviations, and their inverses, 0 where there is no variance."""
     dim = cov.shape[-1]
-    variance = cov.diagonal(dim1=-2, dim2=-1).detach()
-    std = variance.clamp(min=0).sqrt()
-    inverse = torch.where(std > 0, 1 / torch.where(std > 0, std, 1), 0)
-    ridge = 10 * dim * torch.finfo(cov.dtype).eps
-    diagonal = ((std <= 0).to(std) + ridge).diag_embed()
+    variance, ridge = cov.diagonal(dim1=-2, dim2=-1).detach(), 10 * dim * torch.finfo(cov.dtype).eps
     # A variance of less than zero is not taken for one of zero, unless it is round-off next to the largest.
     negative = (variance < -ridge * variance.abs().amax(-1, keepdim=True)).any(-1, keepdim=True)
-    std, inverse = torch.where(negative, torch.nan, std), torch.where(negative, torch.nan, inverse)
+    std = torch.where(negative, torch.nan, variance.clamp(min=0).sqrt())
+    empty = std == 0
+    inverse = std.masked_fill(empty, torch.inf).reciprocal()
+    diagonal = (empty.to(std) + ridge).diag_embed()
     correlation = (cov * inverse.unsqueeze(-1) * inverse.unsqueeze(-2) + diagonal) / (1 + ridge)
     return correlation, std, inverse
 

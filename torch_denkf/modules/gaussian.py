@@ -257,8 +257,7 @@ def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: fl
     if inflation != 1.0:
         inflated = inflation**2 * cov
         cov = inflated if observed is None else torch.where(observed.any(-1)[..., None, None], inflated, cov)
-    variance = cov.diagonal(dim1=-2, dim2=-1)
-    return update.mean, cov, variance, update.innovation, update.nis, update.log_likelihood
+    return update.mean, cov, cov.diagonal(dim1=-2, dim2=-1), update.innovation, update.nis, update.log_likelihood
 
 
 def further_keys(

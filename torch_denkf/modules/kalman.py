@@ -57,8 +57,7 @@ class MomentPrior(Initial):
 
     def compute(self, *, batch_size):
         """Returns the belief."""
-        values = (self.mean, self.cov, self.cov.diagonal())
-        return tuple(value.expand(*batch_size, *value.shape) for value in values)
+        return tuple(value.expand(*batch_size, *value.shape) for value in (self.mean, self.cov, self.cov.diagonal()))
 
 
 class GaussianAround(Initial):

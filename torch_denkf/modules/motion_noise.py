@@ -15,6 +15,7 @@ from torch_denkf.functional.linalg import as_covariance, semidefinite_root
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules.noise import ConstantNoise
+from torch_denkf.modules.process_noise import NoiseThrough
 from torch_denkf.modules.tensors import check_dims
 from torch_denkf.running import check_module, reads, run_module
 from torch_denkf.submodel import Call, Entries, Transition
@@ -93,7 +94,9 @@ class NoisyTransition(Transition):
         self.log_weight_key, self.space = unravel_key(log_weight_key), check_space("space", space)
         self.before, self.mean_key, self.forecast_mean_key = before, *map(unravel_key, (mean_key, forecast_mean_key))
         check_dims("dims", dims or (), once=True)
-        self.exact = is_exact(draws)
+        of_noise = [] if type(noise) is ConstantNoise else of_noise  # it looks at the state's width alone
+        self._means = self_made.intersection([*needed, *optional, *of_noise, *of_noise_optional])
+        self.exact, self.noise_dim = is_exact(draws), noise.noise_dim if isinstance(noise, NoiseThrough) else None
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
 
     def draw_noise(self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_):
@@ -101,8 +104,8 @@ class NoisyTransition(Transition):
         size = state_dim if self.dims is None else len(self.dims)
         if members is None or size is None:
             return None
-        shape = (*batch_size, members, size)
-        return torch.randn(shape, device=device, dtype=dtype, generator=generator)
+        size = min(size, self.noise_dim or size)
+        return torch.randn(*batch_size, members, size, device=device, dtype=dtype, generator=generator)
 
     def noise_sizes(self, ensemble, *_):
         """Returns E, and the state's size."""
@@ -117,50 +120,51 @@ class NoisyTransition(Transition):
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, entries = self.required(entries, key), dict(entries)
         log_weights = entries.get(self.log_weight_key)
-        entries[self.mean_key] = self._mean(state, log_weights)
+        entries[self.mean_key] = self._mean(self.mean_key, state, log_weights)
         if self.before:
             entries[key] = self._add(state, entries, call)
         written = run_module(self.module["transition"], entries, call.part("transition"))
         if not self.before:
             moved = written[out_key]
-            entries[self.forecast_mean_key] = self._mean(moved, log_weights)
+            entries[self.forecast_mean_key] = self._mean(self.forecast_mean_key, moved, log_weights)
             written = {**written, out_key: self._add(moved, entries, call)}
         return written
 
-    def _mean(self, members: torch.Tensor, log_weights: torch.Tensor | None) -> torch.Tensor:
-        """Returns the mean for the noise model; on a space, one that reads the state's width alone gets any member."""
+    def _mean(self, key: NestedKey, members: torch.Tensor, log_weights: torch.Tensor | None) -> torch.Tensor:
+        """Returns the mean for the parts, or any member where none reads its numbers."""
+        if key not in self._means:
+            return members[..., 0, :]
         if self.space is not None:
-            if isinstance(self.module["noise"], ConstantNoise):
-                return members[..., 0, :]
             return self.space.mean(members, None if log_weights is None else log_weights.exp())
         return members.mean(-2) if log_weights is None else weighted_mean(members, log_weights)
 
     def _add(self, ensemble: torch.Tensor, entries: Entries, call: Call) -> torch.Tensor:
         """Returns the ensemble with process noise."""
-        model = self.module["noise"]
-        covariance = run_module(model, entries, call.part("noise"))[unravel_key(model.out_keys[0])]
-        whole = ensemble.shape[-1] if self.space is None else self.space.tangent_dim
+        space, model, inside = self.space, self.module["noise"], call.part("noise")
+        whole = ensemble.shape[-1] if space is None else space.tangent_dim
         size = whole if self.dims is None else len(self.dims)
-        if covariance.shape[-1] != size:
+        few = self.noise_dim is not None and self.noise_dim < size
+        written, matrix = model.unmapped(entries, inside) if few else (run_module(model, entries, inside), None)
+        covariance = written[unravel_key(model.out_keys[0])]
+        width = (covariance if matrix is None else matrix.mT).shape[-1]
+        if width != size:
             dims = "all" if self.dims is None else self.dims.tolist()
             raise ValueError(
-                f"The noise model writes {covariance.shape[-1]} variances in {model.out_keys[0]!r} for {size} dims; "
+                f"The noise model writes {width} variances in {model.out_keys[0]!r} for {size} dims; "
                 f"give it an output for each of dims={dims}."
             )
         normal = cast("torch.Tensor | None", self._noise(entries, [ensemble], call))
         if normal is None:
             return ensemble
-        normal = normal[..., :size]  # a point may have more numbers than its tangent
+        normal = normal[..., : covariance.shape[-1]]  # a point may have more numbers than its tangent
         if self.exact and not call.raw and self.log_weight_key not in entries:
-            space = self.space
             away = ensemble if space is None else space.minus(ensemble, space.near(ensemble).unsqueeze(-2))
             normal = exact_draws(normal, away)
         if covariance.ndim == len(call.batch_size) + 1:
             noise = covariance.sqrt().unsqueeze(-2) * normal
         else:
             noise = normal @ semidefinite_root(as_covariance(covariance, covariance[..., 0])).mT
-        if self.space is not None:
-            if self.dims is not None:
-                noise = noise.new_zeros(*noise.shape[:-1], whole).index_add(-1, self.dims, noise)
-            return self.space.plus(ensemble, noise)
-        return ensemble + noise if self.dims is None else ensemble.index_add(-1, self.dims, noise)
+        noise = noise if matrix is None else noise @ matrix.mT
+        if self.dims is not None:
+            noise = noise.new_zeros(*noise.shape[:-1], whole).index_add(-1, self.dims, noise)
+        return ensemble + noise if space is None else space.plus(ensemble, noise)

@@ -26,7 +26,7 @@ from torch_denkf.modules.tensors import (
     register_matrix,
     variance_and_floor,
 )
-from torch_denkf.submodel import Initial, SubModel, role
+from torch_denkf.submodel import Call, Entries, Initial, SubModel, role
 
 __all__ = ["CholeskyNoise", "MappedNoise", "NoiseThrough", "as_process_noise"]
 
@@ -148,23 +148,33 @@ class CholeskyNoise(SubModel):
 
 
 class NoiseThrough(Wrapper):
-    """Runs another noise module and writes G Q G^T in its place, in the same entry; a sub-class gives G."""
+    """Runs another noise module and writes G Q G^T in its place, in the same entry; a sub-class gives G.
+
+    Attributes:
+        noise_dim: N, of the noise inside.
+    """
 
     place = "noise"
+    noise_dim: int
 
     def on_entries(self, entries, call):
         """Returns the covariance."""
-        written, key = self.run_inside(entries, call), self.out_keys[0]
-        noise = written[key]
+        written, matrix = self.unmapped(entries, call)
+        noise = written[self.out_keys[0]]
+        scaled = matrix * noise.unsqueeze(-2) if noise.ndim == len(call.batch_size) + 1 else matrix @ noise
+        return {**written, self.out_keys[0]: scaled @ matrix.mT}
+
+    def unmapped(self, entries: Entries, call: Call) -> tuple[Entries, torch.Tensor]:
+        """Returns what the noise module inside writes, and G."""
+        written = self.run_inside(entries, call)
+        noise = written[self.out_keys[0]]
         matrix = self._matrix(entries).to(noise.dtype)
         if noise.shape[-1] != matrix.shape[-1]:
             raise ValueError(
                 f"{type(self).__name__} maps noise of {matrix.shape[-1]} dimensions to {matrix.shape[-2]}; "
                 f"{type(self.module).__name__} writes {list(noise.shape)}."
             )
-        variances = noise.ndim == len(call.batch_size) + 1
-        scaled = matrix * noise.unsqueeze(-2) if variances else matrix @ noise
-        return {**written, key: scaled @ matrix.mT}
+        return written, matrix
 
     def _matrix(self, entries) -> torch.Tensor:
         """Returns G, ``[S, N]`` or ``[*B, S, N]``."""
@@ -192,6 +202,7 @@ class MappedNoise(NoiseThrough):
     def __init__(self, noise: TensorDictModuleBase, matrix: torch.Tensor):
         super().__init__(noise)
         register_matrix(self, "matrix", matrix, "[S, N]")
+        self.noise_dim = self.matrix.shape[-1]
 
     def _matrix(self, entries):
         return self.matrix

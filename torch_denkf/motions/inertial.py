@@ -13,7 +13,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf._checks import check_number, check_shape
-from torch_denkf.functional.manifolds import SE3, SE23, SO3, Euclidean, Product, rotate, rotation_matrix, skew
+from torch_denkf.functional.manifolds import SE23, SO3, Euclidean, Product, rotate, rotation_matrix, skew
 from torch_denkf.functional.manifolds.rotations import (
     Function,
     bend,
@@ -21,7 +21,7 @@ from torch_denkf.functional.manifolds.rotations import (
     fourth,
     half_versine,
     one_minus_sinc,
-    series,
+    several,
 )
 from torch_denkf.motions.motion import Motion, corner, densities, integrated, walked
 
@@ -117,7 +117,7 @@ class InertialMotion(Motion):
         gyro, accelerometer = readings if len(readings) == 2 else readings[0].split(3, -1)
         _, gyro_bias, accelerometer_bias = self.space.points(state)
         rate, force = torch.broadcast_tensors(gyro - gyro_bias, accelerometer - accelerometer_bias)
-        return corner(_inertial_jacobian(rate, force, dt), torch.eye(6).to(state))
+        return corner(_inertial_jacobian(rate, force, dt))
 
     def noise_of_step(self, dt):
         """Returns the noise of orientation, velocity, position, the gyro's bias and the accelerometer's."""
@@ -179,8 +179,7 @@ class AttitudeMotion(Motion):
         turn, by_rate = SO3().exp_and_jacobian((gyro - bias) * dt)
         moved = torch.cat([SO3().compose(orientation, turn), bias], -1)
         by_rate = -by_rate * (dt.unsqueeze(-1) if isinstance(dt, Tensor) else dt)
-        by_turn = rotation_matrix(turn).mT
-        return moved, corner(torch.cat([by_turn, by_rate], -1), torch.eye(3, dtype=state.dtype, device=state.device))
+        return moved, corner(torch.cat([rotation_matrix(turn).mT, by_rate], -1))
 
     def noise_of_step(self, dt):
         """Returns the noise of orientation and bias."""
@@ -226,10 +225,9 @@ def move_inertially(pose: Tensor, rate: Tensor, force: Tensor, dt: float | Tenso
         check_shape(name, value, [*value.shape[:-1], 3], "[*, 3]")
     orientation, velocity, position = pose[..., :4], pose[..., 4:7], pose[..., 7:]
     angles = rate * dt
-    square = angles.square().sum(-1, keepdim=True)
-    third = series(square, one_minus_sinc)
-    once = bend(angles, force * dt, series(square, half_versine), third)
-    twice = bend(angles, 0.5 * force * dt, 2 * third, 2 * series(square, fourth))
+    half, third, falling = several(angles.square().sum(-1, keepdim=True), half_versine, one_minus_sinc, fourth)
+    once = bend(angles, force * dt, half, third)
+    twice = bend(angles, 0.5 * force * dt, 2 * third, 2 * falling)
     fall = -gravity * torch.eye(3, dtype=pose.dtype, device=pose.device)[2] * dt
     turned = SO3().compose(orientation, SO3().exp(angles))
     moved = position + (velocity + 0.5 * fall + rotate(orientation, twice)) * dt
@@ -249,27 +247,30 @@ def _inertial_jacobian(rate: Tensor, force: Tensor, dt: float | Tensor) -> Tenso
     Velocity and position are seen from the body's axes, before the step and behind it. What the force adds to the
     velocity is what a twist of turn and force moves a body by; to the position it adds the integral of that.
     """
-    pose, angles, impulse = SE3(), rate * dt, force * dt
+    angles, impulse = rate * dt, force * dt
     dt = dt.unsqueeze(-1) if isinstance(dt, Tensor) else dt
-    back = SO3().adjoint(SO3().exp(-angles))  # the axes behind the step from those before it
-    by_angles = pose.right_jacobian(torch.cat([angles, impulse], -1))
-    turn, add = by_angles[..., :3, :3], by_angles[..., 3:, :3]
     square = angles.square().sum(-1, keepdim=True)
-    third, fall = series(square, one_minus_sinc), series(square, fourth)
-    once = bend(angles, impulse, series(square, half_versine), third)
-    twice = bend(angles, 0.5 * impulse, 2 * third, 2 * fall)
-    cross = torch.linalg.cross(angles, impulse)
-    again = torch.linalg.cross(angles, cross)
-    by_square = -(series(square, fifth) * cross + series(square, _sixth) * again)
-    third, fall = third.unsqueeze(-1), fall.unsqueeze(-1)
+    half, third, fall, low, lower = (
+        value.unsqueeze(-1) for value in several(square, half_versine, one_minus_sinc, fourth, fifth, _sixth)
+    )
+    eye = torch.eye(3, dtype=rate.dtype, device=rate.device)
     w, f = skew(angles), skew(impulse)
-    unit = torch.eye(3, dtype=rate.dtype, device=rate.device).expand_as(w)
-    of_angles = 2 * by_square.unsqueeze(-1) * angles.unsqueeze(-2) - third * f - fall * (w @ f + skew(cross))
-    of_force = 0.5 * unit + third * w + fall * (w @ w)
-    zero = torch.zeros_like(unit)
+    w2 = w @ w
+    back = eye - (1 - square.unsqueeze(-1) * third) * w + half * w2  # the axes behind the step from those before it
+    once, twice = eye + half * w + third * w2, 0.5 * eye + third * w + fall * w2  # of the impulse, and its integral
+    by_turn = 2 * w @ f - f @ w
+    cross = w @ impulse.unsqueeze(-1)
+    again, along = w @ cross, 2 * angles.unsqueeze(-2)
+    of_once = ((fall - third / 2) * cross - low * again) @ along - half * f - third * by_turn
+    of_twice = -(low * cross + lower * again) @ along - third * f - fall * by_turn
+    moved = skew((torch.stack([once, twice], -3) @ impulse[..., None, :, None]).squeeze(-1))
+    columns = torch.cat([moved[..., 0, :, :], moved[..., 1, :, :] * dt, of_once, once, dt * of_twice, dt * twice], -1)
+    columns = back @ columns
+    by_once, by_twice, *by_biases = columns.split([3, 3, 6, 6], -1)
+    zero = torch.zeros_like(back)
     rows = [
-        [back, zero, zero, -dt * turn, zero],
-        [-back @ skew(once), back, zero, -dt * add, -dt * turn],
-        [-back @ skew(twice) * dt, back * dt, back, -dt * dt * (back @ of_angles), -dt * dt * (back @ of_force)],
+        [back, zero, zero, -dt * (back @ once), zero],
+        [-by_once, back, zero, -dt * by_biases[0]],
+        [-by_twice, back * dt, back, -dt * by_biases[1]],
     ]
     return torch.cat([torch.cat(row, -1) for row in rows], -2)

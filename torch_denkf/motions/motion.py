@@ -143,8 +143,13 @@ def carried(space: Space, twist: Tensor, dt: Any) -> tuple[Tensor, Tensor]:
     return space.adjoint(space.exp(-twist)), rate
 
 
-def corner(above: Tensor, below: Tensor) -> Tensor:
-    """Returns rows ``[*, N, D]``, and below them those of numbers that a motion does not mix, ``[*, D - N, D - N]``."""
+def corner(above: Tensor, below: Tensor | None = None) -> Tensor:
+    """Returns rows ``[*, N, D]``, and below them those of numbers that a motion does not mix, ``[*, D - N, D - N]``.
+
+    By default these stay as they are.
+    """
+    if below is None:
+        below = torch.eye(above.shape[-1] - above.shape[-2], dtype=above.dtype, device=above.device)
     padded = nn.functional.pad(below, (above.shape[-2], 0))
     return torch.cat([above, padded.expand(*above.shape[:-2], *padded.shape[-2:])], -2)
 

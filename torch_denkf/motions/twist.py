@@ -64,7 +64,7 @@ class ConstantTwist(Motion):
         """Returns the Jacobian of the pose by itself and by its twist; the twist stays."""
         twist = self.space.points(state)[1]
         by_pose, by_rate = carried(self.pose_space, twist * dt, dt)
-        return corner(torch.cat([by_pose, by_rate], -1), torch.eye(self.pose_space.tangent_dim).to(state))
+        return corner(torch.cat([by_pose, by_rate], -1))
 
     def noise_of_step(self, dt):
         """Returns the noise of the pose, then of the twist."""

@@ -279,8 +279,7 @@ def score_gaussian(errors: Tensor, mask: Tensor, cov: Tensor, score: str, scale:
         added = torch.where(mask, units, -0.5 * math.log(2 * math.pi))
         return added.sum(-1) - gaussian_log_prob(errors, zero, cov)
     # Without spread the CRPS is the absolute error; a spread of 1e-6 is as good as none, and has a derivative.
-    variance = cov.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12)
-    return mean_of(crps_gaussian(zero, variance, errors), mask)
+    return mean_of(crps_gaussian(zero, cov.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12), errors), mask)
 
 
 def score_ensemble(truth: Targets, ensemble: Tensor) -> tuple[Tensor, Tensor]:

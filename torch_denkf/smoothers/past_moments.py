@@ -64,8 +64,7 @@ class CrossTransition(Wrapper, Transition):
 
     def without_step(self, entries):
         """Returns the covariances at a reset, zero: there is no state before."""
-        cov = self.required(entries, self.in_keys[1])
-        return {key: torch.zeros_like(cov) for key in self.out_keys[2:]}
+        return {key: torch.zeros_like(self.required(entries, self.in_keys[1])) for key in self.out_keys[2:]}
 
 
 def _copies(prefix: str, lag: int, belief: Entries) -> list[torch.Tensor]:

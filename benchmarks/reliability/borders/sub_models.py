@@ -169,7 +169,7 @@ def _networks() -> Iterator[Subject]:
     yield Subject(m.ImageSensor, image, on_row, images)
     yield Subject(m.VectorSensor, vector, on_row, readings)
     yield Subject(FlowSensor, lambda: {"dt": 0.1}, wrong=flow)
-    yield Subject(MemberGain, lambda: {"std": [0.1, 0.1], "ensemble_size": 8}, on_row)
+    yield Subject(MemberGain, lambda: {"std": [0.1, 0.1], "ensemble_size": 8, "in_key": ("sensor", "ensemble")}, on_row)
     yield Subject(m.KeypointTrunk, lambda: trunk, on_images, {"channels": d.CELLS})
     yield Subject(SpatialSoftArgmax, lambda: {"channels": 3}, on_images, {"channels": d.COUNT})
     yield Subject(LSTMUpdate, lambda: {"state_dim": 2, "features": 4}, wrong=update)

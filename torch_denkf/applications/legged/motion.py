@@ -10,7 +10,17 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf.applications.legged.noises import LeggedNoises
-from torch_denkf.functional.manifolds import SE23, Euclidean, Opposite, Product, Space, Turned, rotate
+from torch_denkf.functional.manifolds import (
+    SE23,
+    Euclidean,
+    Opposite,
+    Product,
+    Space,
+    Turned,
+    rotate,
+    rotation_matrix,
+    skew,
+)
 from torch_denkf.modules import SubModel
 from torch_denkf.motions import InertialMotion
 from torch_denkf.motions.motion import Motion
@@ -141,6 +151,8 @@ class LeggedMotion(Motion):
         moves_key: how fast standing feet move, ``[*B, 3 F]`` in m/s, in the sensor's axes; ``None`` where they rest.
     """
 
+    drift: Tensor
+
     def __init__(
         self,
         feet: int,
@@ -158,6 +170,10 @@ class LeggedMotion(Motion):
         space: Any = LeggedSpace(feet)  # no Product: the motion uses the space as a whole
         super().__init__(space, dt, actions, ("belief", "ensemble"), ("forecast", "ensemble"))
         self.inertial = InertialMotion(dt, gravity=gravity)
+        # Of errors of orientation, velocity and position: what they change by in a second.
+        drift = torch.zeros(9, 9)
+        drift[3:6, :3], drift[6:, 3:6] = skew(torch.tensor([0.0, 0.0, -gravity])), torch.eye(3)
+        self.register_buffer("drift", drift, persistent=False)
 
     def move(self, state, imu, feet, contact, *moves, dt):
         """Returns the states one step later."""
@@ -170,6 +186,41 @@ class LeggedMotion(Motion):
             standing = standing + dt * rotate(turn, moves[0].unflatten(-1, (-1, 3))).flatten(-2)
         moved = torch.where(stands, standing.unflatten(-1, (-1, 3)), by_joints)
         return torch.cat([base, moved.flatten(-2)], -1)
+
+    def move_and_gradient(self, state, imu, feet, contact, *moves, dt):
+        """Returns both; steps on the space turn the world, so that only gravity and the biases mix what they move."""
+        moved = self.move(state, imu, feet, contact, *moves, dt=dt)
+        to_world, stands = rotation_matrix(moved[..., :4]).unsqueeze(-3), contact.repeat_interleave(3, -1) > 0
+        by_biases = self.inertial.gradient(state[..., :16], imu, dt=dt)[..., :9, 9:]
+        turn, *others = (to_world @ by_biases.unflatten(-2, (3, 3))).unbind(-3)
+        lever = torch.cat([moved[..., 4:10], state[..., 16:]], -1).unflatten(-1, (-1, 3))
+        turned = torch.linalg.cross(*torch.broadcast_tensors(lever.unsqueeze(-1), turn.unsqueeze(-3)), dim=-2)
+        by_biases = torch.cat([turn, turned[..., :2, :, :].flatten(-3, -2) + torch.cat(others, -2)], -2)
+        return moved, self._assembled(by_biases, turned[..., 2:, :, :].flatten(-3, -2), stands, dt)
+
+    def _assembled(self, by_biases: Tensor, feet_by_biases: Tensor, stands: Tensor, dt: Any) -> Tensor:
+        """Returns the Jacobian; the rows of a foot in the air are those of the position.
+
+        Args:
+            by_biases: rows of orientation, velocity and position, columns of the biases, ``[*, 9, 6]``.
+            feet_by_biases: rows of feet that stand, ``[*, 3 F, 6]``.
+            stands: which rows these are, ``[*, 3 F]``.
+            dt: seconds, a number or ``[*, 1]``.
+        """
+        batch, count = by_biases.shape[:-2], stands.shape[-1]
+        eye = torch.eye(15 + count, dtype=by_biases.dtype, device=by_biases.device)
+        step = (dt.unsqueeze(-1) if isinstance(dt, Tensor) else dt) * self.drift.to(eye)
+        base = eye[:9, :9] + step + step @ step / 2
+        base = torch.cat([base.expand(*batch, 9, 9), by_biases], -1)
+        place = base[..., 6:, :].repeat(*[1] * len(batch), count // 3, 1)
+        on_ground = nn.functional.pad(feet_by_biases, (9, 0))
+        feet = torch.where(stands.unsqueeze(-1), on_ground, place)
+        rows = [
+            nn.functional.pad(base, (0, count)),
+            eye[9:15].expand(*batch, 6, 15 + count),
+            torch.cat([feet, stands.to(eye).diag_embed()], -1),
+        ]
+        return torch.cat(rows, -2)
 
 
 class LeggedMotionNoise(SubModel):

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_number
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.functional.kernels.small_system import on_gpu
-from torch_denkf.functional.manifolds import SO3, Space, quaternion_product, rotate
+from torch_denkf.functional.manifolds import SO3, Euclidean, Space, quaternion_product, rotate, rotation_matrix, skew
 from torch_denkf.modules import SubModel
 from torch_denkf.motions.time_step import keys_of_dt
 
@@ -98,12 +98,18 @@ class FeetInBody(SubModel):
         out_key: NestedKey = ("forecast", "observation"),
     ):
         super().__init__(nn.Identity(), [in_key], [out_key])
-        self.observed_space = space
+        self.observed_space, self.tangents_of = space, (space, Euclidean(space.tangent_dim - 15))
 
     def compute(self, state):
         """Returns the predicted readings."""
         self.observed_space.check(point=state)
         return _feet(state).flatten(-2)
+
+    def jacobian(self, state):
+        """Returns both: what turns the world changes no reading."""
+        to_body = rotation_matrix(state[..., None, :4]).mT
+        none = torch.zeros_like(to_body)
+        return self.compute(state), _of_feet(state, to_body, [none, none, -to_body, none, none])
 
 
 class FeetRates(SubModel):
@@ -129,15 +135,41 @@ class FeetRates(SubModel):
         out_key: NestedKey = ("forecast", "observation"),
     ):
         super().__init__(nn.Identity(), [in_key, imu_key, *([] if moves_key is None else [moves_key])], [out_key])
-        self.observed_space = space
+        self.observed_space, self.tangents_of = space, (space, Euclidean(space.tangent_dim - 15))
 
     def compute(self, state, imu, moves=None):
         """Returns the predicted readings."""
         self.observed_space.check(point=state)
-        turn = (imu[..., :3].to(state.dtype).unsqueeze(-2) - state[..., 10:13]).unsqueeze(-2)
+        turn = self._turn(state, imu)
         velocity = rotate(SO3().inverse(state[..., :4]), state[..., 4:7]).unsqueeze(-2)
         rates = (-velocity - torch.linalg.cross(*torch.broadcast_tensors(turn, _feet(state)))).flatten(-2)
         return rates if moves is None else rates + moves.to(rates.dtype).unsqueeze(-2)
+
+    def jacobian(self, state, imu, moves=None):
+        """Returns both."""
+        to_body, turn = rotation_matrix(state[..., None, :4]).mT, self._turn(state, imu).unsqueeze(-1)
+        by_place = torch.linalg.cross(*torch.broadcast_tensors(turn, to_body), dim=-2)
+        none = torch.zeros_like(to_body)
+        columns = [none, -to_body, by_place, -skew(_feet(state)), none]
+        return self.compute(state, imu, moves), _of_feet(state, -by_place, columns)
+
+    def _turn(self, state: Tensor, imu: Tensor) -> Tensor:
+        return (imu[..., :3].to(state.dtype).unsqueeze(-2) - state[..., 10:13]).unsqueeze(-2)
+
+
+def _of_feet(state: Tensor, by_itself: Tensor, columns: list[Tensor]) -> Tensor:
+    """Returns a Jacobian ``[*, 3 F, 15 + 3 F]`` from its blocks ``[*, F, 3, 3]``, or ``[*, 1, 3, 3]`` of all feet.
+
+    Args:
+        state: where, ``[*, 16 + 3 F]``.
+        by_itself: of a foot's reading by that foot.
+        columns: of the readings by orientation, velocity, position and the biases.
+    """
+    count = (state.shape[-1] - 16) // 3
+    eye = torch.eye(count, dtype=state.dtype, device=state.device)
+    own = (eye[:, None, :, None] * by_itself.unsqueeze(-2)).flatten(-2)
+    shared = [block.expand(*own.shape[:-1], 3) for block in columns]
+    return torch.cat([*shared, own], -1).flatten(-3, -2)
 
 
 def _feet(state: Tensor) -> Tensor:

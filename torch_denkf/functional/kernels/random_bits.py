@@ -151,7 +151,7 @@ def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torc
     if draws.dtype != torch.bool and on_gpu(draws):
         draws = draws >= round(256 * rate)
     if draws.dtype == torch.bool:
-        return draws.to(dtype) * kept
+        return draws * kept if dtype == torch.get_default_dtype() else draws.to(dtype) * kept
     # From byte to byte the line rises by 1024, more than twice the largest factor (256): at the first byte that is
     # kept it stands at twice the factor, at the one before below zero, whatever the rounding. So the ends are exact.
     line = draws.to(torch.promote_types(dtype, torch.float32))  # a copy, so in place from here

@@ -49,6 +49,12 @@ def on_gpu(tensor: Tensor) -> bool:
     return tensor.device.type in GPUS
 
 
+def identity_of(matrix: Tensor) -> Tensor:
+    """Returns the identity ``[N, N]`` beside matrices ``[*B, N, N]``; not to be written to."""
+    size, dtype, device = matrix.shape[-1], matrix.dtype, matrix.device
+    return made_once(("identity", size, dtype, device), lambda: torch.eye(size, dtype=dtype, device=device))
+
+
 def inverse_of(matrix: Tensor, ridge: float = 0) -> tuple[Tensor, Tensor]:
     """Returns the inverse of a symmetric M, N x N, and log det M, in few launches and without a look at the numbers.
 
@@ -68,7 +74,7 @@ def inverse_of(matrix: Tensor, ridge: float = 0) -> tuple[Tensor, Tensor]:
                 [-1.,  2.]]), tensor([True]))
     """
     size = matrix.shape[-1]
-    identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    identity = identity_of(matrix).expand_as(matrix)
     matrix = torch.add(matrix, identity, alpha=ridge) if ridge else matrix
     if not 0 < size <= LARGEST:
         factor, info = torch.linalg.cholesky_ex(matrix)

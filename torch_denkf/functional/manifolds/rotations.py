@@ -192,22 +192,22 @@ class _RotationAndVectors(Space):
 
     def right_jacobian(self, tangent):
         """Returns the matrix of Solà et al., eq. 143; Barfoot, eq. 7.86, of the negative tangent."""
-        back = -tangent
-        square = back[..., :3].square().sum(-1)[..., None, None]
-        turn = skew(back[..., :3])
+        angles, lower = tangent[..., :3], (fourth, fifth) if self.vectors else ()
+        square = angles.square().sum(-1, keepdim=True)
+        half, third, *lower = (value.unsqueeze(-1) for value in several(square, half_versine, one_minus_sinc, *lower))
+        turn, unit = skew(angles), eye(angles, 3)
         turn2 = turn @ turn
-        half, third = several(square, half_versine, one_minus_sinc)
-        block = torch.addcmul(torch.addcmul(eye(back[..., :3], 3), half, turn), third, turn2)
+        block = torch.addcmul(torch.addcmul(unit, half, turn, value=-1), third, turn2)
         if not self.vectors:
             return block
-        move = skew(self._vectors(back, 3))
-        turn, turn2, square, third = (value.unsqueeze(-3) for value in (turn, turn2, square, third))
-        both = turn @ move
-        around = both @ turn
-        low = 0.5 * move + third * (both + move @ turn + around)
-        low = low + series(square, fourth) * (turn @ both + move @ turn2 - 3 * around)
-        low = low + series(square, fifth) * (around @ turn + turn @ around)
-        return self._matrix(block, low)
+        # With vectors v, products of w x and v x are w v^T and the like.
+        (fall, low), vectors = lower, self._vectors(tangent, 3)
+        turns = angles.unsqueeze(-2).expand_as(vectors)
+        again = torch.linalg.cross(turns, torch.linalg.cross(turns, vectors))
+        outer, along = vectors.unsqueeze(-1) * turns.unsqueeze(-2), (turns * vectors).sum(-1)[..., None, None]
+        shared = third * (turn - 2 * unit) - fall * turn - 2 * low * turn2
+        low = skew(-0.5 * vectors - fall * again) + third.unsqueeze(-3) * (outer + outer.mT)
+        return self._matrix(block, torch.addcmul(low, along, shared.unsqueeze(-3)))
 
     def exp_and_jacobian(self, tangent):
         """Returns point and Jacobian; for a rotation alone from three functions of its angle."""

@@ -11,13 +11,25 @@ from torch_denkf.applications.car.modules.member_gain import MemberGain
 def test_factors_are_lognormal_quantiles_that_stay_with_their_members(float64):
     gain = MemberGain([0.1, 0.3], ensemble_size=50, in_key="y")
     samples = torch.rand(7, 50, 2) + 1
-    out = gain(TensorDict({"y": samples}, [7]))["y"]
+    out = gain(TensorDict({"y": samples}, [7]))["y"].detach()
     factor = (out / samples).log()
     torch.testing.assert_close(factor, factor[:1].expand_as(factor), rtol=0, atol=1e-12)  # the same at all times
     for dim, std in enumerate((0.1, 0.3)):
         quantiles = torch.as_tensor(norm.ppf((torch.arange(50) + 0.5).numpy() / 50))
         expected = std * quantiles / quantiles.square().mean().sqrt()
+        expected = expected + expected.neg().exp().mean().log()
         torch.testing.assert_close(factor[0, :, dim].sort().values, expected, rtol=0, atol=1e-12)
-        assert float(factor[0, :, dim].square().mean().sqrt()) == pytest.approx(std)
+        assert float(factor[0, :, dim].std(correction=0)) == pytest.approx(std)
+        assert float(factor[0, :, dim].neg().exp().mean()) == pytest.approx(1.0, abs=1e-12)
     # Dimensions are shuffled apart: of 50 pairs, a correlation is 0 +- 0.14.
     assert abs(float(torch.corrcoef(factor[0].T)[0, 1])) < 0.42
+
+
+@pytest.mark.parametrize("std", [0.05, 0.3])
+def test_members_that_are_drawn_to_one_reading_have_its_mean(std, float64):
+    """Each member meets the reading by its own gain; without the shift they would be e^(std^2 / 2) times too fast."""
+    gain, reading, speed = MemberGain([std], ensemble_size=32, in_key="y"), 12.0, torch.full((32, 1), 5.0)
+    for _ in range(200):
+        speed = speed + 0.3 * (reading - gain(TensorDict({"y": speed}))["y"].detach())
+    assert float(speed.mean()) == pytest.approx(reading, abs=1e-9)
+    assert float(speed.log().std(correction=0)) == pytest.approx(std)

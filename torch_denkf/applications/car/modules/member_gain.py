@@ -1,4 +1,4 @@
-"""A gain of each sample of a learned reading, drawn once."""
+"""A gain of what each member predicts to be read, drawn once."""
 
 from __future__ import annotations
 
@@ -16,32 +16,37 @@ __all__ = ["MemberGain"]
 
 
 class MemberGain(SubModel):
-    r"""Multiplies the sensor's samples by factors that belong to the members: :math:`\tilde y^i e^{\sigma z^i}`.
+    r"""Multiplies what each member predicts by a factor of its own: :math:`\hat y^i c e^{\sigma z^i}`.
 
     A camera that is mounted a little lower reads all speeds a little too high, today and tomorrow. Drawn again for each
     frame, such an error averages out over time, and the filter becomes too sure of itself; or its noise model takes the
     error for white noise, and the filter follows too slowly. Here the :math:`z^i` are the normal quantiles of E
-    members, always the same: each member keeps its calibration, the ensemble its doubt. Put it behind the sensor.
+    members, always the same: each member keeps its calibration, the ensemble its doubt. Put it behind the observation.
+
+    An analysis draws member i to the speed y that was read over the member's gain. For the mean of the members to be y,
+    that of the gains' inverses must be 1, so :math:`c = \frac{1}{E} \sum_i e^{-\sigma z^i}`. Without it the speed would
+    be too high by the factor c, about :math:`e^{\sigma^2 / 2}`, and the path too long.
 
     Args:
         std: standard deviation :math:`\sigma` of the logarithm of the factor, for each observation dimension ``[O]``,
             before training; it is learned.
         ensemble_size: E.
         seed: of the order in which the members take the quantiles, for each dimension its own.
-        in_key: the sensor's samples ``[*B, E, O]``.
+        in_key: what the members predict, ``[*B, E, O]``.
         out_key: where to write them, by default in their place.
 
     Raises:
-        ValueError: if a standard deviation is not positive, or the samples are of another number of members.
+        ValueError: if a standard deviation is not positive, or there is another number of members.
 
     Source:
         The "consider" parameters of Schmidt (1966), which a filter doubts but does not estimate, as an ensemble.
 
     Example:
         >>> from tensordict import TensorDict
-        >>> td = TensorDict({("sensor", "ensemble"): torch.full((4, 1), 10.0)})
-        >>> MemberGain([0.1], ensemble_size=4)(td)["sensor", "ensemble"].flatten().sort().values.round(decimals=1)
-        tensor([ 8.7000,  9.6000, 10.4000, 11.5000], grad_fn=...)
+        >>> td = TensorDict({("forecast", "observation"): torch.full((4, 1), 10.0)})
+        >>> predicted = MemberGain([0.1], ensemble_size=4)(td)["forecast", "observation"].flatten()
+        >>> predicted.sort().values.round(decimals=1), (1 / predicted).mean()
+        (tensor([ 8.8000,  9.7000, 10.4000, 11.5000], grad_fn=...), tensor(0.1000, grad_fn=...))
     """
 
     def __init__(
@@ -50,7 +55,7 @@ class MemberGain(SubModel):
         *,
         ensemble_size: int = 32,
         seed: int = 0,
-        in_key: NestedKey = ("sensor", "ensemble"),
+        in_key: NestedKey = ("forecast", "observation"),
         out_key: NestedKey | None = None,
     ):
         super().__init__(nn.Identity(), [in_key], [in_key if out_key is None else out_key])
@@ -65,11 +70,12 @@ class MemberGain(SubModel):
         orders = [torch.randperm(ensemble_size, generator=generator) for _ in std]
         self.register_buffer("quantiles", torch.stack([quantiles[order] for order in orders], -1))
 
-    def compute(self, samples):
-        """Returns the samples, each with its member's gain."""
-        if samples.shape[-2:] != self.quantiles.shape:
+    def compute(self, predicted):
+        """Returns the predictions, each with its member's gain; the mean of the gains' inverses is 1."""
+        if predicted.shape[-2:] != self.quantiles.shape:
             raise ValueError(
-                f"MemberGain was made for samples [*B, {self.quantiles.shape[0]}, {self.quantiles.shape[1]}], "
-                f"ensemble_size by the entries of std; {self.in_keys[0]!r} has shape {list(samples.shape)}."
+                f"MemberGain was made for predictions [*B, {self.quantiles.shape[0]}, {self.quantiles.shape[1]}], "
+                f"ensemble_size by the entries of std; {self.in_keys[0]!r} has shape {list(predicted.shape)}."
             )
-        return samples * (self.log_std.exp() * self.quantiles).exp()
+        inverse = (-self.log_std.exp() * self.quantiles).exp()
+        return predicted * (inverse.mean(-2) / inverse)

@@ -43,6 +43,8 @@ class UnicycleNoise(NoiseThrough):
         tensor(0.0250, grad_fn=...)
     """
 
+    noise_dim = 2
+
     def __init__(
         self,
         noise: TensorDictModuleBase,
