@@ -676,14 +676,11 @@ class Filter(Checked, TensorDictSequential):
 
 def _set(owner: TensorDictBase, name: str, value: Tensor) -> None:
     """Sets an entry; one that fits without tensordict's checks, which take longer than a product of small matrices."""
-    if type(owner) is TensorDict and type(value) is Tensor and owner.device in (None, value.device):
-        try:
-            if value.shape[: owner.batch_dims] == owner.batch_size:
-                owner._set_str(name, value, inplace=False, validated=True)
-                return
-        except (AttributeError, TypeError):  # another tensordict may have other private names
-            pass
-    owner.set(name, value)
+    fits = type(owner) is TensorDict and type(value) is Tensor and owner.device in (None, value.device)
+    if fits and value.shape[: owner.batch_dims] == owner.batch_size and hasattr(owner, "_set_str"):  # private: may go
+        owner._set_str(name, value, inplace=False, validated=True)
+    else:
+        owner.set(name, value)
 
 
 def _shallow(module: torch.nn.Module) -> Any:

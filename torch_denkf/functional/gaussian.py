@@ -60,10 +60,7 @@ def kalman_predict(mean: Tensor, cov: Tensor, transition: Tensor, noise: Tensor)
     """
     square = cov.shape[-2:]
     plain = mean.dtype == cov.dtype == transition.dtype == noise.dtype and transition.shape == noise.shape == square
-    if not (plain and mean.ndim) or cov.shape != (
-        *mean.shape,
-        mean.shape[-1],
-    ):
+    if not (plain and mean.ndim and cov.shape == (*mean.shape, mean.shape[-1])):
         check_one_dtype(mean=mean, cov=cov, transition=transition)
         _check_moments(mean, cov, noise)
         check_shapes(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -13,35 +11,33 @@ __all__ = ["quaternion_of", "quaternion_product", "rotate", "rotation_matrix", "
 
 
 class Table:
-    """Picks numbers ``[*, M]`` of ``[*, N]``, times factors: a matrix of a few numbers in two calls.
+    """Picks numbers ``[*, M]`` of ``[*, N]``, times signs: a matrix of a few numbers in two calls.
 
     Args:
-        places: of the numbers among the N.
-        factors: M of them.
+        places: of the numbers among the N, M digits.
+        signs: M of ``+``, ``-`` and ``0``.
     """
 
-    def __init__(self, places: Sequence[int], factors: Sequence[float]):
-        self.places, self.factors = list(places), list(factors)
+    def __init__(self, places: str, signs: str):
+        self.places, self.signs = list(map(int, places)), [{"+": 1.0, "-": -1.0, "0": 0.0}[sign] for sign in signs]
 
     def __call__(self, numbers: Tensor) -> Tensor:
         """Returns the numbers."""
         dtype, device = numbers.dtype, numbers.device
         places = made_once((self, device), lambda: torch.as_tensor(self.places, device=device))
-        factors = made_once((self, dtype, device), lambda: torch.as_tensor(self.factors, dtype=dtype, device=device))
-        return numbers.index_select(-1, places) * factors
+        signs = made_once((self, dtype, device), lambda: torch.as_tensor(self.signs, dtype=dtype, device=device))
+        return numbers.index_select(-1, places) * signs
 
 
 #: The matrix of products with a quaternion; its conjugate; its products with i, j and k; and that of cross products.
-_TIMES = Table([0, 1, 2, 3, 1, 0, 3, 2, 2, 3, 0, 1, 3, 2, 1, 0], [1, -1, -1, -1, 1, 1, -1, 1, 1, 1, 1, -1, 1, -1, 1, 1])
-_BACK = Table([0, 1, 2, 3], [1, -1, -1, -1])
-_TURNS = Table([1, 2, 3, 0, 3, 2, 3, 0, 1, 2, 1, 0], [-1, -1, -1, 1, -1, 1, 1, 1, -1, -1, 1, 1])
-_CROSS = Table([0, 2, 1, 2, 0, 0, 1, 0, 0], [0, -1, 1, 1, 0, -1, -1, 1, 0])
-#: The rotation matrix without the identity: twice two products each.
-_FIRST = Table(
-    [2, 3, 1, 0, 1, 0, 1, 0, 1, 3, 2, 0, 1, 0, 2, 0, 1, 2],
-    [-1, -1, 1, -1, 1, 1, 1, 1, -1, -1, 1, -1, 1, -1, 1, 1, -1, -1],
-)
-_SECOND = Table([2, 3, 2, 3, 3, 2, 2, 3, 1, 3, 3, 1, 3, 2, 3, 1, 1, 2], [2] * 18)
+_TIMES = Table("0123103223013210", "+---++-++++-+-++")
+_BACK = Table("0123", "+---")
+_TURNS = Table("123032301210", "---+-+++--++")
+_CROSS = Table("021200100", "0-++0--+0")
+#: Two products each, of which a rotation matrix is twice the sum, and the identity.
+_FIRST, _SECOND = Table("231010101320102012", "--+-++++--+-+-++--"), Table("232332231331323112", "+" * 18)
+#: The right Jacobian of a rotation but for its third term, of a quaternion times 2 sin(a/2) / a.
+BENT = Table("032301210", "++--+++-+")
 
 
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
@@ -67,7 +63,7 @@ def _cross(first: Tensor, second: Tensor) -> Tensor:
 def rotation_matrix(quaternion: Tensor) -> Tensor:
     """Returns the matrix ``[*, 3, 3]`` of a quaternion ``[*, 4]``: its columns are the body's axes in the world's."""
     terms = torch.unflatten(_FIRST(quaternion) * _SECOND(quaternion), -1, (3, 3, 2))
-    return terms.sum(-1) + torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)
+    return torch.add(torch.eye(3, dtype=quaternion.dtype, device=quaternion.device), terms.sum(-1), alpha=2)
 
 
 def quaternion_of(matrix: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch_denkf.functional.angles import wrap_angles
 from torch_denkf.functional.kernels.small_system import made_once
 from torch_denkf.functional.manifolds.quaternions import (
-    Table,
+    BENT,
     conjugate,
     products,
     quaternion_product,
@@ -147,9 +147,9 @@ class _RotationAndVectors(Space):
 
     def compose(self, first, second):
         """Composes two points: the second one is seen from the first one's axes."""
+        turn = unit(quaternion_product(first, second[..., :4]))
         if not self.vectors:
-            return unit(quaternion_product(first, second))
-        turn = unit(quaternion_product(first[..., :4], second[..., :4]))
+            return turn
         moved = self._vectors(first, 4) + rotate(first[..., None, :4], self._vectors(second, 4))
         return torch.cat([turn, moved.flatten(-2)], -1)
 
@@ -165,7 +165,7 @@ class _RotationAndVectors(Space):
         angles = tangent[..., :3]
         square = angles.square().sum(-1, keepdim=True)
         w, share, *bends = several(square, *_EXP[: 4 if self.vectors else 2])
-        quaternion = torch.cat([w, 0.5 * share * angles], -1)
+        quaternion = torch.cat([w, share * angles], -1)
         return self._bent(quaternion, angles, tangent, *bends) if self.vectors else quaternion
 
     def log(self, point):
@@ -216,7 +216,7 @@ class _RotationAndVectors(Space):
         square = tangent.square().sum(-1, keepdim=True)
         w, share, third = several(square, cos_half, half_sinc_half, one_minus_sinc, formula=_of_half)
         turn = torch.cat([w, share * tangent], -1)
-        bent = torch.unflatten(_BENT(share * turn), -1, (3, 3))  # sin a and 1 - cos a of a / 2
+        bent = torch.unflatten(BENT(2 * share * turn), -1, (3, 3))  # sin a and 1 - cos a of a / 2
         return turn, torch.addcmul(bent, (third * tangent).unsqueeze(-1), tangent.unsqueeze(-2))
 
     def adjoint(self, point):
@@ -309,10 +309,6 @@ class Turned(_RotationAndVectors):
     vectors: int
 
 
-#: The right Jacobian of a rotation but for its third term, of a quaternion times sin(a/2) / a.
-_BENT = Table([0, 3, 2, 3, 0, 1, 2, 1, 0], [2, 2, -2, -2, 2, 2, 2, -2, 2])
-
-
 def _turn(pose: Tensor, vector: Tensor) -> Tensor:
     """Rotates a vector ``[*, 2]`` by the angle of a pose ``[*, 3]``."""
     cos, sin = pose[..., :1].cos(), pose[..., :1].sin()
@@ -338,9 +334,7 @@ def series(square: Tensor, function: Function) -> Tensor:
     return torch.where(small, near, function.formula(safe))
 
 
-def several(
-    square: Tensor, *functions: Function, formula: Callable[[Tensor], Sequence[Tensor]] | None = None
-) -> Sequence[Tensor]:
+def several(square: Tensor, *functions: Function, formula: Callable | None = None) -> Sequence[Tensor]:
     """Returns the :func:`series` of several functions of squares ``[*, 1]``, in fewer calls.
 
     Args:
@@ -370,7 +364,6 @@ def _of_half(angle: Tensor) -> Sequence[Tensor]:
 
 
 cos_half = Function(lambda a: (a / 2).cos(), (1.0, -1 / 8, 1 / 384, -1 / 46080))
-sinc_half = Function(lambda a: (a / 2).sin() * 2 / a, (1.0, -1 / 24, 1 / 1920, -1 / 322560))
 half_sinc_half = Function(lambda a: (a / 2).sin() / a, (1 / 2, -1 / 48, 1 / 3840, -1 / 645120))
 sinc = Function(lambda a: a.sin() / a, (1.0, -1 / 6, 1 / 120, -1 / 5040))
 half_versine = Function(lambda a: (1 - a.cos()) / a**2, (1 / 2, -1 / 24, 1 / 720, -1 / 40320))
@@ -386,7 +379,7 @@ inverse_third = Function(
 )
 
 #: What the exponential of a rotation needs, and behind it that of the vectors which it turns.
-_EXP = (cos_half, sinc_half, half_versine, one_minus_sinc)
+_EXP = (cos_half, half_sinc_half, half_versine, one_minus_sinc)
 
 
 def bend(turn: Tensor, vector: Tensor, half: Tensor, third: Tensor) -> Tensor:
