@@ -26,6 +26,8 @@ from torch_denkf.modules import (
     UKFTransition,
 )
 from torch_denkf.modules.stochastic import FlipoutLinear
+from torch_denkf.running import linearise
+from torch_denkf.submodel import Call
 
 TRANSITIONS, ANALYSES = [EKFTransition, UKFTransition], [EKFAnalysis, UKFAnalysis]
 
@@ -256,3 +258,10 @@ def test_an_error_in_a_jacobian_is_raised(error, wrapped):
     td["sensor"] = {"ensemble": torch.ones(1), "noise": torch.ones(1)}
     with pytest.raises(error, match="my own wheelbase"):
         EKFAnalysis(model)(td)
+
+
+def test_a_sensor_without_errors_beside_one_that_has_some_knows_its_jacobian():
+    model = OfOwnErrors(Select([1]), [], 1)
+    states = torch.randn(4, 1, 3)
+    _, jacobian, _ = linearise(model, {("forecast", "ensemble"): states}, Call(torch.Size([4])))
+    assert jacobian.expand(4, 1, 1, 3).equal(torch.tensor([0.0, 1.0, 0.0]).expand(4, 1, 1, 3))
