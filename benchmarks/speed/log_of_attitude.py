@@ -1,6 +1,7 @@
 """A log of 13,500 rows at 100 Hz, attitude: seconds of filter and smoother from a cold start, in a process of its own.
 
 Cold is a fresh process with an empty cache of torch's compiler, eager and compiled in steps (``chunk=1``).
+
 python -m benchmarks.speed.log_of_attitude eager     # one way in this process, in seconds
 """
 

@@ -192,9 +192,9 @@ class _RotationAndVectors(Space):
 
     def right_jacobian(self, tangent):
         """Returns the matrix of Solà et al., eq. 143; Barfoot, eq. 7.86, of the negative tangent."""
-        angles, lower = tangent[..., :3], (fourth, fifth) if self.vectors else ()
+        angles, further = tangent[..., :3], (fourth, fifth) if self.vectors else ()
         square = angles.square().sum(-1, keepdim=True)
-        half, third, *lower = (value.unsqueeze(-1) for value in several(square, half_versine, one_minus_sinc, *lower))
+        half, third, *lower = (value.unsqueeze(-1) for value in several(square, half_versine, one_minus_sinc, *further))
         turn, unit = skew(angles), eye(angles, 3)
         turn2 = turn @ turn
         block = torch.addcmul(torch.addcmul(unit, half, turn, value=-1), third, turn2)
