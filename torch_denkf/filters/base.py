@@ -534,11 +534,7 @@ class Filter(Checked, TensorDictSequential):
         return self.write(tensordict, noise)
 
     def sequence(
-        self,
-        tensordict: TensorDictBase,
-        *,
-        detach_every: int | None = None,
-        keep: Sequence[NestedKey] | None = None,
+        self, tensordict: TensorDictBase, *, detach_every: int | None = None, keep: Sequence[NestedKey] | None = None
     ) -> TensorDictBase:
         """Filters a sequence ``[*B, T]`` and writes what a step writes, for every time.
 
@@ -660,7 +656,7 @@ class Filter(Checked, TensorDictSequential):
                 owner = tensordict.get(prefix, None) if type(tensordict) is TensorDict else None
             if isinstance(owner, TensorDictBase):
                 owners[prefix] = owner
-                _set(owner, key[-1] if prefix else key, value)
+                owner.set(key[-1] if prefix else key, value)
             else:  # not there yet
                 tensordict.set(key, value)
         return tensordict
@@ -672,15 +668,6 @@ class Filter(Checked, TensorDictSequential):
     def of_one_robot(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
         """Returns a tensordict as it is; of a dictionary a new one, ``[]``, in the filter's precision and device."""
         return of_one_robot(type(self).__name__, self.like(), tensordict)
-
-
-def _set(owner: TensorDictBase, name: str, value: Tensor) -> None:
-    """Sets an entry; one that fits without tensordict's checks, which take longer than a product of small matrices."""
-    fits = type(owner) is TensorDict and type(value) is Tensor and owner.device in (None, value.device)
-    if fits and value.shape[: owner.batch_dims] == owner.batch_size and hasattr(owner, "_set_str"):  # private: may go
-        owner._set_str(name, value, inplace=False, validated=True)
-    else:
-        owner.set(name, value)
 
 
 def _shallow(module: torch.nn.Module) -> Any:

@@ -84,11 +84,7 @@ class SE2(Space):
         third = angle * series(square, one_minus_sinc)  # (angle - sin angle) / angle^2
         half = series(square, half_versine)
         zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-        rows = [
-            [one, zero, zero],
-            [x * third - y * half, along, across],
-            [y * third + x * half, -across, along],
-        ]
+        rows = [[one, zero, zero], [x * third - y * half, along, across], [y * third + x * half, -across, along]]
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
     def adjoint(self, point):
@@ -370,12 +366,10 @@ half_versine = Function(lambda a: (1 - a.cos()) / a**2, (1 / 2, -1 / 24, 1 / 720
 one_minus_sinc = Function(lambda a: (a - a.sin()) / a**3, (1 / 6, -1 / 120, 1 / 5040, -1 / 362880))
 fourth = Function(lambda a: (a**2 + 2 * a.cos() - 2) / (2 * a**4), (1 / 24, -1 / 720, 1 / 40320, -1 / 3628800))
 fifth = Function(
-    lambda a: (2 * a - 3 * a.sin() + a * a.cos()) / (2 * a**5),
-    (1 / 120, -1 / 2520, 1 / 120960, -1 / 9979200),
+    lambda a: (2 * a - 3 * a.sin() + a * a.cos()) / (2 * a**5), (1 / 120, -1 / 2520, 1 / 120960, -1 / 9979200)
 )
 inverse_third = Function(
-    lambda a: (1 - a / 2 * (a / 2).cos() / (a / 2).sin()) / a**2,
-    (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600),
+    lambda a: (1 - a / 2 * (a / 2).cos() / (a / 2).sin()) / a**2, (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600)
 )
 
 #: What the exponential of a rotation needs, and behind it that of the vectors which it turns.
