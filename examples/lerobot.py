@@ -205,7 +205,9 @@ def main() -> None:
     parser.add_argument(
         "--joints", nargs="+", default=[":"], help="of the state: 7:14, 3, gripper, right_*; default all"
     )
+    parser.add_argument("--action", default="action", help="feature of the commands")
     parser.add_argument("--no-commands", action="store_true", help="leave recorded commands out")
+    parser.add_argument("--episodes", nargs="+", type=int, help="numbers of those to read; all by default")
     parser.add_argument("--lag", type=int, help="rows by which states are later than pictures; estimated by default")
     parser.add_argument("--size", nargs=2, type=int, default=(96, 128), help="height and width to scale pictures to")
     parser.add_argument("--held-out", type=float, default=0.2, help="share of the episodes that the sensor never sees")
@@ -229,7 +231,8 @@ def main() -> None:
 
     # The data: one episode of five is for tests, drawn by a hash. A repeated picture carries no news.
     options = {"state_key": args.state, "size": tuple(args.size), "cache": args.out / "cache", "repeats": "mask"}
-    options |= {"action_key": None if args.no_commands else "action", "validation_share": args.held_out}
+    options |= {"action_key": None if args.no_commands else args.action, "validation_share": args.held_out}
+    options["episodes"] = args.episodes
     folder = partial(LeRobotReplay, args.root, camera=args.camera, **options)
     whole = folder()
     width = whole[0]["state"].shape[-1]

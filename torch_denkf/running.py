@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import Any, TypeGuard
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TypeGuard, TypeVar
 
 import torch
 from tensordict import NestedKey, TensorDict, unravel_key
@@ -31,6 +31,8 @@ __all__ = [
     "writes",
 ]
 
+T = TypeVar("T")
+
 
 def check_module(name: str, module: Any) -> None:
     """Raises unless an argument is a TensorDict module.
@@ -54,12 +56,7 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
     """
     if not (module._forward_hooks or module._forward_pre_hooks):
         if isinstance(module, SubModel) and type(module).forward is SubModel.forward:
-            try:
-                return module.on_entries(entries, call)
-            except EXPLAINED as error:
-                if torch.compiler.is_compiling():
-                    raise
-                raise diagnosis().explained(module, error, entries) from error
+            return _explained(module.on_entries, module, entries, call)
         if is_sequence(module):
             return run_modules(named_modules_of(module), entries, call)
     keys, optional = reads(module)
@@ -88,14 +85,23 @@ def linearise(
     if not (isinstance(module, SubModel) and runs_as_written(module)):
         return None
     try:
-        return module.linearised(entries, call)
-    except (KeyError, *EXPLAINED):  # a run says what is wrong
+        return _explained(module.linearised, module, entries, call)
+    except NotImplementedError:  # a motion, or a measurement, without its optional gradient
         return None
 
 
 def runs_as_written(module: TensorDictModuleBase) -> bool:
     """Tells whether a sub-model has neither forward hooks nor a ``forward`` of its own."""
     return type(module).forward is SubModel.forward and not (module._forward_hooks or module._forward_pre_hooks)
+
+
+def _explained(method: Callable[[Entries, Call], T], module: SubModel, entries: Entries, call: Call) -> T:
+    try:
+        return method(entries, call)
+    except EXPLAINED as error:
+        if torch.compiler.is_compiling():
+            raise
+        raise diagnosis().explained(module, error, entries) from error
 
 
 def run_modules(modules: Iterable[tuple[str, TensorDictModuleBase]], entries: Entries, call: Call) -> Entries:

@@ -37,8 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"{len(log[0])} readings, 9 axes, eager: {time.process_time() - began:.1f} s of processor time")
     if options.package and not options.smoke:
         rows = imu_rows(model.settings, *log, rate=rate)[:1000]  # type: ignore[arg-type]
-        with tempfile.TemporaryDirectory() as folder, torch.inference_mode():
+        with tempfile.TemporaryDirectory() as folder:
             step = load_step(export_step(model, rows[0].clone(), Path(folder) / "imu.pt2"))
+        with torch.inference_mode():
             entries = [
                 {name: row[tuple(name.split("."))] for name in step.inputs if name not in step.carry} for row in rows
             ]

@@ -29,6 +29,7 @@ PAIRS = (
     "against_floor",
     "packaged_step",
     "one_row",
+    "log_of_attitude",
     "training_step",  # and these are commands of their own
     "transform_cost",
     "scaling",

@@ -136,3 +136,19 @@ def test_in_time_holds_the_ceiling(float64):
     filter, frames = linear_system(variance_ceiling=0.3), TensorDict({"observation": torch.randn(9, 2)}, [9])
     expected = filter.sequence(frames.clone())["belief", "cov"]
     assert_close(filter.compile(mode="in time").sequence(frames.clone())["belief", "cov"], expected)
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_cuts_and_a_policys_data_are_taken_one_step_after_the_other(float64, stored):
+    """Gradients stop at the cuts, and a policy's steps begin at the beliefs that were stored, as eagerly."""
+    frames, found = TensorDict({"observation": torch.randn(2, 6, 2)}, [2, 6]), []
+    if stored:
+        before = {"mean": torch.randn(2, 6, 3), "cov": 4 * torch.eye(3).expand(2, 6, 3, 3)}
+        frames["previous"] = TensorDict({"belief": before, "known": torch.ones(2, 6, 1, dtype=torch.bool)}, [2, 6])
+        frames["is_init"] = torch.arange(6).expand(2, 6).unsqueeze(-1) == 3
+    for filter in (linear_system(), linear_system().compile(mode="in time")):
+        observation = frames["observation"].clone().requires_grad_()
+        out = filter.sequence(frames.clone().set("observation", observation), detach_every=None if stored else 4)
+        found.append((out["belief", "mean"], *torch.autograd.grad(out["belief", "mean"][:, -1].sum(), observation)))
+    assert_close(*found, rtol=1e-9, atol=1e-10)
+    assert (found[1][1] == 0).all(-1)[0].tolist() == [True] * 3 + [not stored] + [False] * 2

@@ -433,3 +433,26 @@ def test_what_cannot_be_raises():
         Contaminated(inner, nn.Linear(1, 1))
     with pytest.raises(KeyError, match="share"):
         Contaminated(SEVERAL["etkf"](), "share")(several())
+
+
+@pytest.mark.parametrize("name", ["etkf", "Kalman", "particles"])
+def test_a_head_learns_from_what_is_seen(name):
+    """Its frame may be NaN behind the mask: the gradient is that of the other rows."""
+    inner = "particles" if name == "particles" else SEVERAL[name]()
+    td = several(samples=False).set("light", torch.tensor([[0.1], [torch.nan], [0.5]]).double())
+    td["observed"] = torch.tensor([[True], [False], [True]])
+    for keys in (["light"], ["light", ("info", "innovation")]):
+        layer = nn.Linear(1 if len(keys) == 1 else 3, 1).double()
+        head = TensorDictModule(lambda *read, f=layer: f(torch.cat(read, -1)).sigmoid(), keys, ["share"])
+        losses = (update_of(inner, head)(each.clone())["info", "log_likelihood"].sum() for each in (td, td[[0, 2]]))
+        found, expected = (torch.autograd.grad(loss, list(layer.parameters())) for loss in losses)
+        assert_close(found, expected)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.3, 0.4])
+def test_particles_of_a_missing_observation_keep_their_weights_bit_for_bit(share):
+    likelihood = GaussianLikelihood(observation_key=KEY)
+    plain = TensorDictSequential(likelihood, ParticleAnalysis(likelihood)).float()
+    both = TensorDictSequential(likelihood, Contaminated(plain[1], share)).float()
+    td = several(samples=False).float().set("observed", torch.zeros(3, 1, dtype=torch.bool))
+    assert both(td.clone())["belief", "log_weight"].equal(plain(td.clone())["belief", "log_weight"])

@@ -11,6 +11,7 @@ from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import ClonedTransition, PairObservation
 from torch_denkf.functional import kalman_update
 from torch_denkf.functional.manifolds import Flat
+from torch_denkf.fusion.parts import OfOwnErrors
 from torch_denkf.modules import (
     ConstantNoise,
     DiagonalNoise,
@@ -25,6 +26,8 @@ from torch_denkf.modules import (
     UKFTransition,
 )
 from torch_denkf.modules.stochastic import FlipoutLinear
+from torch_denkf.running import linearise
+from torch_denkf.submodel import Call
 
 TRANSITIONS, ANALYSES = [EKFTransition, UKFTransition], [EKFAnalysis, UKFAnalysis]
 
@@ -239,3 +242,26 @@ def test_an_observation_that_ignores_the_state_corrects_nothing(float64):
     out = EKFAnalysis(LearnedObservation(lambda x: torch.ones_like(x[..., :2])))(td.copy())
     torch.testing.assert_close(out["belief", "mean"], td["forecast", "mean"], rtol=0, atol=0)
     torch.testing.assert_close(out["info", "innovation"], td["sensor", "ensemble"].mean(-2) - 1, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyError, IndexError, TypeError])
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_an_error_in_a_jacobian_is_raised(error, wrapped):
+    """It is no sign that the Jacobian is not known, also of a model inside another."""
+
+    class Own(Select):
+        def jacobian(self, *values):
+            raise error("division by my own wheelbase")
+
+    model = OfOwnErrors(Own([1]), [0], 1) if wrapped else Own([1])
+    td = TensorDict({"forecast": {"mean": torch.zeros(3), "cov": torch.eye(3)}}, [])
+    td["sensor"] = {"ensemble": torch.ones(1), "noise": torch.ones(1)}
+    with pytest.raises(error, match="my own wheelbase"):
+        EKFAnalysis(model)(td)
+
+
+def test_a_sensor_without_errors_beside_one_that_has_some_knows_its_jacobian():
+    model = OfOwnErrors(Select([1]), [], 1)
+    states = torch.randn(4, 1, 3)
+    _, jacobian, _ = linearise(model, {("forecast", "ensemble"): states}, Call(torch.Size([4])))
+    assert jacobian.expand(4, 1, 1, 3).equal(torch.tensor([0.0, 1.0, 0.0]).expand(4, 1, 1, 3))

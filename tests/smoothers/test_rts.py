@@ -12,7 +12,7 @@ from tests.filters.gaussian_for_tests import directional_check, learned_filter, 
 from tests.smoothers.joint import drive, joint_beliefs
 from torch_denkf import EKF, UKF, KalmanFilter
 from torch_denkf.functional.manifolds import SE2
-from torch_denkf.functional.smoothing.rts import rts_smooth
+from torch_denkf.functional.smoothing.rts import rts_smooth, smoothing_gain
 from torch_denkf.modules import ConstantNoise, LinearObservation, MappedNoise, MomentPrior
 from torch_denkf.motions import ConstantTwist, PoseOf
 from torch_denkf.smoothers import FixedLag, RTSSmoother
@@ -139,3 +139,30 @@ def test_a_start_that_is_far_less_sure_than_the_readings_stays_positive(name, sm
     assert (torch.linalg.eigvalsh(rounded_cov / scale) > 0).all()
     assert_close(rounded_cov / scale, cov / scale, rtol=0, atol=0.05)
     assert ((rounded - mean).abs() < 0.05 * std).all()
+
+
+@pytest.mark.parametrize("lag", [None, 40])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-6), (torch.float32, 2e-3)])
+def test_a_constant_state_of_which_one_direction_is_unknown(lag, dtype, tolerance):
+    """With Q = 0 and a prior of rank 1 all covariances are singular; oracle: x = a u, a regression on one number."""
+    for seed in range(4):
+        torch.manual_seed(seed)
+        u, reads, readings = (torch.randn(*shape, dtype=dtype) for shape in ((3,), (1, 3), (40, 1)))
+        moments = {"mean": torch.zeros(3, dtype=dtype), "cov": torch.outer(u, u)}
+        noises = {"process_noise_cov": torch.zeros(3, 3, dtype=dtype), "noise_cov": torch.eye(1, dtype=dtype)}
+        filter = KalmanFilter(torch.eye(3, dtype=dtype), reads, **noises, **moments)
+        out = RTSSmoother(filter, lag)(TensorDict({"observation": readings}, [40]))
+        slope = (reads @ u).item()
+        variance = 1 / (1 + 39 * slope**2)  # the first reading is of the initial belief
+        mean, cov = variance * slope * readings[1:].sum() * u, variance * torch.outer(u, u)
+        assert_close(out["smoothed", "mean"], mean.expand(40, 3), rtol=tolerance, atol=tolerance)
+        assert_close(out["smoothed", "cov"], cov.expand(40, 3, 3), rtol=tolerance, atol=tolerance)
+
+
+def test_the_gain_of_a_singular_forecast_has_a_gradient(float64):
+    """Rounding makes one eigenvalue slightly negative: no NaN, in the gradient neither."""
+    u = torch.tensor([1.0, 2.0, -3.0])
+    cov = (torch.outer(u, u) - 1e-12 * torch.eye(3)).requires_grad_()
+    gain = smoothing_gain(cov, cov)
+    assert_close(gain @ u, u, rtol=1e-6, atol=0)
+    assert torch.autograd.grad((gain @ u).sum(), cov)[0].isfinite().all()

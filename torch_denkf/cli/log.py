@@ -24,7 +24,7 @@ __all__ = ["Log"]
 class Log(Command):
     """Say what is in a log: streams, rates, gaps, repeats, bursts, units, and delays between streams."""
 
-    log: Positional[Path]  # text, Parquet, or a ROS bag
+    log: Positional[tuple[Path, ...]]  # text, Parquet, or ROS bags, of one clock
     time: str | None = None  # name of the column of times; found by usual names by default
     unit: Literal["s", "ms", "us", "ns"] | None = None  # of the times; by name or size by default
     picture: Path | None = None  # a PNG file to write: time steps, and what several streams know
@@ -34,16 +34,18 @@ class Log(Command):
     def run(self) -> int:
         """Reads all streams."""
         from torch_denkf.data.recordings.offsets import changes_of, delays_between, solved
+        from torch_denkf.data.recordings.quantities import speed_unit
         from torch_denkf.data.recordings.streams import streams_of
 
+        logs = " and ".join(map(str, self.log))
         options = {name: value for name, value in (("time", self.time), ("unit", self.unit)) if value is not None}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what they say stands below
-            streams = streams_of(self.log, **options)
+            streams = streams_of(*self.log, **options)
         if not streams:
-            raise ValueError(f"{self.log} has no stream of numbers that change")
+            raise ValueError(f"{logs} has no stream of numbers that change")
         begin = min(one.readings.times[0] for one in streams.values())
-        say(f"{self.log}: {max(one.readings.times[-1] for one in streams.values()) - begin:.1f} s from {begin:.15g} s")
+        say(f"{logs}: {max(one.readings.times[-1] for one in streams.values()) - begin:.1f} s from {begin:.15g} s")
         for name, one in streams.items():
             columns = list(one.readings.columns)
             shown = ", ".join(columns[:6]) + (f" and {len(columns) - 6} more" if len(columns) > 6 else "")
@@ -59,11 +61,10 @@ class Log(Command):
                 f"{late} is {abs(delay.seconds):.2f} s behind {early} ({1.96 * delay.std:.2f} s either way, 95 %), by "
                 f"its {delay.what} (correlation {delay.correlation:.2f})"
             )
-            for factor, units in ((3.6, "km/h beside m/s"), (57.3, "degrees beside rad")):
-                if delay.what == ("way" if factor < 10 else "heading") and any(
-                    0.85 < abs(ratio) / factor < 1.15 for ratio in (delay.scale, 1 / delay.scale)
-                ):
-                    say(f"  their numbers differ by {max(delay.scale, 1 / delay.scale):.3g}: {units}?")
+            ratio = max(abs(delay.scale), 1 / abs(delay.scale))
+            unit = speed_unit("", ratio) if delay.what == "way" else "degrees" if 49 < ratio < 66 else None
+            if unit is not None:
+                say(f"  their numbers differ by {ratio:.3g}: {unit} beside {'rad' if unit == 'degrees' else 'm/s'}?")
         for name, offset in offsets.items():
             if abs(offset.seconds) > 1.96 * offset.std:
                 say(f"{name}: pass offset={offset.seconds:.2f} to its Table ({1.96 * offset.std:.2f} s either way)")

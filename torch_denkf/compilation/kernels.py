@@ -38,8 +38,18 @@ class FewCalls(CustomGraphPass):
 def part_bias(graph: Graph) -> None:
     """Adds the bias of a linear layer after the product, in the kernel of the activation.
 
-    The library's product with bias first copies the bias to every row of its result.
+    The library's product with bias first copies the bias to every row of its result. A sum of a product of batches is
+    taken apart, too, so that the product can be written out.
     """
+    for node in graph.find_nodes(op="call_function", target=aten.baddbmm.default):
+        (other, left, right), factors = node.args, node.kwargs
+        with graph.inserting_before(node):
+            product = insert_call(graph, aten.bmm.default, left, right)
+            if factors.get("beta", 1) != 1:
+                other = insert_call(graph, aten.mul.Tensor, other, factors["beta"])
+            if factors.get("alpha", 1) != 1:
+                product = insert_call(graph, aten.mul.Tensor, product, factors["alpha"])
+            _replace(graph, node, insert_call(graph, aten.add.Tensor, other, product))
     for node in graph.find_nodes(op="call_function", target=aten.addmm.default):
         bias, x, weight = node.args
         if bias.meta["val"].ndim == 1 and not node.kwargs:  # factors other than 1

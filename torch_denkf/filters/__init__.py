@@ -7,14 +7,4 @@ from torch_denkf.filters.kalman import KalmanFilter
 from torch_denkf.filters.particle import DPF, PFM, MixtureParticleFilter, ParticleFilter
 from torch_denkf.filters.ukf import UKF
 
-__all__ = [
-    "Filter",
-    "DEnKF",
-    "KalmanFilter",
-    "EKF",
-    "UKF",
-    "ParticleFilter",
-    "DPF",
-    "MixtureParticleFilter",
-    "PFM",
-]
+__all__ = ["Filter", "DEnKF", "KalmanFilter", "EKF", "UKF", "ParticleFilter", "DPF", "MixtureParticleFilter", "PFM"]

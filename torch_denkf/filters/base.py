@@ -534,11 +534,7 @@ class Filter(Checked, TensorDictSequential):
         return self.write(tensordict, noise)
 
     def sequence(
-        self,
-        tensordict: TensorDictBase,
-        *,
-        detach_every: int | None = None,
-        keep: Sequence[NestedKey] | None = None,
+        self, tensordict: TensorDictBase, *, detach_every: int | None = None, keep: Sequence[NestedKey] | None = None
     ) -> TensorDictBase:
         """Filters a sequence ``[*B, T]`` and writes what a step writes, for every time.
 

@@ -190,11 +190,7 @@ def _reference_trunk(image_shape: tuple[int, int, int]) -> nn.Sequential:
     """Convolutions 5/16 s2, 5/32 s2, 3/64 s1 with pooling, then a 512-wide layer."""
     layers, channels = [], image_shape[0]
     for width, kernel, stride in ((16, 5, 2), (32, 5, 2), (64, 3, 1)):
-        layers += [
-            nn.Conv2d(channels, width, kernel, stride, kernel // 2),
-            nn.ReLU(),
-            nn.MaxPool2d(2, ceil_mode=True),
-        ]
+        layers += [nn.Conv2d(channels, width, kernel, stride, kernel // 2), nn.ReLU(), nn.MaxPool2d(2, ceil_mode=True)]
         channels = width
     layers.append(nn.Flatten())
     with torch.no_grad():

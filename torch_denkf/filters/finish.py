@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torch_denkf._checks import flag_value
 from torch_denkf._registered import diagnosis
+from torch_denkf.beliefs import Belief
 from torch_denkf.filters.structure import Structure
 from torch_denkf.functional.kernels.small_system import on_gpu
 from torch_denkf.submodel import Entries
@@ -70,12 +71,15 @@ def check_belief(structure: Structure, entries: Entries, written: Entries) -> No
     """
     if on_gpu(written[structure.carry[0]]):  # to look would wait for the device
         return
-    nothing = None  # NaN where a number is not finite: fewer calls than isfinite() takes
-    for key, kind in structure.carried:
-        for value in (written[key], entries.get(key)):  # a particle that is not finite may have been resampled away
-            if value is not None and value.is_floating_point():
-                zero = (value - value).sum() if kind is None else kind.finite(key[-1], value).logical_not()
-                nothing = zero if nothing is None else nothing + zero
-    if nothing is None or flag_value(nothing == 0) is not False:
+    numbers = [
+        (value.sum() if kind is None else kind.finite(key[-1], value).log(), key, kind, value)
+        for key, kind in structure.carried
+        for value in (written[key], entries.get(key))  # a particle that is not finite may have been resampled away
+        if value is not None and value.is_floating_point()
+    ]
+    total = sum([number for number, *_ in numbers[1:]], numbers[0][0]) if numbers else torch.zeros(())
+    if flag_value(total - total == 0) is not False:  # fewer calls than isfinite() takes
+        return
+    if all((kind or Belief()).finite(key[-1], value) for _, key, kind, value in numbers):  # their sum alone is not
         return
     raise ValueError(diagnosis().why_not_finite(structure, entries, written))

@@ -100,11 +100,7 @@ class KalmanFilter(Filter):
         modules = OrderedDict(
             transition=LinearTransition(f, q.diag() if q.ndim == 1 else q, **action),
             analysis=KalmanAnalysis(
-                h,
-                r,
-                observation_key=observation_key,
-                observed_key=observed_key,
-                reading_space=reading_space,
+                h, r, observation_key=observation_key, observed_key=observed_key, reading_space=reading_space
             ),
         )
         super().__init__(modules, initial=MomentPrior(m, p), **kwargs)

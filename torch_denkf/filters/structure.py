@@ -11,12 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.beliefs import Belief, complete, kinds_of, summary_keys
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.running import (
-    in_sequences,
-    reads,
-    reads_of,
-    writes,
-)
+from torch_denkf.running import in_sequences, reads, reads_of, writes
 from torch_denkf.submodel import Entries, Initial, Update, in_role, role
 
 __all__ = ["HAS_PREVIOUS", "FROM_STORED", "Placed", "Structure", "previous_key"]

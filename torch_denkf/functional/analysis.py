@@ -17,14 +17,7 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from torch_denkf._checks import (
-    check_choice,
-    check_ensemble,
-    check_observed,
-    check_one_dtype,
-    check_shape,
-    check_shapes,
-)
+from torch_denkf._checks import check_choice, check_ensemble, check_observed, check_one_dtype, check_shape, check_shapes
 from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
 from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
 from torch_denkf.functional.kernels.small_system import WrittenOut, identity_of, is_written_out, on_gpu

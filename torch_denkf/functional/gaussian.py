@@ -60,10 +60,7 @@ def kalman_predict(mean: Tensor, cov: Tensor, transition: Tensor, noise: Tensor)
     """
     square = cov.shape[-2:]
     plain = mean.dtype == cov.dtype == transition.dtype == noise.dtype and transition.shape == noise.shape == square
-    if not (plain and mean.ndim) or cov.shape != (
-        *mean.shape,
-        mean.shape[-1],
-    ):
+    if not (plain and mean.ndim and cov.shape == (*mean.shape, mean.shape[-1])):
         check_one_dtype(mean=mean, cov=cov, transition=transition)
         _check_moments(mean, cov, noise)
         check_shapes(
@@ -133,17 +130,19 @@ def innovation_update(
         innovation = torch.where(observed, innovation, 0)
         observation_matrix = torch.where(observed.unsqueeze(-1), observation_matrix, 0)
 
-    p, h, r = cov, observation_matrix.expand(*batch, dim, cov.shape[-1]), innovation.unsqueeze(-1)
+    p, h, r = cov, observation_matrix.expand(*batch, dim, cov.shape[-1]), innovation
     if len(batch) != 1:  # a product of batches with one dimension costs a third of any other
-        p, h, r, noise = [value.reshape(-1, *value.shape[-2:]) for value in (p, h, r, noise.expand(*batch, dim, dim))]
+        p, h, noise = [value.reshape(-1, *value.shape[-2:]) for value in (p, h, noise.expand(*batch, dim, dim))]
+        r = innovation.reshape(-1, dim)
     cross = torch.bmm(h, p)
-    gain, nis, log_det = solve_for_gain(torch.bmm(cross, h.mT) + noise, cross, r.squeeze(-1))
-    keep = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device) - torch.bmm(gain, h)
-    new = torch.bmm(torch.bmm(keep, p), keep.mT) + torch.bmm(torch.bmm(gain, noise), gain.mT)
-    mean, new = torch.bmm(gain, r).squeeze(-1), (new + new.mT) / 2
+    gain, nis, log_det = solve_for_gain(torch.baddbmm(noise, cross, h.mT), cross, r)
+    keep = torch.baddbmm(torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device), gain, h, alpha=-1)
+    half = torch.bmm(torch.bmm(gain, noise), gain.mT)
+    half = torch.baddbmm(half, torch.bmm(keep, p), keep.mT, beta=0.5, alpha=0.5)
+    mean, new = torch.bmm(gain, r.unsqueeze(-1)).squeeze(-1), half + half.mT
     if len(batch) != 1:
         mean, new, nis, log_det = [value.reshape(*batch, *value.shape[1:]) for value in (mean, new, nis, log_det)]
-    log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
+    log_likelihood = torch.rsub(nis + log_det, -0.5 * math.log(2 * math.pi) * count, alpha=0.5)
     return GaussianUpdate(mean, new, innovation, nis, log_likelihood)
 
 
@@ -236,7 +235,7 @@ def solve_for_gain(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Ten
         Cᵀ M⁻¹, ``[*B, S, O]``; rᵀ M⁻¹ r and log det M, ``[*B, 1]`` each. NaN where M is not positive definite.
     """
     if matrix.shape[-1] == 1:
-        total = torch.where(matrix > 0, matrix, torch.nan)
+        total = torch.threshold(matrix, 0, torch.nan)
         of_one = total.squeeze(-1)
         return cross.mT / total, residual.square() / of_one, of_one.log()
     solver = (WrittenOut if is_written_out(matrix) else Solver)(matrix)

@@ -33,7 +33,7 @@ def cholesky(matrix: Tensor) -> Tensor:
     if is_written_out(matrix, LARGEST_FACTOR):
         return WrittenOut(matrix).factor()
     factor, info = torch.linalg.cholesky_ex(matrix)
-    return torch.where((info == 0)[..., None, None], factor, torch.nan)
+    return factor.masked_fill((info != 0)[..., None, None], torch.nan)
 
 
 def semidefinite_root(cov: Tensor) -> Tensor:
@@ -68,7 +68,7 @@ def whitened(rows: Tensor, cov: Tensor) -> Tensor:
     return torch.linalg.solve_triangular(cholesky(correlation), scaled, upper=False).mT
 
 
-def semidefinite_solve(cov: Tensor, right: Tensor) -> Tensor:
+def semidefinite_solve(cov: Tensor, right: Tensor, *, spare: float = 0) -> Tensor:
     """Solves P X = Y for a covariance P, also a singular one; X then is one of the solutions.
 
     It is solved in correlations with a relative ridge, see :func:`semidefinite_root`. Components without any variance
@@ -77,6 +77,7 @@ def semidefinite_solve(cov: Tensor, right: Tensor) -> Tensor:
     Args:
         cov: P, ``[*B, N, N]``, symmetric positive semi-definite.
         right: Y, ``[*B, N, M]``.
+        spare: is added to the correlations' diagonal where P is not positive semi-definite, but for rounding.
 
     Returns:
         X, ``[*B, N, M]``; NaN where P is not positive semi-definite.
@@ -88,6 +89,9 @@ def semidefinite_solve(cov: Tensor, right: Tensor) -> Tensor:
                 [0.0000]])
     """
     correlation, _, inverse = _correlation(cov)
+    if spare:
+        failed = torch.linalg.cholesky_ex(correlation.detach())[1] != 0
+        correlation = correlation + (spare * failed.unsqueeze(-1).expand_as(inverse)).diag_embed()
     return inverse.unsqueeze(-1) * solve(correlation, inverse.unsqueeze(-1) * right)
 
 
@@ -227,7 +231,7 @@ def as_covariance(noise: Tensor, mean: Tensor) -> Tensor:
                 [0., nan]])
     """
     if noise.ndim == mean.ndim:
-        return torch.where(noise < 0, torch.nan, noise).diag_embed()
+        return noise.masked_fill(noise < 0, torch.nan).diag_embed()
     return torch.where(is_covariance(noise)[..., None, None], noise, torch.nan)
 
 

@@ -346,4 +346,4 @@ class JoinedReading(Sensor):
 
 
 def _places(numbers: Sequence[int], begin: int, like: Tensor) -> Tensor:
-    return torch.tensor([begin + number for number in numbers], device=like.device)
+    return torch.tensor([begin + number for number in numbers], dtype=torch.int64, device=like.device)

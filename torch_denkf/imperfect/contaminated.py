@@ -21,6 +21,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_number, check_values
+from torch_denkf.filters.scan import where_rows
 from torch_denkf.imperfect.mixed import (
     MixedUpdate,
     kind_of_update,
@@ -223,6 +224,10 @@ class Contaminated(MixedUpdate):
         quantity, nothing = cast(_Quantity, self.quantities[name]), float(name != "share")
         if quantity.key is not None and quantity.head is None and seen is not None and quantity.key not in entries:
             return torch.full_like(like, nothing)  # a step without the reading
+        if quantity.head is not None and seen is not None:  # NaN that is hidden below would be NaN in its gradient
+            read = [key for key in (*quantity.in_keys, *quantity.optional_keys) if key in entries]
+            hidden = {key: where_rows(seen, entries[key], torch.zeros_like(entries[key])) for key in read}
+            entries = {**entries, **hidden}
         value = quantity(self, entries, call)
         return value if seen is None or quantity.key is None else torch.where(seen, value, nothing)
 

@@ -68,12 +68,7 @@ def spread_skill_ratio(
 
 
 def interval_coverage(
-    mean: Tensor,
-    variance: Tensor,
-    truth: Tensor,
-    *,
-    level: float = 0.9,
-    space: Space | None = None,
+    mean: Tensor, variance: Tensor, truth: Tensor, *, level: float = 0.9, space: Space | None = None
 ) -> Tensor:
     """Returns the share of the truth inside the central interval of a Gaussian, ``mean ± z sqrt(variance)``.
 
@@ -106,11 +101,7 @@ def interval_coverage(
 
 
 def ensemble_interval_coverage(
-    ensemble: Tensor,
-    truth: Tensor,
-    *,
-    level: float = 0.9,
-    space: Space | None = None,
+    ensemble: Tensor, truth: Tensor, *, level: float = 0.9, space: Space | None = None
 ) -> Tensor:
     """Returns the share of the truth inside the members' central interval: ``level`` if calibrated, Gaussian or not.
 

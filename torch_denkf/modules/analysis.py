@@ -144,12 +144,7 @@ class EnsembleAnalysis(EnsembleUpdate):
             center = self.space.near(forecast).unsqueeze(-2)
             forecast = self.space.minus(forecast, center)
         ensemble, innovation, nis, log_likelihood = self._formula(
-            forecast,
-            predicted,
-            observation,
-            variance,
-            observed=observed,
-            **self._options(noise, self.state_taper),
+            forecast, predicted, observation, variance, observed=observed, **self._options(noise, self.state_taper)
         )
         if self.relaxation:
             ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)

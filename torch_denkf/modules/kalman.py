@@ -167,9 +167,9 @@ class LinearTransition(Transition):
 
     def on_entries(self, entries, call):
         """Returns the forecast."""
-        return self.with_link(entries, call)[0]
+        return self.with_link(entries, call, wanted=False)[0]
 
-    def with_link(self, entries: Entries, call: Call) -> tuple[Entries, Sequence[torch.Tensor]]:
+    def with_link(self, entries: Entries, call: Call, *, wanted: bool = True) -> tuple[Entries, Sequence[torch.Tensor]]:
         """Returns the forecast, and how it follows from the state before, see :class:`GaussianTransition`."""
         mean, cov = entries.get(self.in_keys[0]), entries.get(self.in_keys[1])
         if mean is None or cov is None:
@@ -184,8 +184,13 @@ class LinearTransition(Transition):
             written = run_module(noise, {**entries, self.out_keys[0]: forecast}, call.part("noise"))
             constant = as_covariance(written[unravel_key(noise.out_keys[0])], mean)
             forecast_cov = forecast_cov + constant
-        link = torch.eye(len(self.matrix), dtype=cov.dtype, device=cov.device), cov, self.matrix, constant
-        return {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}, link
+        written = {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}
+        return written, (
+            torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device),
+            cov,
+            self.matrix,
+            constant,
+        ) if wanted else ()
 
 
 class KalmanAnalysis(Update):

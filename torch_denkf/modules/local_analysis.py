@@ -68,13 +68,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         torch.Size([40])
     """
 
-    def __init__(
-        self,
-        near: Neighbours | torch.Tensor,
-        *,
-        tile: int = 4096,
-        **options: Unpack[EnsembleOptions],
-    ):
+    def __init__(self, near: Neighbours | torch.Tensor, *, tile: int = 4096, **options: Unpack[EnsembleOptions]):
         check_count("tile", tile)
         if not (isinstance(near, Neighbours) or (isinstance(near, torch.Tensor) and near.ndim == 2)):
             raise TypeError(f"near is Neighbours, or a taper [S, O]; got {near!r}")

@@ -179,8 +179,7 @@ class AttitudeMotion(Motion):
         turn, by_rate = SO3().exp_and_jacobian((gyro - bias) * dt)
         moved = torch.cat([SO3().compose(orientation, turn), bias], -1)
         by_rate = -by_rate * (dt.unsqueeze(-1) if isinstance(dt, Tensor) else dt)
-        by_turn = rotation_matrix(SO3().inverse(turn))
-        return moved, corner(torch.cat([by_turn, by_rate], -1))
+        return moved, corner(torch.cat([rotation_matrix(turn).mT, by_rate], -1))
 
     def noise_of_step(self, dt):
         """Returns the noise of orientation and bias."""

@@ -140,7 +140,7 @@ class Magnetic(_Reading):
 
     def observe(self, point):
         """Returns the direction in the body's axes."""
-        return rotate(_inverse(point), self.field)
+        return rotate(point[..., :4], self.field, back=True)
 
     def gradient(self, point, reading):
         """Returns the Jacobian: a turn of the body turns the direction back."""
@@ -269,7 +269,7 @@ class PositionInBody(_Reading):
         """The landmarks ``[*, L, N]`` in the body's axes."""
         away = landmark - point[..., -self.size :].unsqueeze(-2)
         if self.size == 3:
-            return rotate(_inverse(point).unsqueeze(-2), away)
+            return rotate(point[..., None, :4], away, back=True)
         cos, sin = point[..., :1].cos(), point[..., :1].sin()
         x, y = away.unbind(-1)
         return torch.stack([cos * x + sin * y, cos * y - sin * x], -1)
@@ -325,11 +325,6 @@ class RangeBearing(PositionInBody):
         rows = torch.stack([ahead, across], -2) * (distance != 0)[..., None, None]
         turned = self._by_pose((distance[..., None] * ahead).flatten(-2)).unflatten(-2, (-1, 2))
         return (rows @ turned).flatten(-3, -2)
-
-
-def _inverse(pose: Tensor) -> Tensor:
-    """Returns the world's orientation seen from the body, of a pose whose first four numbers are a quaternion."""
-    return SO3().inverse(pose[..., :4])
 
 
 def _register_vectors(module: nn.Module, name: str, value: Sequence | Tensor, *shapes: list[int]) -> None:

@@ -202,12 +202,7 @@ class FilterLoss(Checked, LossModule):
     functional = False
 
     def __init__(
-        self,
-        filter: Filter,
-        terms: Sequence[Term],
-        *,
-        score: str = "crps",
-        **options: Unpack[SequenceOptions],
+        self, filter: Filter, terms: Sequence[Term], *, score: str = "crps", **options: Unpack[SequenceOptions]
     ):
         if self.SCORES:
             check_choice("score", score, self.SCORES)

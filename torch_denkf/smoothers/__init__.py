@@ -5,10 +5,4 @@ from torch_denkf.smoothers.fixed_lag import FixedLag
 from torch_denkf.smoothers.particles import ParticleSmoother
 from torch_denkf.smoothers.rts import RTSSmoother
 
-__all__ = [
-    "FixedLag",
-    "EnKS",
-    "EnRTS",
-    "RTSSmoother",
-    "ParticleSmoother",
-]
+__all__ = ["FixedLag", "EnKS", "EnRTS", "RTSSmoother", "ParticleSmoother"]

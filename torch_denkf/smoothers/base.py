@@ -54,11 +54,7 @@ class Smoother(Checked, TensorDictModuleBase):
         return self.sequence(tensordict)
 
     def sequence(
-        self,
-        tensordict: TensorDictBase,
-        *,
-        detach_every: int | None = None,
-        keep: Sequence[NestedKey] | None = None,
+        self, tensordict: TensorDictBase, *, detach_every: int | None = None, keep: Sequence[NestedKey] | None = None
     ) -> TensorDictBase:
         """Filters and smooths ``[*B, T]``; takes what :meth:`Filter.sequence` takes.
 

@@ -49,12 +49,7 @@ class Past(NamedTuple):
 
 
 def with_past(
-    initial: TensorDictModuleBase,
-    lag: int,
-    past: Past,
-    *,
-    age: int = 0,
-    belief_prefix: str = "belief",
+    initial: TensorDictModuleBase, lag: int, past: Past, *, age: int = 0, belief_prefix: str = "belief"
 ) -> AugmentedBelief:
     """Returns an initial belief with a past: L copies of its state.
 
@@ -209,13 +204,7 @@ class LaggedBelief(SubModel):
         (tensor([1.5000]), tensor([2]))
     """
 
-    def __init__(
-        self,
-        *,
-        belief_prefix: str = "belief",
-        weighted: bool = False,
-        space: Space | None = None,
-    ):
+    def __init__(self, *, belief_prefix: str = "belief", weighted: bool = False, space: Space | None = None):
         out_keys = [(belief_prefix, "past"), *(("smoothed", name) for name in ("ensemble", "mean", "var")), AGE_KEY]
         super().__init__(nn.Identity(), [PAST_KEY, AGE_KEY] + [(belief_prefix, "log_weight")] * weighted, out_keys)
         self.space = space

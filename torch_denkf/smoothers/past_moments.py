@@ -98,16 +98,8 @@ class MomentsPast(SubModel):
         forecast_prefix: prefix of ``cov``, ``cross`` and ``open`` of the forecast, see :class:`CrossTransition`.
     """
 
-    def __init__(
-        self,
-        *,
-        belief_prefix: str = "belief",
-        forecast_prefix: str = "forecast",
-    ):
-        in_keys = [
-            (belief_prefix, "mean"),
-            *((forecast_prefix, name) for name in ("cov", "cross", "open")),
-        ]
+    def __init__(self, *, belief_prefix: str = "belief", forecast_prefix: str = "forecast"):
+        in_keys = [(belief_prefix, "mean"), *((forecast_prefix, name) for name in ("cov", "cross", "open"))]
         in_keys += [*((belief_prefix, name) for name in MOMENTS_PAST.carried), AGE_KEY]
         super().__init__(nn.Identity(), in_keys, [("past", name) for name in ("mean", "cov", "gain")])
 
@@ -134,13 +126,7 @@ class LaggedMoments(SubModel):
         space: in which the state lives; ``None`` for plain numbers.
     """
 
-    def __init__(
-        self,
-        *,
-        belief_prefix: str = "belief",
-        forecast_prefix: str = "forecast",
-        space: Space | None = None,
-    ):
+    def __init__(self, *, belief_prefix: str = "belief", forecast_prefix: str = "forecast", space: Space | None = None):
         in_keys = [(belief_prefix, "mean"), (belief_prefix, "cov"), (forecast_prefix, "mean")]
         in_keys += [*(("past", name) for name in ("mean", "cov", "gain")), AGE_KEY]
         out_keys = [(belief_prefix, name) for name in MOMENTS_PAST.carried]

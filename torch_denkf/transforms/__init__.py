@@ -3,7 +3,4 @@
 from torch_denkf.transforms.denkf import DEnKFTransform
 from torch_denkf.transforms.primer import LastAction
 
-__all__ = [
-    "DEnKFTransform",
-    "LastAction",
-]
+__all__ = ["DEnKFTransform", "LastAction"]

@@ -144,6 +144,41 @@ def test_the_equations(float64, two_d, dynamic):
     assert np.ptp(np.unwrap(mean[:, 5])) > 0.5
 
 
+@pytest.mark.parametrize("held", [False, True])
+def test_jacobians_of_drifts(float64, held):
+    """Motion and readings, with slow errors behind the states; after the time of a drift a third is left."""
+    sensor = {"odom0": "/o", "odom0_config": flags(0, 1, 5, 6, 7, 11), "odom0_drift_time": [4.0] * 6 + [2.0] * 9}
+    drifts = [0.0] * 15
+    drifts[0], drifts[6], drifts[11] = 2.0, 0.1, 0.02
+    model = robot_model(sensor | {"odom0_drifts": drifts, "held_velocities": held})
+    motion = model.filter.transition_module.module
+    state, dt = 0.7 * torch.randn(4, 18), torch.full((4, 1), 0.3)
+    moved, jacobian = motion.move_and_gradient(state, dt=dt)
+    every = torch.func.vmap(torch.func.jacrev(lambda one: motion.move(one, dt=dt[0])))
+    torch.testing.assert_close(jacobian, every(state))
+    torch.testing.assert_close(moved, motion.move(state, dt=dt))
+    torch.testing.assert_close(moved[:, 15:], state[:, 15:] * torch.exp(-0.3 / torch.tensor([4.0, 2.0, 2.0])))
+    for name, wanted in (
+        ("odom0_pose", [state[:, 0] + state[:, 15], state[:, 1], state[:, 5]]),
+        ("odom0_twist", [state[:, 6] + 3.0 * state[:, 16], state[:, 7], state[:, 11] + state[:, 17]]),
+    ):
+        model_of, seen = model.reading(name), torch.tensor([3.0, torch.nan, 0.0])
+        read, by_state = model_of.jacobian(state, seen)
+        torch.testing.assert_close(read, torch.stack(wanted, -1))
+        by_hand = torch.func.jacrev(lambda one, of=model_of, seen=seen: of.compute(one.unsqueeze(0), seen)[0])
+        torch.testing.assert_close(by_state, torch.func.vmap(by_hand)(state))
+
+
+def test_held_velocities_are_means_of_the_step(float64):
+    """On a circle a step of a quarter turn leads to the heading's end, along that of its middle."""
+    motion = robot_model({"odom0": "/o", "odom0_config": flags(0), "held_velocities": True})
+    motion = motion.filter.transition_module.module
+    state = torch.zeros(15)
+    state[6], state[11] = 2.0, torch.pi / 2
+    moved = motion.move(state, dt=1.0)
+    torch.testing.assert_close(moved[[0, 1, 5]], torch.tensor([2**0.5, 2**0.5, torch.pi / 2]))
+
+
 def test_what_is_not_honoured_is_named():
     model = robot_model(
         config(

@@ -15,6 +15,7 @@ from torch_denkf._checks import check_number
 __all__ = ["PLANE", "Config", "SensorConfig", "read_config", "write_config"]
 
 EXTRA = "pip install 'torch_denkf[ros]'"
+_LASTS = 30.0  # s, that errors last of which nothing is said
 #: States that are zero in the plane.
 PLANE = (2, 3, 4, 8, 9, 10, 14)
 _GROUPS = {"pose": range(6), "twist": range(6, 12), "acceleration": range(12, 15)}
@@ -46,6 +47,9 @@ class SensorConfig:
         without_gravity: whether gravity is taken out of its accelerations.
         delay: by how many seconds its stamps are late.
         variances: of its readings, by state, where messages bring none; empty where they are not known.
+        drifts: standard deviations of the slow errors of its readings, by state, 0 for none; that of a forward speed is
+            of its scale. Empty for none.
+        drift_time: seconds that they last, by state.
     """
 
     name: str
@@ -56,6 +60,8 @@ class SensorConfig:
     without_gravity: bool = False
     delay: float = 0.0
     variances: tuple[float, ...] = ()
+    drifts: tuple[float, ...] = ()
+    drift_time: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,7 @@ class Config:
         dynamic: whether the pose's process noise grows with the speed.
         gravity: m/s^2.
         frequency: Hz.
+        held: whether velocities are means of the coming step, see :class:`~.motion.RobotMotion`.
         sigma: alpha, kappa and beta of the unscented filter.
         unheeded: what is not honoured, and why.
         given: the parameters as they were.
@@ -84,6 +91,7 @@ class Config:
     dynamic: bool
     gravity: float
     frequency: float
+    held: bool
     sigma: tuple[float, float, float]
     unheeded: tuple[str, ...]
     given: Mapping[str, Any] = field(repr=False)
@@ -116,11 +124,12 @@ def read_config(config: Mapping[str, Any] | str | Path) -> Config:
         given = next(iter(given.values()))
     heeded = {"two_d_mode", "process_noise_covariance", "initial_estimate_covariance", "initial_state"}
     heeded |= {"dynamic_process_noise_covariance", "gravitational_acceleration", "alpha", "kappa", "beta"}
+    heeded.add("held_velocities")
     sensors = []
     for name in given:
         if re.fullmatch(rf"({'|'.join(_KINDS)})\d+", name):
             sensors.append(_sensor(name, given))
-            ends = ("", "_config", "_differential", "_relative", "_delay", "_variances")
+            ends = ("", "_config", "_differential", "_relative", "_delay", "_variances", "_drifts", "_drift_time")
             heeded |= {name + end for end in ends}
     if not sensors:
         raise ValueError(
@@ -143,6 +152,7 @@ def read_config(config: Mapping[str, Any] | str | Path) -> Config:
         bool(given.get("dynamic_process_noise_covariance", False)),
         float(given.get("gravitational_acceleration", 9.80665)),
         float(given.get("frequency", 30.0)),
+        bool(given.get("held_velocities", False)),
         (float(given.get("alpha", 0.001)), float(given.get("kappa", 0.0)), float(given.get("beta", 2.0))),
         tuple(unheeded),
         dict(given),
@@ -173,7 +183,13 @@ def _sensor(name: str, given: Mapping[str, Any]) -> SensorConfig:
     flags = [bool(each) for each in chosen]
     kind = name.rstrip("0123456789")
     groups = {group: tuple(place for place in _GROUPS[group] if flags[place]) for group in _KINDS[kind]}
-    variances = given.get(f"{name}_variances") or ()
+    rows = {}
+    for what in ("variances", "drifts"):
+        values = given.get(f"{name}_{what}")
+        rows[what] = () if values is None or not len(values) else tuple(_row(f"{name}_{what}", values).tolist())
+    time = given.get(f"{name}_drift_time", _LASTS)
+    time = _row(f"{name}_drift_time", [time] * 15 if np.ndim(time) == 0 else time).tolist()
+    check_number(f"{name}_drift_time", min(time), above=0)
     return SensorConfig(
         name,
         str(given[name]),
@@ -182,7 +198,8 @@ def _sensor(name: str, given: Mapping[str, Any]) -> SensorConfig:
         bool(given.get(f"{name}_relative", False)),
         bool(given.get(f"{name}_remove_gravitational_acceleration", False)),
         float(given.get(f"{name}_delay", 0.0)),
-        tuple(_row(f"{name}_variances", variances).tolist()) if len(variances) else (),
+        **rows,
+        drift_time=tuple(time),
     )
 
 

@@ -1,4 +1,4 @@
-"""Noises of a robot's sensors and of its motion, learned from a log by their likelihood."""
+"""Noises of a robot's sensors and of its motion, learned from a log by how likely the fixes are that are hidden."""
 
 from __future__ import annotations
 
@@ -13,21 +13,24 @@ from torch import Tensor, nn
 
 from torch_denkf.applications.robot.config import PLANE
 from torch_denkf.applications.robot.model import LearnedScale, RobotModel
-from torch_denkf.applications.robot.motion import RobotNoise
+from torch_denkf.applications.robot.motion import ANGLES, STATES, RobotNoise
 from torch_denkf.deployment.progress import progress_bar
+from torch_denkf.smoothers import RTSSmoother
 
-__all__ = ["Learned", "learn_noises", "scale_of"]
+__all__ = ["Learned", "fix_error", "learn_noises", "scale_of"]
+
 
 _HELD_OUT = 4  # every so many segments one is held out
-_RATE = 0.4  # of Adam, on logarithms of standard deviations
-_LASTS = 1.0  # s, for which errors of poses last: one in that time says as much as all
+_MOST = 20  # segments; of a longer log so many are spread over it
+_RATE = 0.3  # of Adam, on logarithms of standard deviations
+_LEAST = 1e-3  # of a reading's spread: quantised readings look as if they had no noise
 
 
 class Learned(NamedTuple):
     """The end of learning.
 
     Attributes:
-        before: mean log-likelihood of a row of the held-out segments, nats, with the noises as they were.
+        before: mean log-likelihood of what is hidden in the held-out segments, nats, with the noises as they were.
         after: likewise, with the best of those that were learned.
         stages: ``after`` at the end of each stage.
         interrupted: whether it ended before all stages were done.
@@ -40,77 +43,96 @@ class Learned(NamedTuple):
 
 
 def learn_noises(
-    model: RobotModel, rows: TensorDict, *, steps: int = 8, length: int | None = None, shown: bool = True
+    model: RobotModel,
+    rows: TensorDict,
+    *,
+    others: Sequence[tuple[RobotModel, TensorDict]] = (),
+    steps: int = 6,
+    window: float = 15.0,
+    shown: bool = True,
 ) -> Learned:
-    """Learns how large the noises are, so that the readings of a log are likely.
+    """Learns how large noises and drifts are, so that the fixes of a log are likely where they are hidden.
 
-    The log is cut into segments. Each starts from the filter's belief at that time, and is used twice: as it is, and
-    without poses in most of it, where the forecast is to be likely at those that are hidden. Errors of poses that
-    follow each other within a second are alike: one of them is used, and the noise that is learned becomes that of all.
-    First the noises of sensors are learned, then that of the motion, then all; what is kept is the best on segments
-    that are held out.
+    The likelihood of each next reading says little of errors that last. So the log is cut into segments of three
+    windows, each from the filter's belief at that time; fixes of the middle window are hidden, and are to be likely for
+    the smoother, with the fix's own noise and drift. A log without fixes is learned by the likelihood of its readings.
+    White noise starts from how much readings differ from the line through their neighbours. In three stages all is
+    learned, each from the beliefs that the one before it leads to; what is kept is the best on held-out segments.
 
     Args:
         model: its parameters change.
         rows: of the log ``[T]``, see :func:`~torch_denkf.applications.robot.log.rows_of_log`.
+        others: further logs to learn from: the model with the initial belief of each, and its rows.
         steps: of a stage.
-        length: rows of a segment; by default 200, or an eighth of a short log.
+        window: s; at most a sixth of the log.
         shown: whether progress is.
 
     Raises:
-        ValueError: if the log is shorter than four segments.
+        ValueError: if the log is too short.
     """
-    filter = model.filter
-    length = min(200, max(len(rows) // (2 * _HELD_OUT), 20)) if length is None else length
-    count = len(rows) // length
-    if count < _HELD_OUT:
-        raise ValueError(f"the log has {len(rows)} rows, fewer than {_HELD_OUT} segments of {length}: pass --steps 0")
+    filter, logs = model.filter, [(model, rows), *others]
+    seconds = [float(each["stamp"][-1] - each["stamp"][0]) for _, each in logs]
+    window = min(window, min(seconds) / (_HELD_OUT + 2))
+    length = min(round(3 * window * len(each) / max(took, 1e-9)) for (_, each), took in zip(logs, seconds, strict=True))
+    if length < 3 * _HELD_OUT:
+        least = min(len(each) for _, each in logs)
+        raise ValueError(f"the log has {least} rows, too few to cut it into {_HELD_OUT} segments: pass --steps 0")
+    rows = torch.cat([each for _, each in logs])
     sensors = [part.log_scale for part in filter.modules() if isinstance(part, LearnedScale)]
+    sensors += [] if model.drifts is None else list(model.drifts.parameters())
     motion = [part.log_scale for part in filter.modules() if isinstance(part, RobotNoise)]
-    rows, thinned = _thinned(model, rows)
-    if model.config.two_d:  # what does not move has no noise to learn
-        for parameter in motion:
-            parameter.register_hook(lambda gradient: gradient.index_fill(0, torch.tensor(PLANE), 0.0))
-    for scale in [*motion, *(scale_of(model, name) for name in _positions(model))]:
-        scale.register_hook(_alike)
-    for name in model.reads:  # a reading that is always the same, such as zero, would be taken for one without noise
-        seen = rows[name][rows[f"{name}_observed"][:, 0]]
-        varies = (seen != seen[:1]).any(0)[: len(scale_of(model, name))]
-        scale_of(model, name).register_hook(partial(torch.mul, varies.to(rows[name].dtype)))
-    best = [value.detach().clone() for value in (*sensors, *motion)]
+    hooks = []
+    for name in model.reads:
+        varies = _varies(model, rows, name)
+        hooks.append(scale_of(model, name).register_hook(partial(torch.mul, varies.to(rows[name].dtype))))
+        _start_from(model, rows, name, varies)
+    for parameter in motion:
+        if model.config.two_d:  # what does not move has no noise to learn
+            hooks.append(parameter.register_hook(lambda gradient: gradient.index_fill(0, torch.tensor(PLANE), 0.0)))
+        hooks.append(parameter.register_hook(partial(_alike, at=(0, 1))))
+    for name in _positions(model):
+        hooks.append(scale_of(model, name).register_hook(partial(_alike, at=(0, 1))))
+        slow = model.reading(name).slow[:2]
+        if model.drifts is not None and None not in slow:
+            at = [each - len(STATES) for each in slow if each is not None]
+            hooks += [each.register_hook(partial(_alike, at=at)) for each in model.drifts.parameters()]
+    every = (*sensors, *motion)
+    best = [value.detach().clone() for value in every]
     before, reached, stages, interrupted = None, -torch.inf, [], False
     with progress_bar("learning noises", 3 * (steps + 1), unit=" steps", shown=shown) as bar:
         try:
-            for parameters in (sensors, motion, [*sensors, *motion]):
-                train, test = _segments(model, rows, count, length)
-                optimiser = torch.optim.Adam(parameters, lr=_RATE)
+            for _ in range(3):
+                cut = [_segments(*each, window, length) for each in logs]
+                train, test = (torch.cat(parts) for parts in zip(*cut, strict=True))
+                optimiser = torch.optim.Adam(every, lr=_RATE)
                 for step in range(steps + 1):
                     with torch.no_grad():
                         score = float(_likelihood(model, test))
                     before = score if before is None else before
                     if score > reached:
-                        reached, best = score, [value.detach().clone() for value in (*sensors, *motion)]
+                        reached, best = score, [value.detach().clone() for value in every]
                     bar.set_postfix({"held out": f"{score:.3f}"}, refresh=False)
                     bar.update()
                     if step == steps:
                         break
                     optimiser.zero_grad()
                     (-_likelihood(model, train)).backward()
-                    nn.utils.clip_grad_norm_(parameters, 10.0)
+                    nn.utils.clip_grad_norm_(every, 10.0)
                     optimiser.step()
-                _load((*sensors, *motion), best)
+                _load(logs, every, best)
                 stages.append(reached)
         except KeyboardInterrupt:  # what was learned is kept
             interrupted = True
-    _load((*sensors, *motion), best)
-    for name, each in thinned.items():
-        scale_of(model, name).data += 0.5 * math.log(each)
+    _load(logs, every, best)
+    for hook in hooks:
+        hook.remove()
     return Learned(before if before is not None else float("nan"), reached, stages, interrupted)
 
 
-def _alike(gradient: Tensor) -> Tensor:
+def _alike(gradient: Tensor, at: Sequence[int]) -> Tensor:
     """A gradient that keeps the noises of x and y in the ratio in which they were."""
-    return torch.cat([gradient[:2].mean().expand(2), gradient[2:]])
+    where = torch.tensor(list(at))
+    return gradient.index_copy(0, where, gradient[where].mean().expand(len(where)))
 
 
 def scale_of(model: RobotModel, name: str) -> Tensor:
@@ -118,42 +140,60 @@ def scale_of(model: RobotModel, name: str) -> Tensor:
     return model.filter[f"{name}_noise"].module.log_scale
 
 
-def _thinned(model: RobotModel, rows: TensorDict) -> tuple[TensorDict, dict[str, float]]:
-    """Rows with a pose a second, and how many of each sensor there were for one that is left."""
-    out, shares = rows.clone(), {}
-    for name in model.reads:
-        if name.endswith("_pose") and model.reads[name][0] < 6:
-            seen = rows[f"{name}_observed"][:, 0]
-            second = (rows["stamp"][:, 0] // _LASTS).long()
-            first = torch.ones_like(seen)
-            there = seen.nonzero()[:, 0]
-            first[there[1:]] = second[there[1:]] != second[there[:-1]]
-            out[f"{name}_observed"] = (seen & first).unsqueeze(-1)
-            shares[name] = float(seen.sum() / (seen & first).sum())
-    return out, shares
+def _varies(model: RobotModel, rows: TensorDict, name: str) -> Tensor:
+    """Masks readings that differ: one that is always the same, such as zero, would be taken for one without noise."""
+    seen = rows[name][rows[f"{name}_observed"][:, 0]]
+    return (seen != seen[:1]).any(0)[: len(scale_of(model, name))]
 
 
-def _load(parameters: Sequence[Tensor], values: Sequence[Tensor]) -> None:
+def _start_from(model: RobotModel, rows: TensorDict, name: str, varies: Tensor) -> None:
+    """Sets white noise to what readings differ from the line through their neighbours."""
+    there = rows[f"{name}_observed"][:, 0]
+    seen, given = rows[name][there], rows[f"{name}_noise"][there].diagonal(dim1=-2, dim2=-1).mean(0).sqrt()
+    if len(seen) < 3 * _HELD_OUT or model.drifts is None:
+        return
+    apart = seen[2:] - 2 * seen[1:-1] + seen[:-2]
+    for at, place in enumerate(model.reads[name]):
+        if place in ANGLES:
+            apart[:, at] = torch.atan2(apart[:, at].sin(), apart[:, at].cos())
+    white = torch.maximum(1.4826 * apart.abs().median(0).values / 6**0.5, _LEAST * seen.std(0))
+    with torch.no_grad():
+        scale = scale_of(model, name)
+        start = (white / given)[: len(scale)].log()
+        if name in _positions(model):
+            start[:2] = start[:2].mean()
+        scale.copy_(torch.where(varies, start, scale))
+
+
+def _load(
+    logs: Sequence[tuple[RobotModel, TensorDict]], parameters: Sequence[Tensor], values: Sequence[Tensor]
+) -> None:
     with torch.no_grad():
         for parameter, value in zip(parameters, values, strict=True):
             parameter.copy_(value)
+        for model, _ in logs:
+            if model.drifts is not None:  # the initial belief knows as little of them
+                model.filter.initial.cov[len(STATES) :, len(STATES) :] = model.drifts.variance.diag()
 
 
-def _segments(model: RobotModel, rows: TensorDict, count: int, length: int) -> tuple[TensorDict, TensorDict]:
+def _segments(model: RobotModel, rows: TensorDict, window: float, length: int) -> tuple[TensorDict, TensorDict]:
     """Segments to learn from, and those held out, ``[B, length]``, with the beliefs that they start from."""
     with torch.no_grad():
         keys = [("belief", name) for name in ("mean", "cov", "var")]
-        whole = model.filter.sequence(rows.clone(), keep=keys)[: count * length]
-    cut = whole.reshape(count, length).clone()
-    silent = cut.clone()
+        whole = model.filter.sequence(rows.clone(), keep=keys)
+    stamp = (rows["stamp"] - rows["stamp"][0])[:, 0].contiguous()
+    count = int(stamp[-1] / window) - 2
+    first = torch.searchsorted(stamp, window * torch.arange(count, dtype=stamp.dtype))
+    first = first[first + length <= len(rows)]
+    first = first[torch.linspace(0, len(first) - 1, min(_MOST, len(first))).round().long()]
+    cut = whole[first.unsqueeze(-1) + torch.arange(length)].clone()
+    passed = cut["stamp"] - cut["stamp"][:, :1]
     for name in _positions(model):
-        seen = silent[f"{name}_observed"]
-        between = torch.zeros_like(seen)
-        between[:, length // 8 : 7 * length // 8] = True
-        cut[f"{name}_hidden"], silent[f"{name}_hidden"] = torch.zeros_like(seen), seen & between
-        silent[f"{name}_observed"] = seen & ~between
-    held = torch.arange(count) % _HELD_OUT == _HELD_OUT - 1
-    return torch.cat([cut[~held], silent[~held]]), torch.cat([cut[held], silent[held]])
+        seen = cut[f"{name}_observed"]
+        hidden = seen & (passed >= window) & (passed < 2 * window)
+        cut[f"{name}_hidden"], cut[f"{name}_observed"] = hidden, seen & ~hidden
+    held = torch.arange(len(first)) % _HELD_OUT == _HELD_OUT - 1
+    return cut[~held], cut[held]
 
 
 def _positions(model: RobotModel) -> list[str]:
@@ -161,16 +201,32 @@ def _positions(model: RobotModel) -> list[str]:
     return [name for name, reads in model.reads.items() if tuple(reads[:2]) == (0, 1)]
 
 
+def fix_error(model: RobotModel, name: str, out: TensorDict) -> tuple[Tensor, Tensor]:
+    """Errors of the fixes that a smoothed belief predicts, drift included ``[*, 2]``, and covariances, noise included.
+
+    Args:
+        model: of the belief.
+        name: of the sensor.
+        out: with its readings and ``("smoothed", "mean")`` and ``("smoothed", "cov")``.
+    """
+    read, jacobian = model.reading(name).jacobian(out["smoothed", "mean"].unsqueeze(-2), out[name])
+    jacobian = jacobian.squeeze(-3)[..., :2, :]
+    scale = scale_of(model, name)[:2].exp()
+    noise = out[f"{name}_noise"][..., :2, :2] * scale * scale.unsqueeze(-1)
+    error = out[name][..., :2] - read.squeeze(-2)[..., :2]
+    return error, jacobian @ out["smoothed", "cov"] @ jacobian.mT + noise
+
+
 def _likelihood(model: RobotModel, segments: TensorDict) -> Tensor:
-    """Mean log-likelihood of a row, of what is observed and of places that are hidden."""
-    keys = [("info", "log_likelihood"), ("belief", "mean"), ("belief", "cov")]
-    out = model.filter.sequence(segments.clone(), keep=keys)
-    total = out["info", "log_likelihood"].mean()
-    for name in _positions(model):
-        scale = scale_of(model, name)[:2].exp()
-        cov = out["belief", "cov"][..., :2, :2] + out[f"{name}_noise"][..., :2, :2] * scale * scale.unsqueeze(-1)
-        error = (out[name] - out["belief", "mean"][..., : out[name].shape[-1]])[..., :2]
+    """Mean log-likelihood of hidden fixes by the smoother; of readings where there are none."""
+    positions = [name for name in _positions(model) if segments[f"{name}_hidden"].any()]
+    if not positions:
+        out = model.filter.sequence(segments.clone(), keep=[("info", "log_likelihood")])
+        return out["info", "log_likelihood"].mean()
+    out = RTSSmoother(model.filter)(segments.clone())
+    scores = []
+    for name in positions:
+        error, cov = (value[out[f"{name}_hidden"][..., 0]] for value in fix_error(model, name, out))
         distance = (error * torch.linalg.solve(cov, error)).sum(-1)
-        score = -0.5 * (distance + torch.logdet(cov)) - math.log(2 * math.pi)
-        total = total + torch.where(out[f"{name}_hidden"][..., 0], score, 0.0).mean()
-    return total
+        scores.append(-0.5 * (distance + torch.logdet(cov)) - math.log(2 * math.pi))
+    return torch.cat(scores).mean()

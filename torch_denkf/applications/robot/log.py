@@ -13,15 +13,16 @@ from tensordict import TensorDict
 
 from torch_denkf.applications.robot.config import Config
 from torch_denkf.applications.robot.model import RobotModel
-from torch_denkf.applications.robot.motion import ANGLES
-from torch_denkf.applications.robot.readings import Seen, seen_by
+from torch_denkf.applications.robot.motion import ANGLES, STATES
+from torch_denkf.applications.robot.readings import Seen, from_north, seen_by
 from torch_denkf.data.recordings.offsets import ClockOffset, Delay, delays_between, solved
 from torch_denkf.data.recordings.quantities import find
 from torch_denkf.data.recordings.streams import Stream, streams_of
 
-__all__ = ["RobotLog", "default_settings", "log_streams", "read_log", "rows_of_log", "start_of"]
+__all__ = ["RobotLog", "default_settings", "drift_settings", "log_streams", "read_log", "rows_of_log", "start_of"]
 
-_KMH = (3.1, 4.2)  # of a speed to that by fixes, in m/s
+_RATE = 2.0  # Hz, of rows to learn from
+_SHARE = 0.05  # of a speed, or of a reading's spread: size of a drift before it is learned
 _AWAY = 5.0  # m, from the first fix to the one that tells the heading
 
 
@@ -40,11 +41,11 @@ class RobotLog:
     origin: tuple[float, float] | None
 
 
-def log_streams(file: Path) -> dict[str, Stream]:
-    """The streams of a log; raises as :func:`~torch_denkf.data.recordings.streams.streams_of`."""
+def log_streams(*files: Path) -> dict[str, Stream]:
+    """The streams of a log of some files; raises as :func:`~torch_denkf.data.recordings.streams.streams_of`."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of float32, which no number becomes here, and of repeats, which are left out
-        return streams_of(file)
+        return streams_of(*files)
 
 
 def default_settings(streams: Mapping[str, Stream]) -> dict:
@@ -56,12 +57,15 @@ def default_settings(streams: Mapping[str, Stream]) -> dict:
         for name, stream in streams.items():
             if find(stream.readings.columns, what) or (kind == "pose" and find(stream.readings.columns, "east")):
                 settings[f"{kind}{number}"] = name
-                settings[f"{kind}{number}_config"] = [place in places for place in range(15)]
+                columns = stream.readings.columns
+                turned = any(map(from_north, columns)) or (find(columns, "east") and find(columns, "heading"))
+                read = (*places, 5) if kind == "pose" and turned else places
+                settings[f"{kind}{number}_config"] = [place in read for place in range(15)]
                 number += 1
     return settings
 
 
-def read_log(file: Path, config: Config, streams: Mapping[str, Stream]) -> RobotLog:
+def read_log(file: Path | str, config: Config, streams: Mapping[str, Stream]) -> RobotLog:
     """Reads the streams that the settings name, takes out their delays, and brings them into m, s and rad.
 
     Raises:
@@ -83,21 +87,43 @@ def read_log(file: Path, config: Config, streams: Mapping[str, Stream]) -> Robot
         table = tables[topic]
         if not sensor.delay and topic in offsets:
             table = table._replace(times=table.times + offsets[topic].seconds)
-        kmh = any(
-            delay.what == "way"
-            and ((delay.late == topic and _in(delay.scale)) or (delay.early == topic and _in(1 / delay.scale)))
-            for delay in delays
-        )
+        ways = [delay for delay in delays if delay.what == "way" and topic in (delay.late, delay.early)]
+        scale = max([abs(each.scale if each.late == topic else 1 / each.scale) for each in ways], default=1.0)
         for group in sensor.groups:
-            seen[f"{sensor.name}_{group}"] = seen_by(sensor, group, config, table, origin, kmh)
+            seen[f"{sensor.name}_{group}"] = seen_by(sensor, group, config, table, origin, scale)
     return RobotLog(seen, offsets, origin)
 
 
-def _in(scale: float) -> bool:
-    return _KMH[0] < abs(scale) < _KMH[1]
+def drift_settings(log: RobotLog, model: RobotModel) -> dict:
+    """The settings, with drifts of all readings that vary, from which they are learned; those that are given stay.
+
+    Rows are few: fast readings are means, whose noise is what matters for a path, and is learned for this rate alone.
+    Velocities are held for a step, and without process noise in the settings it follows from how they change in 1 s.
+    A pose drifts by what the log says of its noise; a forward speed by a share, other readings by one of their spread.
+    """
+    settings = {"held_velocities": True, **model.config.given, "frequency": min(_RATE, model.config.frequency)}
+    walks = [1e-2] * 3 + [1e-4] * 3 + [1e-2] * 9  # the variance that a second adds
+    for sensor in model.config.sensors:
+        drifts = [0.0] * len(STATES)
+        for group in sensor.groups:
+            seen = log.seen[f"{sensor.name}_{group}"]
+            back = 6 if sensor.differential and group == "pose" else 0
+            for at, place in enumerate(model.reads[f"{sensor.name}_{group}"]):
+                column = np.unwrap(seen.values[:, at]) if place in ANGLES else seen.values[:, at]
+                if np.ptp(column) == 0:
+                    continue
+                if 6 <= place < 12:
+                    later = np.interp(seen.times + 1.0, seen.times, column)
+                    walks[place] = float(np.square(later - column).mean())
+                drifts[place - back] = _SHARE if place == STATES.index("vx") else _SHARE * float(column.std())
+                if place < 3:
+                    drifts[place] = float(np.sqrt(np.median(seen.noise[:, at, at])))
+        settings.setdefault(f"{sensor.name}_drifts", drifts)
+    settings.setdefault("process_noise_covariance", walks)
+    return settings
 
 
-def _found(topic: str, streams: Mapping[str, Stream], file: Path) -> str:
+def _found(topic: str, streams: Mapping[str, Stream], file: Path | str) -> str:
     for name in streams:
         if name.strip("/") == topic.strip("/"):
             return name
@@ -107,8 +133,8 @@ def _found(topic: str, streams: Mapping[str, Stream], file: Path) -> str:
 def rows_of_log(log: RobotLog, model: RobotModel, hidden: np.ndarray | None = None) -> TensorDict:
     """Makes rows ``[T]`` of all poses, of fast ones of every so many, and of ``frequency`` where none is near.
 
-    Readings of other sensors that are as fast stand in the row that is nearest to them, as their mean; those of slow
-    ones have rows of their own.
+    Readings of other sensors that are as fast stand in the row that is nearest to them, as their mean; in the one
+    before them if the model holds velocities for a step. Those of slow ones have rows of their own.
 
     Args:
         log: the readings.
@@ -130,9 +156,9 @@ def rows_of_log(log: RobotLog, model: RobotModel, hidden: np.ndarray | None = No
         ticks = ticks[(near > 0.5 / rate) & (ticks > begin)]
     times = np.unique(np.concatenate([[begin], exact, ticks]))
     rows = {"stamp": times[:, None], "dt": np.diff(times, prepend=begin)[:, None]}
-    edges = (times[1:] + times[:-1]) / 2
+    edges = times[1:] if model.config.held else (times[1:] + times[:-1]) / 2
     for name, seen in streams.items():
-        place = np.searchsorted(times, seen.times) if own[name] else np.searchsorted(edges, seen.times)
+        place = np.searchsorted(times, seen.times) if own[name] else np.searchsorted(edges, seen.times, "right")
         inside = (seen.times >= begin) & (seen.times <= times[-1] + 0.5 / rate)
         place, values, noise = place[inside], seen.values[inside], seen.noise[inside]
         count = np.bincount(place, minlength=len(times))

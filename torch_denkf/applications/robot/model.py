@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,13 +11,13 @@ import torch
 from torch import Tensor, nn
 
 from torch_denkf.applications.robot.config import PLANE, Config, read_config
-from torch_denkf.applications.robot.motion import ANGLES, STATE_SPACE, RobotMotion, RobotNoise
+from torch_denkf.applications.robot.motion import ANGLES, STATES, Drifts, RobotMotion, RobotNoise, state_space
 from torch_denkf.functional.manifolds import Circle, Euclidean, Product
 from torch_denkf.fusion import FusedFilter, FusedSensor
-from torch_denkf.modules import MomentPrior, Select, UKFTransition
+from torch_denkf.modules import MomentPrior, UKFTransition
 from torch_denkf.submodel import SubModel
 
-__all__ = ["LearnedScale", "RobotModel", "robot_model"]
+__all__ = ["Drifted", "LearnedScale", "RobotModel", "robot_model"]
 
 PLANE_VARIANCE = 1e-6  # of the zeros that are read in the plane
 
@@ -32,17 +32,60 @@ class RobotModel:
         config: the settings.
         reads: by the name of each sensor of the filter, such as ``odom0_pose``: the states that it reads, in order.
         unheeded: what of the settings is not honoured, and why.
+        drifts: the slow errors of readings, behind the fifteen states; ``None`` without any.
     """
 
     filter: FusedFilter
     config: Config
     reads: Mapping[str, tuple[int, ...]]
     unheeded: tuple[str, ...] = field(default=())
+    drifts: Drifts | None = None
 
     def started(self, mean: Tensor, cov: Tensor) -> RobotModel:
-        """Returns this model with another initial belief: ``[15]`` and ``[15, 15]``."""
-        initial = MomentPrior(mean, cov, space=STATE_SPACE)
-        return RobotModel(self.filter.with_modules(initial=initial), self.config, self.reads, self.unheeded)
+        """Returns this model with another initial belief, ``[15]`` and ``[15, 15]``; drifts are as large as ever."""
+        return replace(self, filter=self.filter.with_modules(initial=_initial(mean, cov, self.drifts)))
+
+    def reading(self, name: str) -> Drifted:
+        """Returns the observation model of a sensor."""
+        return next(part for part in self.filter.modules() if isinstance(part, Drifted) and part.name == name)
+
+
+class Drifted(SubModel):
+    """The states that a sensor reads, each with its slow error: added to it, or a share of the forward speed as read.
+
+    Args:
+        name: of the sensor, and of its readings ``[*B, O]``.
+        dims: the states, ``[O]``.
+        slow: places of their errors in the state; ``None`` for none.
+    """
+
+    def __init__(self, name: str, dims: Sequence[int], slow: Sequence[int | None]):
+        super().__init__(nn.Identity(), [("forecast", "ensemble"), name], [("forecast", "observation")])
+        self.name, self.slow = name, tuple(slow)
+        self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
+        self.register_buffer("places", torch.tensor([0 if at is None else at for at in slow]), persistent=False)
+        self.register_buffer("has", torch.tensor([at is not None for at in slow]), persistent=False)
+        shares = [place == STATES.index("vx") and at is not None for place, at in zip(dims, slow, strict=True)]
+        self.register_buffer("shares", torch.tensor(shares), persistent=False)
+
+    def compute(self, ensemble, reading):
+        """The predicted reading."""
+        return self.jacobian(ensemble, reading)[0]
+
+    def jacobian(self, ensemble, reading):
+        """The same, and its Jacobian: linear, since a share is one of what was read, not of the state."""
+        factor = torch.where(self.shares, reading.nan_to_num(), 1.0).to(ensemble.dtype) * self.has
+        predicted = ensemble[..., self.dims] + factor.unsqueeze(-2) * ensemble[..., self.places]
+        every = torch.arange(ensemble.shape[-1], device=ensemble.device)
+        own, other = ((each.unsqueeze(-1) == every).to(ensemble.dtype) for each in (self.dims, self.places))
+        return predicted, (own + factor.unsqueeze(-1) * other).unsqueeze(-3).expand(*predicted.shape, -1)
+
+
+def _initial(mean: Tensor, cov: Tensor, drifts: Drifts | None) -> MomentPrior:
+    if drifts is None:
+        return MomentPrior(mean, cov, space=state_space())
+    mean = nn.functional.pad(mean, (0, len(drifts)))
+    return MomentPrior(mean, torch.block_diag(cov, drifts.variance.detach().diag()), space=state_space(len(drifts)))
 
 
 class LearnedScale(SubModel):
@@ -75,12 +118,15 @@ def robot_model(
     """Makes the filter that a configuration of robot_localization describes.
 
     Messages of an odometry are two sensors, its pose and its twist, and those of an inertial sensor three; each is
-    believed by the covariance that stands in its row. With ``two_d_mode`` each reads also zeros, of variance 1e-6, of
-    what does not move in the plane. Poses of ``..._differential`` and ``..._relative`` sensors are those of the rows.
+    believed by the covariance that stands in its row, and by its drifts. With ``two_d_mode`` each reads also zeros, of
+    variance 1e-6, of what does not move in the plane. Poses of ``..._differential`` and ``..._relative`` sensors are
+    those of the rows.
 
     Args:
-        config: a YAML file, or its content. Two parameters of a sensor are this library's own: ``odom0_delay``, in s,
-            and ``odom0_variances``, fifteen, where messages bring no covariance.
+        config: a YAML file, or its content. Four parameters of a sensor are this library's own: ``odom0_delay``, in s;
+            ``odom0_variances``, fifteen, where messages bring no covariance; ``odom0_drifts``, fifteen standard
+            deviations of errors that last (that of a forward speed is a share of it), and ``odom0_drift_time``, in s, a
+            number or fifteen.
         kind: the extended filter, or the unscented one, with ``alpha``, ``kappa`` and ``beta`` of the configuration.
         dtype: of all constants; float64, in which robot_localization calculates.
 
@@ -100,32 +146,41 @@ def robot_model(
     """
     settings = read_config(config)
     sensors, reads = {}, {}
+    sizes: list[float] = []
+    times: list[float] = []
     for sensor in settings.sensors:
         for group, places in sensor.groups.items():
+            if settings.two_d:
+                places = tuple(place for place in places if place not in PLANE)
+            slow: list[int | None] = []
+            for place in places:
+                size = sensor.drifts[place] if sensor.drifts else 0.0
+                slow.append(len(STATES) + len(sizes) if size > 0 else None)
+                if size > 0:
+                    sizes.append(size)
+                    times.append(sensor.drift_time[place])
             if sensor.differential and group == "pose":
                 places = tuple(place + 6 for place in places)
-            if settings.two_d:
-                places = (*(place for place in places if place not in PLANE), *PLANE)
-            name = f"{sensor.name}_{group}"
             kept = len(PLANE) if settings.two_d else 0
+            places, slow = (*places, *PLANE[:kept]), slow + [None] * kept
+            name = f"{sensor.name}_{group}"
             space = Product(*(Circle() if place in ANGLES else Euclidean(1) for place in places))
             noise = LearnedScale(f"{name}_noise", len(places), kept, dtype)
-            sensors[name] = FusedSensor(Select(list(places)), noise, reading_space=space)
+            sensors[name] = FusedSensor(Drifted(name, places, slow), noise, reading_space=space)
             reads[name] = places
-    motion = RobotMotion("dt")
+    drifts = Drifts(torch.tensor(sizes, dtype=dtype), torch.tensor(times, dtype=dtype)) if sizes else None
+    motion = RobotMotion("dt", drifts, settings.held)
     cov = torch.as_tensor(settings.process_noise, dtype=dtype)
-    noise_of_step = RobotNoise(cov, "dt", settings.dynamic)
+    noise_of_step = RobotNoise(cov, "dt", settings.dynamic, drifts)
     transition: Any = motion
     if kind == "ukf":
         alpha, kappa, beta = settings.sigma
-        transition = UKFTransition(motion, noise_of_step, alpha=alpha, beta=beta, kappa=kappa, space=STATE_SPACE)
+        transition = UKFTransition(motion, noise_of_step, alpha=alpha, beta=beta, kappa=kappa, space=motion.space)
     elif kind != "ekf":
         raise ValueError(f"kind is 'ekf' or 'ukf', got {kind!r}")
-    initial = MomentPrior(
-        torch.as_tensor(settings.initial_state, dtype=dtype),
-        torch.as_tensor(settings.initial_cov, dtype=dtype),
-        space=STATE_SPACE,
+    initial = _initial(
+        torch.as_tensor(settings.initial_state, dtype=dtype), torch.as_tensor(settings.initial_cov, dtype=dtype), drifts
     )
     options = {} if kind == "ukf" else {"process_noise": noise_of_step}
     filter = FusedFilter(transition, sensors, initial=initial, **options)
-    return RobotModel(filter, settings, reads, settings.unheeded)
+    return RobotModel(filter, settings, reads, settings.unheeded, drifts)

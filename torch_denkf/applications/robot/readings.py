@@ -10,10 +10,10 @@ import numpy as np
 
 from torch_denkf.applications.robot.config import PLANE, Config, SensorConfig
 from torch_denkf.data.earth import to_local
-from torch_denkf.data.recordings.quantities import find, quantity
+from torch_denkf.data.recordings.quantities import SPEEDS, find, quantity, speed_unit
 from torch_denkf.data.recordings.tables import Readings
 
-__all__ = ["Seen", "seen_by"]
+__all__ = ["Seen", "from_north", "seen_by"]
 
 _ROTATING = 7.0  # rad, or rad/s: beyond are degrees
 _XYZ = ("x", "y", "z")
@@ -42,8 +42,18 @@ class Seen(NamedTuple):
         return Seen(self.times[kept], self.values[kept], self.noise[kept], self.stated)
 
 
+def from_north(name: str) -> bool:
+    """Whether a column is a compass heading, clockwise from north.
+
+    Examples:
+        >>> from_north("Compass heading [deg]"), from_north("COG [deg]"), from_north("theta")
+        (True, False, False)
+    """
+    return bool(re.search("compass|magnetic|true_?heading", name.lower()))
+
+
 def seen_by(
-    sensor: SensorConfig, group: str, config: Config, table: Readings, origin: Sequence[float] | None, kmh: bool
+    sensor: SensorConfig, group: str, config: Config, table: Readings, origin: Sequence[float] | None, scale: float
 ) -> Seen:
     """Finds what a sensor reads of the states.
 
@@ -53,12 +63,12 @@ def seen_by(
         config: all settings.
         table: the log's columns, of a ROS message or with usual names.
         origin: of a local frame, degrees, for latitudes and longitudes.
-        kmh: whether speeds are in km/h.
+        scale: of its speeds to those of other sensors, which tells their unit where no name does.
 
     Raises:
         ValueError: if the log lacks a state that the settings read; names it.
     """
-    values, variances = _states(table, origin, kmh)
+    values, variances = _states(table, origin, scale)
     if sensor.without_gravity and group == "acceleration":
         values[:, 12:] -= _gravity(values[:, 3:6], config.gravity)
     times = table.times - sensor.delay
@@ -100,7 +110,7 @@ def seen_by(
     return Seen(times[there], read[there], noise[there], stated)
 
 
-def _states(table: Readings, origin: Sequence[float] | None, kmh: bool) -> tuple[np.ndarray, np.ndarray]:
+def _states(table: Readings, origin: Sequence[float] | None, scale: float) -> tuple[np.ndarray, np.ndarray]:
     """The states of each row ``[n, 15]``, and their covariances ``[n, 15, 15]``; NaN where they are not known."""
     count, columns = (
         len(table.times),
@@ -111,7 +121,7 @@ def _states(table: Readings, origin: Sequence[float] | None, kmh: bool) -> tuple
     if ros:
         _of_message(columns, values, cov)
     else:
-        _of_names(table, columns, values, cov, origin, kmh)
+        _of_names(table, columns, values, cov, origin, scale)
     return values, cov
 
 
@@ -139,7 +149,7 @@ def _of_names(
     values: np.ndarray,
     cov: np.ndarray,
     origin: Sequence[float] | None,
-    kmh: bool,
+    scale: float,
 ) -> None:
     """Fills in columns with usual names."""
     if places := find(table.columns, "latitude", "longitude"):
@@ -148,14 +158,15 @@ def _of_names(
         values[:, :2] = table.values[:, places]
     for name, column in columns.items():
         what, turned = quantity(name), np.abs(column).max(initial=0.0) > _ROTATING
-        if what == "heading":
+        if what == "heading" and (from_north(name) or np.isnan(values[:, 5]).all()):  # a compass before a course
             angle = np.radians(column) if turned else column
-            compass = re.search("course|cog|track", name.lower())  # clockwise from north
-            values[:, 5] = np.pi / 2 - angle if compass else angle
+            clockwise = from_north(name) or re.search("course|cog|track", name.lower())
+            values[:, 5] = np.pi / 2 - angle if clockwise else angle
         elif what == "turn rate":
             values[:, 11] = np.radians(column) if turned else column
         elif what == "speed" and np.isnan(values[:, 6]).all():
-            values[:, 6], values[:, 7:9] = column / 3.6 if kmh else column, 0.0
+            unit = speed_unit(name, scale)
+            values[:, 6], values[:, 7:9] = column / SPEEDS[unit][0] if unit else column, 0.0
             cov[:, 7, 7] = cov[:, 8, 8] = _SLIP**2
         elif what == "acceleration":
             begin = table.columns.index(name)

@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf.applications.robot.config import PLANE, write_config
-from torch_denkf.applications.robot.learning import scale_of
+from torch_denkf.applications.robot.learning import fix_error, scale_of
 from torch_denkf.applications.robot.log import RobotLog
 from torch_denkf.applications.robot.model import RobotModel
 from torch_denkf.applications.robot.motion import ANGLES, STATES
@@ -26,16 +26,16 @@ _BELIEVED = 0.99  # of a reading's distance: beyond, it is none that the noise e
 
 
 def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]:
-    """Says of each sensor how often it is believed, its bias, its delay and its noise, as a table."""
-    lines = ["| sensor | reads | readings | believed | bias | residual | noise as given | noise as learned | offset |"]
-    lines.append("|" + "---|" * 9)
+    """Says of each sensor how often it is believed, its bias, its delay, its noise and its drift, as a table."""
+    heads = ("sensor", "reads", "readings", "believed", "bias", "residual", "noise as given", "noise as learned")
+    lines = [f"| {' | '.join(heads)} | drift | offset |", "|" + "---|" * (len(heads) + 2)]
     for sensor in model.config.sensors:
         for group in sensor.groups:
             name = f"{sensor.name}_{group}"
             seen = out[f"{name}_observed"][:, 0]
             places = [place for place in model.reads[name] if not (model.config.two_d and place in PLANE)]
             size = len(places)
-            nis = out["info", name, "nis"][seen, 0]
+            nis = out.get(("info", name, "nis"), out["info", "nis"])[seen, 0]  # of one sensor without its name
             share = float((nis < _chi_square(size)).double().mean())
             residual = out[name][seen][:, :size] - out["smoothed", "mean"][seen][:, places]
             for at, place in enumerate(places):
@@ -45,7 +45,14 @@ def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]
             scale = scale_of(model, name).detach().exp()
             offset = log.offsets[sensor.topic].seconds if sensor.topic in log.offsets else -sensor.delay
             said = given if log.seen[name].stated else ["none"] * size
-            cells = [residual.mean(0), residual.std(0), said, given * scale]
+            with torch.no_grad():
+                mean = out["smoothed", "mean"][seen].unsqueeze(-2)
+                predicted = model.reading(name).compute(mean, out[name][seen]).squeeze(-2)
+            bias = predicted[:, :size] - out["smoothed", "mean"][seen][:, places]
+            sized = [_drift(model, name, at) for at in range(size)]
+            drift = ["none" if each is None else f"{each[0]:.3g} for {each[1]:.3g} s" for each in sized]
+            kept = residual.mean(0) if model.drifts is None else bias.mean(0)
+            cells = [kept, (residual - bias).std(0), said, given * scale, drift]
             texts = ["; ".join(each if isinstance(each, str) else f"{each:.3g}" for each in cell) for cell in cells]
             reads = ", ".join(STATES[place] for place in places)
             lines.append(
@@ -53,6 +60,15 @@ def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]
                 f"{offset:+.2f} s |"
             )
     return lines
+
+
+def _drift(model: RobotModel, name: str, at: int) -> tuple[float, float] | None:
+    """Standard deviation and time, s, of the drift of a sensor's reading; ``None`` for one that has none."""
+    place = model.reading(name).slow[at]
+    if place is None or model.drifts is None:
+        return None
+    drifts, place = model.drifts, place - len(STATES)
+    return drifts.log_std[place].exp().item(), drifts.log_time[place].exp().item()
 
 
 def _chi_square(dof: int) -> float:
@@ -63,18 +79,16 @@ def _chi_square(dof: int) -> float:
 
 def gap_errors(out: TensorDict, full: TensorDict, model: RobotModel) -> tuple[float, float, int]:
     """Root mean square error of the place at fixes that were hidden, the share of their x and y that lie in the 95 %
-    intervals of such a fix, its own noise included, and how many there are.
+    intervals of such a fix, its own noise and drift included, and how many there are.
     """
     errors, held = [], []
     for name, reads in model.reads.items():
         if tuple(reads[:2]) == (0, 1):
             hidden = (full[f"{name}_observed"] & ~out[f"{name}_observed"])[:, 0]
-            error = (full[name][:, :2] - out["smoothed", "mean"][:, :2])[hidden]
+            with torch.no_grad():
+                error, cov = (value[hidden] for value in fix_error(model, name, out.clone().update(full.select(name))))
             errors.append(error.square().sum(-1))
-            noise = (
-                full[f"{name}_noise"][hidden][:, range(2), range(2)] * scale_of(model, name).detach()[:2].exp().square()
-            )
-            held.append(error.abs() < 1.96 * (out["smoothed", "var"][hidden][:, :2] + noise).sqrt())
+            held.append(error.abs() < 1.96 * cov.diagonal(dim1=-2, dim2=-1).sqrt())
     every = torch.cat(errors) if errors else torch.zeros(0)
     if not len(every):
         return math.nan, math.nan, 0
@@ -82,19 +96,25 @@ def gap_errors(out: TensorDict, full: TensorDict, model: RobotModel) -> tuple[fl
 
 
 def learned_settings(model: RobotModel, log: RobotLog, rows: TensorDict) -> dict[str, Any]:
-    """The settings that were learned: process noise, and delays and variances of the sensors."""
+    """The settings that were learned: process noise, and delays, variances and drifts of the sensors."""
     process = next(part for part in model.filter.modules() if hasattr(part, "log_scale") and hasattr(part, "dynamic"))
     scale = process.log_scale.detach().exp()
     cov: Tensor = process.cov * scale * scale.unsqueeze(-1)
     changed: dict[str, Any] = {"process_noise_covariance": [float(f"{each:.6g}") for each in cov.flatten().tolist()]}
     for sensor in model.config.sensors:
-        variances = [0.0] * len(STATES)
+        variances, drifts, times = [0.0] * len(STATES), [0.0] * len(STATES), list(sensor.drift_time)
         for group in sensor.groups:
             name = f"{sensor.name}_{group}"
             kept = scale_of(model, name).detach().exp().square()
             mean = rows[f"{name}_noise"][rows[f"{name}_observed"][:, 0]].mean(0).diagonal()[: len(kept)]
-            for place, variance in zip(model.reads[name], (mean * kept).tolist(), strict=False):
-                variances[place - 6 if sensor.differential and group == "pose" else place] = float(f"{variance:.6g}")
+            back = 6 if sensor.differential and group == "pose" else 0
+            for at, (place, variance) in enumerate(zip(model.reads[name], (mean * kept).tolist(), strict=False)):
+                variances[place - back] = float(f"{variance:.6g}")
+                if drift := _drift(model, name, at):
+                    drifts[place - back] = float(f"{drift[0]:.6g}")
+                    times[place - back] = float(f"{drift[1]:.6g}")
+        if any(drifts):
+            changed |= {f"{sensor.name}_drifts": drifts, f"{sensor.name}_drift_time": times}
         changed[f"{sensor.name}_variances"] = variances
         if not sensor.delay and sensor.topic in log.offsets:
             changed[f"{sensor.name}_delay"] = round(-log.offsets[sensor.topic].seconds, 3)
@@ -107,10 +127,10 @@ def write_path(folder: Path, model: RobotModel, log: RobotLog, out: TensorDict) 
     Returns:
         The names of the files.
     """
-    mean, std = out["smoothed", "mean"].numpy(), out["smoothed", "var"].sqrt().numpy()
+    mean, std = (out["smoothed", name][:, : len(STATES)].numpy() for name in ("mean", "var"))
     stamp, names = out["stamp"].numpy(), ["path.csv", "path.tum", "ekf.yaml"]
     kept = np.append(np.diff(stamp[:, 0]) > 0, True)  # the last row of each time
-    stamp, mean, std = stamp[kept], mean[kept], std[kept]
+    stamp, mean, std = stamp[kept], mean[kept], np.sqrt(std[kept])
     head = ",".join(["time", *STATES, *(f"std_{state}" for state in STATES)])
     np.savetxt(folder / "path.csv", np.c_[stamp, mean, std], "%.9f", ",", header=head, comments="")
     half = mean[:, 3:6] / 2

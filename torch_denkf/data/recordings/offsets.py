@@ -163,8 +163,12 @@ def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[De
                 found = tried[best]
                 if what == "heading" or pair[1].level.ndim == 1:  # a chord of some seconds is shorter than a way
                     longer = _delay(*pair, what, limit, _SPANS[1])
-                    if found is None or (longer is not None and longer[1] < _BETTER * found[1]):
-                        found = longer
+                    if found is not None and longer is not None:
+                        # The better one by chance: what their intervals do not explain counts, too.
+                        apart = (found[0] - longer[0]) ** 2 - max(found[1], longer[1]) ** 2
+                        found = longer if longer[1] < _BETTER * found[1] else found
+                        found = (found[0], float(np.sqrt(found[1] ** 2 + max(apart, 0.0) / 4)), *found[2:])
+                    found = longer if found is None else found
                 if found is not None and abs(found[3]) >= _AGREE:
                     out.append(Delay(late, early, what, *found))
     return out
@@ -293,6 +297,7 @@ def _delay(
     block = ((late.times[begin] - late.times[begin[0]]) // max(_BLOCK * span, 8.0)).astype(int)
     sums, known = np.bincount(block, score), np.bincount(block, weight * slope * slope)
     blocks = max(2.0, float(known.sum() ** 2 / np.square(known).sum()))  # that say as much as others
-    variance = np.square(sums / (known.sum() - known).clip(min=1e-300)).sum()
+    with np.errstate(over="ignore"):  # of a single block, which leaves nothing: infinite
+        variance = np.square(sums / (known.sum() - known).clip(min=1e-300)).sum()
     variance = variance * (1 + 1.2 / (blocks - 1)) ** 2 + np.median(np.diff(early.times)) ** 2 / 12
     return shift, float(np.sqrt(variance)), scale, correlation

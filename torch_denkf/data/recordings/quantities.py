@@ -7,7 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["find", "in_radians", "quantity"]
+__all__ = ["SPEEDS", "find", "in_radians", "quantity", "speed_unit"]
+
+#: Units of speeds: how many are one m/s, and how their names look.
+SPEEDS = {"km/h": (3.6, r"km/?h|kph|kmph"), "mph": (2.23694, r"mph"), "knots": (1.94384, r"kn|kts?|knots?")}
 
 _AXIS = r"(?:^|(?:.*[._ /])?(?:pose|pos|position|utm|map|gps|fix|translation)[._ /])(?:p|t|pos)?_?"
 #: Patterns of the names of columns, in lower case and without units, by what they mean.
@@ -16,8 +19,8 @@ _NAMES = {
     "longitude": r".*longitude|.*\b(lon|lng|long)",
     "east": rf"east(ing)?|{_AXIS}x|.*p_rs_r_x",
     "north": rf"north(ing)?|{_AXIS}y|.*p_rs_r_y",
-    "turn rate": r".*(yaw_?rate|yaw_?vel|turn(_?rate)?|gyro(_?z)?|omega(_?z)?|\bwz|angular(_velocity)?[._]z|w_rs_s_z)",
-    "heading": r".*(heading|yaw|theta|course|\bcog|track|psi)",
+    "turn rate": r".*(yaw_?(rate|vel)|turn(_?rate)?|gyro(_?z)?|omega(_?z)?|\b[wg]z|angular(_velocity)?[._]z|w_rs_s_z)",
+    "heading": r".*(heading|compass|yaw|theta|course|\bcog|track|psi)",
     "speed": r".*(speed|velocity|\bsog|\bvx|\bv|(twist[._])?linear[._]x|v_forward)",
     "acceleration": r".*(\bax|acc(el(eration)?)?_?x|linear_acceleration[._]x|a_rs_s_x)",
 }
@@ -39,6 +42,19 @@ def find(columns: Sequence[str], *wanted: str) -> list[int] | None:
     """The places of the first columns that hold some quantities; ``None`` where one is not there."""
     found = [quantity(name) for name in columns]
     return [found.index(what) for what in wanted] if set(wanted) <= set(found) else None
+
+
+def speed_unit(name: str, scale: float = 1.0) -> str | None:
+    """The unit of a speed, by its column's name, of km/h also by a scale; ``None`` for m/s.
+
+    Examples:
+        >>> speed_unit("SOG [kn]"), speed_unit("speed_kmh"), speed_unit("speed", 3.7), speed_unit("speed", 2.2)
+        ('knots', 'km/h', 'km/h', None)
+    """
+    for unit, (_, pattern) in SPEEDS.items():
+        if re.search(rf"(?<![a-z])({pattern})(?![a-z])", name.lower()):
+            return unit
+    return "km/h" if 3.1 < scale < 4.2 else None  # others are too near to 1 for a scale that noise makes smaller
 
 
 def in_radians(angles: np.ndarray) -> np.ndarray:

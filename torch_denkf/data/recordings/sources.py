@@ -174,7 +174,7 @@ def read_numbers(
 
     Args:
         file: of a :class:`~torch_denkf.data.Table`.
-        time: name of the column of times; ``None`` for the first ascending one with a usual name.
+        time: name of the column of times; ``None`` for the first ascending one with a usual name, or the one of dates.
         columns: to read; ``None`` for all others that hold numbers.
         timeless: whether times stand elsewhere.
         topic: of a bag.
@@ -186,7 +186,7 @@ def read_numbers(
     """
     source = open_source(file, columns, topic)
     there = source.names
-    found = [] if timeless else [time] if time is not None else time_columns(there) or ["time"]
+    found = [] if timeless else [time] if time is not None else time_columns(there) or _dates(source) or ["time"]
     missing = [name for name in [*found, *(columns or ())] if name not in there]
     if missing:
         cure = (
@@ -223,3 +223,12 @@ def read_numbers(
     return Numbers(
         times, chosen or "times", values, names, lambda row: source.place(int(kept[row]) if len(kept) else -1)
     )
+
+
+def _dates(source: Source) -> list[str]:
+    """The column whose first cell is a date, where there is one such column."""
+    try:
+        found = [name for name in source.names if seconds_of(str(source.cell(name, 0))) is not None]
+    except (IndexError, NotImplementedError):  # no row, or no text
+        return []
+    return found if len(found) == 1 else []

@@ -64,11 +64,11 @@ class Stream(NamedTuple):
         return out
 
 
-def streams_of(file: str | Path, **options) -> dict[str, Stream]:
+def streams_of(*files: str | Path, **options) -> dict[str, Stream]:
     """Finds the streams of a log.
 
     Args:
-        file: of a :class:`~torch_denkf.data.Table`.
+        *files: of :class:`~torch_denkf.data.Table`; their times are of one clock.
         **options: of the tables, such as ``time`` and ``unit``.
 
     Returns:
@@ -79,7 +79,18 @@ def streams_of(file: str | Path, **options) -> dict[str, Stream]:
         ImportError: for bags without rosbags.
         ValueError: if the file cannot be read.
     """
-    path = Path(file).expanduser()
+    if not files:
+        raise ValueError("no log was given: name a file, or several of one clock")
+    found: dict[str, Stream] = {}
+    for file in files:
+        for name, stream in _of_file(Path(file).expanduser(), **options).items():
+            while name in found:
+                name += "_"
+            found[name] = stream
+    return found
+
+
+def _of_file(path: Path, **options) -> dict[str, Stream]:
     found: dict[str, Stream] = {}
     if is_bag(path):
         for topic in sorted(bag_topics(path)):

@@ -44,10 +44,7 @@ def representable_rate(rate: float) -> float:
 
 
 def random_bytes(
-    shape: Sequence[int],
-    *,
-    device: torch.device | str | None = None,
-    generator: torch.Generator | None = None,
+    shape: Sequence[int], *, device: torch.device | str | None = None, generator: torch.Generator | None = None
 ) -> torch.Tensor:
     """Draws independent bytes, uniform in 0 to 255, eight out of one 64-bit number.
 
@@ -159,10 +156,7 @@ def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torc
 
 
 def random_signs(
-    shape: Sequence[int],
-    *,
-    device: torch.device | str | None = None,
-    generator: torch.Generator | None = None,
+    shape: Sequence[int], *, device: torch.device | str | None = None, generator: torch.Generator | None = None
 ) -> torch.Tensor:
     """Draws fair coins, as a boolean tensor of shape ``shape``: ``True`` stands for +1, ``False`` for -1."""
     return random_bytes(shape, device=device, generator=generator) >= 128

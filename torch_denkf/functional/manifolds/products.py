@@ -205,12 +205,12 @@ class Product(_Made):
 
     def points(self, point: Tensor) -> Sequence[Tensor]:
         """Returns the numbers of each part."""
-        return point.split([part.point_dim for part in self.parts], -1)
+        return point.split_with_sizes([part.point_dim for part in self.parts], -1)
 
     def _apart(self, name: str, value: Tensor) -> Sequence[Tensor]:
         if name not in ("exp", "right_jacobian"):
             return self.points(value)
-        return value.split([part.tangent_dim for part in self.parts], -1)
+        return value.split_with_sizes([part.tangent_dim for part in self.parts], -1)
 
     def _each(self, name, *values, **options):
         apart = zip(self.parts, *(self._apart(name, value) for value in values), strict=True)

@@ -10,31 +10,60 @@ from torch_denkf.functional.kernels.small_system import made_once
 __all__ = ["quaternion_of", "quaternion_product", "rotate", "rotation_matrix", "skew"]
 
 
+class Table:
+    """Picks numbers ``[*, M]`` of ``[*, N]``, times signs: a matrix of a few numbers in two calls.
+
+    Args:
+        places: of the numbers among the N, M digits.
+        signs: M of ``+``, ``-`` and ``0``.
+    """
+
+    def __init__(self, places: str, signs: str):
+        self.places, self.signs = list(map(int, places)), [{"+": 1.0, "-": -1.0, "0": 0.0}[sign] for sign in signs]
+
+    def __call__(self, numbers: Tensor) -> Tensor:
+        """Returns the numbers."""
+        dtype, device = numbers.dtype, numbers.device
+        places = made_once((self, device), lambda: torch.as_tensor(self.places, device=device))
+        signs = made_once((self, dtype, device), lambda: torch.as_tensor(self.signs, dtype=dtype, device=device))
+        return numbers.index_select(-1, places) * signs
+
+
+#: The matrix of products with a quaternion; its conjugate; its products with i, j and k; and that of cross products.
+_TIMES = Table("0123103223013210", "+---++-++++-+-++")
+_BACK = Table("0123", "+---")
+_TURNS = Table("123032301210", "---+-+++--++")
+_CROSS = Table("021200100", "0-++0--+0")
+#: Two products each, of which a rotation matrix is twice the sum, and the identity.
+_FIRST, _SECOND = Table("231010101320102012", "--+-++++--+-+-++--"), Table("232332231331323112", "+" * 18)
+#: The right Jacobian of a rotation but for its third term, of a quaternion times 2 sin(a/2) / a.
+BENT = Table("032301210", "++--+++-+")
+
+
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
     """Multiplies quaternions ``[*, 4]``, w first: the rotation ``second``, then ``first``."""
-    a, b = first[..., :1], first[..., 1:]
-    c, d = second[..., :1], second[..., 1:]
-    w = a * c - (b * d).sum(-1, keepdim=True)
-    return torch.cat([w, torch.addcmul(torch.addcmul(_cross(b, d), c, b), a, d)], -1)
+    return (torch.unflatten(_TIMES(first), -1, (4, 4)) * second.unsqueeze(-2)).sum(-1)
 
 
-def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
-    """Rotates a vector ``[*, 3]`` from the body's axes to the world's by a quaternion ``[*, 4]``."""
+def rotate(quaternion: Tensor, vector: Tensor, *, back: bool = False) -> Tensor:
+    """Rotates a vector ``[*, 3]`` from the body's axes to the world's by a quaternion ``[*, 4]``; or ``back``."""
     w, axis = quaternion[..., :1], quaternion[..., 1:]
     twice = 2 * _cross(axis, vector)
-    return torch.addcmul(vector, w, twice) + _cross(axis, twice)
+    return torch.addcmul(vector, w, twice, value=-1 if back else 1) + _cross(axis, twice)
 
 
 def _cross(first: Tensor, second: Tensor) -> Tensor:
-    if first.ndim != second.ndim:  # torch pads no dimensions
+    if second.ndim == 1:  # torch pads no dimensions
+        second = second.expand_as(first)
+    elif first.ndim != second.ndim:
         first, second = torch.broadcast_tensors(first, second)
     return torch.linalg.cross(first, second)
 
 
 def rotation_matrix(quaternion: Tensor) -> Tensor:
     """Returns the matrix ``[*, 3, 3]`` of a quaternion ``[*, 4]``: its columns are the body's axes in the world's."""
-    axes = torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)
-    return rotate(quaternion.unsqueeze(-2), axes).mT
+    terms = torch.unflatten(_FIRST(quaternion) * _SECOND(quaternion), -1, (3, 3, 2))
+    return torch.add(torch.eye(3, dtype=quaternion.dtype, device=quaternion.device), terms.sum(-1), alpha=2)
 
 
 def quaternion_of(matrix: Tensor) -> Tensor:
@@ -54,23 +83,16 @@ def quaternion_of(matrix: Tensor) -> Tensor:
 
 def skew(vector: Tensor) -> Tensor:
     """Returns the matrix ``[*, 3, 3]`` whose product with another vector is the cross product with it."""
-    axes = torch.eye(3, dtype=vector.dtype, device=vector.device)
-    return _cross(vector.unsqueeze(-2), axes).mT
+    return torch.unflatten(_CROSS(vector), -1, (3, 3))
 
 
 def products(point: Tensor) -> Tensor:
     """Returns the products of a point's quaternion with i, j and k, ``[*, 4, 3]``."""
-    w, x, y, z = point[..., :4].unbind(-1)
-    rows = [[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    return torch.unflatten(_TURNS(point), -1, (4, 3))
 
 
 def conjugate(quaternion: Tensor) -> Tensor:
-    return quaternion * made_once(("conjugate", quaternion.dtype, quaternion.device), lambda: _signs(quaternion))
-
-
-def _signs(like: Tensor) -> Tensor:
-    return torch.as_tensor([1.0, -1.0, -1.0, -1.0], dtype=like.dtype, device=like.device)
+    return _BACK(quaternion)
 
 
 def unit(quaternion: Tensor) -> Tensor:

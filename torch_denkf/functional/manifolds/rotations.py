@@ -11,6 +11,7 @@ from torch import Tensor
 from torch_denkf.functional.angles import wrap_angles
 from torch_denkf.functional.kernels.small_system import made_once
 from torch_denkf.functional.manifolds.quaternions import (
+    BENT,
     conjugate,
     products,
     quaternion_product,
@@ -83,11 +84,7 @@ class SE2(Space):
         third = angle * series(square, one_minus_sinc)  # (angle - sin angle) / angle^2
         half = series(square, half_versine)
         zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-        rows = [
-            [one, zero, zero],
-            [x * third - y * half, along, across],
-            [y * third + x * half, -across, along],
-        ]
+        rows = [[one, zero, zero], [x * third - y * half, along, across], [y * third + x * half, -across, along]]
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
     def adjoint(self, point):
@@ -146,7 +143,7 @@ class _RotationAndVectors(Space):
 
     def compose(self, first, second):
         """Composes two points: the second one is seen from the first one's axes."""
-        turn = unit(quaternion_product(first[..., :4], second[..., :4]))
+        turn = unit(quaternion_product(first, second[..., :4]))
         if not self.vectors:
             return turn
         moved = self._vectors(first, 4) + rotate(first[..., None, :4], self._vectors(second, 4))
@@ -164,7 +161,7 @@ class _RotationAndVectors(Space):
         angles = tangent[..., :3]
         square = angles.square().sum(-1, keepdim=True)
         w, share, *bends = several(square, *_EXP[: 4 if self.vectors else 2])
-        quaternion = torch.cat([w, 0.5 * share * angles], -1)
+        quaternion = torch.cat([w, share * angles], -1)
         return self._bent(quaternion, angles, tangent, *bends) if self.vectors else quaternion
 
     def log(self, point):
@@ -210,12 +207,13 @@ class _RotationAndVectors(Space):
 
     def exp_and_jacobian(self, tangent):
         """Returns point and Jacobian; for a rotation alone from three functions of its angle."""
-        if self.vectors or torch.compiler.is_compiling():
+        if self.vectors:
             return super().exp_and_jacobian(tangent)
-        w, share, third = several(tangent.square().sum(-1, keepdim=True), cos_half, sinc_half, one_minus_sinc)
-        share, turn = 0.5 * share, skew(tangent)
-        half = torch.addcmul(eye(tangent, 3), (share * share).unsqueeze(-1), turn, value=-2)  # 1 - cos = 2 sin^2
-        return torch.cat([w, share * tangent], -1), torch.addcmul(half, third.unsqueeze(-1), turn @ turn)
+        square = tangent.square().sum(-1, keepdim=True)
+        w, share, third = several(square, cos_half, half_sinc_half, one_minus_sinc, formula=_of_half)
+        turn = torch.cat([w, share * tangent], -1)
+        bent = torch.unflatten(BENT(2 * share * turn), -1, (3, 3))  # sin a and 1 - cos a of a / 2
+        return turn, torch.addcmul(bent, (third * tangent).unsqueeze(-1), tangent.unsqueeze(-2))
 
     def adjoint(self, point):
         """Returns the matrix of Solà et al., eq. 175."""
@@ -332,8 +330,14 @@ def series(square: Tensor, function: Function) -> Tensor:
     return torch.where(small, near, function.formula(safe))
 
 
-def several(square: Tensor, *functions: Function) -> Sequence[Tensor]:
-    """Returns the :func:`series` of several functions of squares ``[*, 1]``, in fewer calls."""
+def several(square: Tensor, *functions: Function, formula: Callable | None = None) -> Sequence[Tensor]:
+    """Returns the :func:`series` of several functions of squares ``[*, 1]``, in fewer calls.
+
+    Args:
+        square: angles squared.
+        functions: what is wanted.
+        formula: of all, where they share what they need.
+    """
     if torch.compiler.is_compiling():
         return [series(square, function) for function in functions]
     dtype, device = square.dtype, square.device
@@ -341,29 +345,35 @@ def several(square: Tensor, *functions: Function) -> Sequence[Tensor]:
     terms = [list(each) for each in zip(*(function.terms[::-1] for function in functions), strict=True)]
     first, *others = made_once(key, lambda: torch.as_tensor(terms, dtype=dtype, device=device)).unbind()
     small = square < _SMALL[dtype]
-    safe, near = torch.where(small, 1.0, square).sqrt(), first
+    safe, near = square.clamp_min(_SMALL[dtype]).sqrt(), first
     for each in others:
         near = torch.addcmul(each, near, square)
-    return torch.where(small, near, torch.cat([each.formula(safe) for each in functions], -1)).split(1, -1)
+    exact = [each.formula(safe) for each in functions] if formula is None else formula(safe)
+    return torch.where(small, near, torch.cat(exact, -1)).split_with_sizes([1] * len(exact), -1)
+
+
+def _of_half(angle: Tensor) -> Sequence[Tensor]:
+    """Returns the formulas of the exponential's three functions from those of half the angle."""
+    half = 0.5 * angle
+    w, share = half.cos(), half.sin() / angle
+    return w, share, torch.rsub(w * share, 1, alpha=2) / angle.square()
 
 
 cos_half = Function(lambda a: (a / 2).cos(), (1.0, -1 / 8, 1 / 384, -1 / 46080))
-sinc_half = Function(lambda a: (a / 2).sin() * 2 / a, (1.0, -1 / 24, 1 / 1920, -1 / 322560))
+half_sinc_half = Function(lambda a: (a / 2).sin() / a, (1 / 2, -1 / 48, 1 / 3840, -1 / 645120))
 sinc = Function(lambda a: a.sin() / a, (1.0, -1 / 6, 1 / 120, -1 / 5040))
 half_versine = Function(lambda a: (1 - a.cos()) / a**2, (1 / 2, -1 / 24, 1 / 720, -1 / 40320))
 one_minus_sinc = Function(lambda a: (a - a.sin()) / a**3, (1 / 6, -1 / 120, 1 / 5040, -1 / 362880))
 fourth = Function(lambda a: (a**2 + 2 * a.cos() - 2) / (2 * a**4), (1 / 24, -1 / 720, 1 / 40320, -1 / 3628800))
 fifth = Function(
-    lambda a: (2 * a - 3 * a.sin() + a * a.cos()) / (2 * a**5),
-    (1 / 120, -1 / 2520, 1 / 120960, -1 / 9979200),
+    lambda a: (2 * a - 3 * a.sin() + a * a.cos()) / (2 * a**5), (1 / 120, -1 / 2520, 1 / 120960, -1 / 9979200)
 )
 inverse_third = Function(
-    lambda a: (1 - a / 2 * (a / 2).cos() / (a / 2).sin()) / a**2,
-    (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600),
+    lambda a: (1 - a / 2 * (a / 2).cos() / (a / 2).sin()) / a**2, (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600)
 )
 
 #: What the exponential of a rotation needs, and behind it that of the vectors which it turns.
-_EXP = (cos_half, sinc_half, half_versine, one_minus_sinc)
+_EXP = (cos_half, half_sinc_half, half_versine, one_minus_sinc)
 
 
 def bend(turn: Tensor, vector: Tensor, half: Tensor, third: Tensor) -> Tensor:

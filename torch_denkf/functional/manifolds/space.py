@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 if TYPE_CHECKING:
     from torch_denkf.functional.manifolds.flat import Flat
@@ -248,9 +249,4 @@ def side_by_side(parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor
 def blocks(parts: Sequence[Tensor]) -> Tensor:
     """Returns matrices on the diagonal of one."""
     sizes = [part.shape[-1] for part in parts]
-    rows = []
-    for place, part in enumerate(parts):
-        batch = part.shape[:-1]
-        before, after = part.new_zeros(*batch, sum(sizes[:place])), part.new_zeros(*batch, sum(sizes[place + 1 :]))
-        rows.append(torch.cat([before, part, after], -1))
-    return torch.cat(rows, -2)
+    return torch.cat([pad(part, (sum(sizes[:at]), sum(sizes[at + 1 :]))) for at, part in enumerate(parts)], -2)

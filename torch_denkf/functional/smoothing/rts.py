@@ -9,6 +9,7 @@ Source: Rauch, Tung & Striebel 1965; Särkkä 2013, theorem 8.2 and section 9 (f
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_shape
@@ -18,7 +19,7 @@ from torch_denkf.functional.smoothing.backward import run_backward
 
 
 def smoothing_gain(cross: Tensor, forecast_cov: Tensor) -> Tensor:
-    """Returns the smoother's gain G = C P_f⁻¹, also for a singular P_f.
+    """Returns the smoother's gain G = C P_f⁻¹, also for a singular P_f, whose eigenvalues rounding made negative.
 
     Args:
         cross: C, the covariance of the state at t and the state at t + 1, ``[*B, S, S]``, rows at t.
@@ -32,7 +33,7 @@ def smoothing_gain(cross: Tensor, forecast_cov: Tensor) -> Tensor:
         >>> smoothing_gain(torch.tensor([[1.0]]), torch.tensor([[2.0]]))
         tensor([[0.5000]])
     """
-    return semidefinite_solve(forecast_cov, cross.mT).mT
+    return semidefinite_solve(forecast_cov, cross.mT, spare=torch.finfo(cross.dtype).eps ** 0.5).mT
 
 
 def left_open(gain: Tensor, before: Tensor, middle: Tensor, after: Tensor, noise: Tensor) -> Tensor:
