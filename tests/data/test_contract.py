@@ -3,6 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.collectors.utils import split_trajectories
 from torchrl.data import SliceSampler
 
 import torch_denkf
@@ -67,6 +68,31 @@ def test_rollouts_are_episodes_with_statistics_of_all_that_was_seen():
     for strange in (root["pixels"] / 255, root["pixels"].movedim(2, -1)):
         with pytest.raises(ValueError, match=r"uint8 \[T, C, H, W\]"):
             EpisodeReplay.from_rollouts(rollouts.set("pixels", strange), 0.1)
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_what_pads_a_rollout_is_no_row(ends):
+    """torchrl's split_trajectories pads the shorter ones with zeros, and marks that."""
+    done = torch.zeros(2, ROWS, 1, dtype=torch.bool)
+    done[0, 2] = ends
+    rollouts = TensorDict({"state": torch.randn(2, ROWS, 1), "next": {"done": done}, "done": done.clone()}, [2, ROWS])
+    number = torch.stack([(torch.arange(ROWS) > 2).long(), torch.full((ROWS,), 2)])
+    rollouts["collector", "traj_ids"] = number
+    data = EpisodeReplay.from_rollouts(split_trajectories(rollouts), 0.1)
+    assert [episode.length for episode in data.episodes] == [3, ROWS - 3, ROWS]
+    assert data[:]["state"].equal(rollouts["state"].flatten(0, 1))
+
+
+def test_rollouts_of_a_policy_hold_no_graph_and_nested_numbers_count():
+    td = TensorDict({"next": {"done": torch.zeros(1, ROWS, 1, dtype=torch.bool)}}, [1, ROWS])
+    td["action"], td["robot", "speed"] = torch.randn(1, ROWS, 2, requires_grad=True), torch.randn(1, ROWS, 3)
+    td["pixels"] = torch.randint(256, (1, ROWS, 3, 4, 4), dtype=torch.uint8)
+    td["observed"] = torch.tensor([True, False]).expand(1, ROWS, 2)  # of two readings
+    data = EpisodeReplay.from_rollouts(td, 0.1)
+    assert not data[:]["action"].requires_grad
+    torch.testing.assert_close(data.statistics["robot", "speed", "mean"], td["robot", "speed"].mean((0, 1)))
+    pixels = td["pixels"].double().mean((0, 1, 3, 4)) / 255
+    torch.testing.assert_close(data.statistics["pixels", "mean"].flatten().double(), pixels)
 
 
 # Samples --------------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import nn
 
 from torch_denkf.applications.car.modules.unicycle_noise import UnicycleNoise
@@ -22,7 +23,9 @@ from torch_denkf.modules import (
     LearnedTransition,
     MappedNoise,
     NoisyTransition,
+    ScaledNoise,
 )
+from torch_denkf.modules.process_noise import NoiseThrough
 from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import FixedLag
 
@@ -263,6 +266,68 @@ def test_few_noises_of_a_car_are_exact_with_few_members():
     q = noise(TensorDict({"belief": {"mean": mean}, "forecast": {"mean": mean}}, [3]))["forecast", "noise"]
     torch.testing.assert_close(ensemble_cov(added), q, rtol=0, atol=1e-10)
     assert (added.mT @ (td["belief", "ensemble"] - mean.unsqueeze(-2))).abs().max() < 1e-10
+
+
+class Floored(MappedNoise):
+    """Noise through a matrix, and more noise."""
+
+    def on_entries(self, entries, call):
+        written, key = super().on_entries(entries, call), self.out_keys[0]
+        return {**written, key: written[key] + torch.eye(S)}
+
+
+class Rolled(NoiseThrough):
+    """It does not say how many numbers there are."""
+
+    def _matrix(self, entries):
+        return torch.eye(S).roll(1, 0)[:, :2]
+
+
+@pytest.mark.parametrize("kind", ["floored", "looked at", "rolled", "swapped", "swapped for more"])
+def test_noise_that_is_more_than_a_matrix_is_drawn_whole(kind):
+    inner, seen = ConstantNoise(torch.tensor([1.0, 2.0]), **FORECAST), []
+    noise = {"floored": Floored, "rolled": lambda inner, _: Rolled(inner)}.get(kind, MappedNoise)(
+        inner, torch.eye(S, 2)
+    )
+    noisy, q = NoisyTransition(Still(), noise), torch.tensor([1.0, 4.0, 0.0])
+    if kind == "floored":
+        q = q + 1
+    elif kind == "rolled":
+        q = q.roll(1)
+    elif kind == "looked at":
+        noise.register_forward_hook(lambda module, read, out: seen.append(out["forecast", "noise"]))
+    elif kind == "swapped":
+        q = Q.square()
+        noisy.module["noise"] = ConstantNoise(Q, **FORECAST)
+    else:
+        q = 9 * q
+        noisy.module["noise"] = ScaledNoise(noise, 3.0)
+    td = TensorDict({("belief", "ensemble"): torch.randn(5, E, S)}, [5])
+    added = noisy(td.copy())["forecast", "ensemble"] - td["belief", "ensemble"]
+    torch.testing.assert_close(ensemble_cov(added), q.diag().expand(5, S, S), rtol=0, atol=1e-9)
+    assert len(seen) == (kind == "looked at")
+
+
+def test_a_new_noise_module_gets_the_mean():
+    """The old one did not read it, so that it was not worked out."""
+    f, h = system()
+    filter = DEnKF(
+        LearnedTransition(linear(f)),
+        None,
+        LearnedObservation(linear(h)),
+        ConstantNoise(R, in_key="reading"),
+        EnsembleAnalysis("etkf", observation_key="reading"),
+        initial=GaussianPrior([0.0] * S, [1.0] * S, ensemble_size=E),
+        process_noise=Q,
+    )
+    seen = []
+    means = TensorDictModule(
+        lambda mean: seen.append(mean) or mean.square(), [FORECAST["in_key"]], [FORECAST["out_key"]]
+    )
+    filter = filter.with_modules({"transition.noise": means})
+    td = filter.initialise(TensorDict({"reading": torch.ones(2, 2)}, [2]))
+    filter.step(td.copy())
+    torch.testing.assert_close(seen[-1], td["belief", "ensemble"].mean(-2))
 
 
 @pytest.mark.parametrize("space", [Euclidean(1) * Circle(), SO3()])

@@ -99,6 +99,18 @@ def test_noise_is_that_of_steps_in_the_sensors_axes():
     torch.testing.assert_close(cov.compute(state, stands), expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("contact", [torch.bool, torch.float32])
+def test_the_jacobian_of_members_is_that_of_each(contact):
+    motion, batch = LeggedMotion(2, "dt", moves_key="moves"), (2, 3)
+    state = motion.space.exp(torch.randn(*batch, 4, motion.space.tangent_dim))
+    read = [torch.randn(*batch, 6), torch.randn(*batch, 6), (torch.rand(*batch, 2) < 0.5).to(contact)]
+    read += [torch.randn(*batch, 6), torch.full((*batch, 1), DT)]
+    moved, jacobian = motion.jacobian(state, *read)
+    each = [motion.jacobian(member.unsqueeze(-2), *read) for member in state.unbind(-2)]
+    torch.testing.assert_close(moved, torch.cat([one for one, _ in each], -2))
+    torch.testing.assert_close(jacobian, torch.cat([one for _, one in each], -3))
+
+
 def test_a_turn_of_the_world_is_not_seen_in_what_feet_say():
     """Scales by any size: so no update is mistaken about where up is."""
     space = LeggedSpace(2)

@@ -78,3 +78,13 @@ def test_a_constant_that_is_made_under_a_transform_is_no_part_of_it():
     kept = made_once(("test", "jacfwd"), make)
     assert kept.data_ptr()  # a wrapper of the transform would have none
     torch.testing.assert_close(kept, torch.tensor([2.0, 3.0]))
+
+
+def test_a_constant_of_inference_mode_may_meet_gradients():
+    """The first call, of which the constant is, may be one without gradients; inference tensors cannot be saved."""
+    with torch.inference_mode():
+        made = made_once("test of inference mode", lambda: torch.eye(2))
+    assert made_once("test of inference mode", torch.empty) is made
+    weight = torch.ones(2, 2, requires_grad=True)
+    (weight * made).sum().backward()
+    assert weight.grad.equal(torch.eye(2))
