@@ -135,3 +135,17 @@ def test_a_gpu_takes_no_tiles_of_a_cache(monkeypatch, as_on_a_gpu):
     assert as_on_a_gpu(_ensemble_space.columns_in_a_tile, x) is None
     monkeypatch.setattr(_ensemble_space, "GPU_TILE_ELEMENTS", 2**18)  # where memory asks for it
     assert as_on_a_gpu(_ensemble_space.columns_in_a_tile, x) == 2**16
+
+
+@pytest.mark.parametrize("size", [2, LARGEST + 1])
+@pytest.mark.parametrize("place", [0, -1])
+def test_a_reading_of_infinite_noise_says_nothing(float64, as_on_a_gpu, size, place):
+    forecast, noise = torch.randn(3, 16, size + 1, requires_grad=True), torch.ones(3, size)
+    noise[:, place] = torch.inf
+    given = forecast, 2 * forecast[..., :size], torch.randn(3, 16, size), noise
+    ours, theirs = as_on_a_gpu(analyse, *given, scheme="sensor"), analyse(*given, scheme="sensor")
+    for value, expected in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(value, expected)
+    gradients = [torch.autograd.grad(found.ensemble.square().sum(), forecast)[0] for found in (ours, theirs)]
+    assert gradients[0].isfinite().all()
+    torch.testing.assert_close(*gradients)

@@ -159,19 +159,24 @@ def _in_few_launches(
     if observed is not None:
         members = observed.unsqueeze(-2)
         predicted, samples = torch.where(members, predicted, 0), torch.where(members, samples, 0)
-        noise, count = torch.where(observed, noise, 1), observed.expand(noise.shape).sum(-1, keepdim=True)
+        noise, count = (
+            torch.where(observed, noise, 1),
+            observed.expand(noise.shape).sum(-1, keepdim=True, dtype=noise.dtype),
+        )
     shift = samples - predicted
     joint = torch.cat([predicted, forecast], -1)
     anomalies = joint - joint.mean(-2, keepdim=True)
     gram, cross = (anomalies[..., :dim].mT @ anomalies).split([dim, forecast.shape[-1]], -1)
-    solver = Solver(torch.addcmul(gram, identity_of(gram), noise.unsqueeze(-1), value=size - 1))  # (E - 1) S, eq. 9
-    ensemble = forecast + shift @ solver.solve(cross)  # eqs. 11 and 12
+    noise = torch.where(identity_of(gram, torch.bool), noise.unsqueeze(-1), 0)  # R may be infinite
+    solver = Solver(torch.add(gram, noise, alpha=size - 1))  # (E - 1) S, eq. 9
+    gain = solver.solve(cross)  # eqs. 11 and 12
+    ensemble = torch.baddbmm(forecast, shift, gain) if shift.ndim == 3 else forecast + shift @ gain
     if observed is not None:
         ensemble = torch.where(observed.any(-1)[..., None, None], ensemble, forecast)
     innovation = shift.mean(-2)
     nis = (size - 1) * solver.square(innovation.unsqueeze(-1))
-    constant = count * math.log(2 * math.pi) - dim * math.log(size - 1)
-    return Analysis(ensemble, innovation, nis, torch.rsub(nis + solver.log_det(), -0.5 * constant, alpha=0.5))
+    constant = 0.5 * dim * math.log(size - 1) - 0.5 * math.log(2 * math.pi) * count
+    return Analysis(ensemble, innovation, nis, torch.rsub(nis + solver.log_det(), constant, alpha=0.5))
 
 
 def check_analysis_arguments(

@@ -50,9 +50,9 @@ def on_gpu(tensor: Tensor) -> bool:
     return tensor.device.type in GPUS
 
 
-def identity_of(matrix: Tensor) -> Tensor:
+def identity_of(matrix: Tensor, dtype: torch.dtype | None = None) -> Tensor:
     """Returns the identity ``[N, N]`` beside matrices ``[*B, N, N]``; not to be written to."""
-    size, dtype, device = matrix.shape[-1], matrix.dtype, matrix.device
+    size, dtype, device = matrix.shape[-1], dtype or matrix.dtype, matrix.device
     return made_once(("identity", size, dtype, device), lambda: torch.eye(size, dtype=dtype, device=device))
 
 
