@@ -54,11 +54,10 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
     Another TensorDict module gets a TensorDict of what it names among its keys, so it sees the same in a step as in a
     sequence. So does a sub-model with a ``forward`` of its own, or with forward hooks.
     """
-    if not (module._forward_hooks or module._forward_pre_hooks):
-        if isinstance(module, SubModel) and type(module).forward is SubModel.forward:
-            return _explained(module.on_entries, module, entries, call)
-        if is_sequence(module):
-            return run_modules(named_modules_of(module), entries, call)
+    if runs_as_written(module):
+        return _explained(module.on_entries, module, entries, call)
+    if is_sequence(module) and not (module._forward_hooks or module._forward_pre_hooks):
+        return run_modules(named_modules_of(module), entries, call)
     keys, optional = reads(module)
     tensordict = TensorDict({}, batch_size=call.batch_size)
     for key in (*keys, *optional):
@@ -82,16 +81,14 @@ def linearise(
     module: TensorDictModuleBase, entries: Entries, call: Call
 ) -> tuple[Entries, Tensor, tuple[Space, Space] | None] | None:
     """Returns what a module says of itself, see :meth:`SubModel.linearised`; ``None`` where only autograd knows."""
-    if not (isinstance(module, SubModel) and runs_as_written(module)):
-        return None
     try:
-        return _explained(module.linearised, module, entries, call)
+        return _explained(module.linearised, module, entries, call) if runs_as_written(module) else None
     except NotImplementedError:  # a motion, or a measurement, without its optional gradient
         return None
 
 
-def runs_as_written(module: TensorDictModuleBase) -> bool:
-    """Tells whether a sub-model has neither forward hooks nor a ``forward`` of its own."""
+def runs_as_written(module: TensorDictModuleBase) -> TypeGuard[SubModel]:
+    """Tells whether a module is a sub-model, with neither forward hooks nor a ``forward`` of its own."""
     return type(module).forward is SubModel.forward and not (module._forward_hooks or module._forward_pre_hooks)
 
 

@@ -146,6 +146,8 @@ def test_a_reading_of_infinite_noise_says_nothing(float64, as_on_a_gpu, size, pl
     ours, theirs = as_on_a_gpu(analyse, *given, scheme="sensor"), analyse(*given, scheme="sensor")
     for value, expected in zip(ours, theirs, strict=True):
         torch.testing.assert_close(value, expected)
-    gradients = [torch.autograd.grad(found.ensemble.square().sum(), forecast)[0] for found in (ours, theirs)]
+    gradients = [
+        torch.autograd.grad(found.ensemble.square().sum(), forecast, retain_graph=True)[0] for found in (ours, theirs)
+    ]
     assert gradients[0].isfinite().all()
     torch.testing.assert_close(*gradients)

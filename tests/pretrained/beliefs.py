@@ -11,7 +11,7 @@ from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
 
 _LEGS = {"imu": 6, "joints": 16, "joint_rates": 16, "contact": 4}
 _IMU = dict.fromkeys(("gyro", "accelerometer", "magnetometer"), 3) | dict.fromkeys(("unrest", "disturbance", "dt"), 1)
-_IMU |= {"moves": 9, "start": 34}
+_IMU |= {"moves": 9, "lever": 9, "start": 37}
 _READINGS = {
     "car-odometry": {"flow": FLOW_SHAPE, "road": ROAD_SHAPE, "start": (5,)},
     "imu": {key: (size,) for key, size in _IMU.items()},

@@ -167,7 +167,8 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
     ) -> EpisodeReplay:
         """Returns a data set of what environments showed, with statistics of all its numbers and of its pictures.
 
-        The rows are those of the root, each with the action that leads to the next one.
+        The rows are those of the root, each with the action that leads to the next one: behind
+        :class:`~torch_denkf.envs.LateActions` the one that ran. What a filter wrote in the environment is left out.
 
         Args:
             rollouts: ``[T]`` each, one episode; a batch of them ``[B, T]`` will do.
@@ -197,6 +198,10 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
             step = torch.arange(len(rollout)).unsqueeze(-1)
             times = {"step": step, "time": dt * step.double()}
             kept = rollout.exclude("next", "collector", "done", "terminated", "truncated", "is_init", "step_count")
+            late = kept.get(("under_way", "action"), None)
+            if late is not None:
+                kept.set("action", late[..., 0, :])
+            kept = kept.exclude("under_way", "belief", "previous", "ahead", "drawn")  # a belief would start each slice
             parts.append(kept.detach().cpu().apply(lambda x: x.float() if x.is_floating_point() else x).update(times))
             episodes.append(Episode(str(number), sum(map(len, parts[:-1])), len(rollout)))
         rows = cast(TensorDictBase, torch.cat(parts))

@@ -159,10 +159,8 @@ def _in_few_launches(
     if observed is not None:
         members = observed.unsqueeze(-2)
         predicted, samples = torch.where(members, predicted, 0), torch.where(members, samples, 0)
-        noise, count = (
-            torch.where(observed, noise, 1),
-            observed.expand(noise.shape).sum(-1, keepdim=True, dtype=noise.dtype),
-        )
+        noise = torch.where(observed, noise, 1)
+        count = observed.expand(noise.shape).sum(-1, keepdim=True, dtype=noise.dtype)
     shift = samples - predicted
     joint = torch.cat([predicted, forecast], -1)
     anomalies = joint - joint.mean(-2, keepdim=True)

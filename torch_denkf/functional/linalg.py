@@ -90,7 +90,7 @@ def semidefinite_solve(cov: Tensor, right: Tensor, *, spare: float = 0) -> Tenso
     """
     correlation, _, inverse = _correlation(cov)
     if spare:
-        failed = torch.linalg.cholesky_ex(correlation.detach())[1] != 0
+        failed = cholesky(correlation.detach())[..., -1, -1].isnan()
         correlation = correlation + (spare * failed.unsqueeze(-1).expand_as(inverse)).diag_embed()
     return inverse.unsqueeze(-1) * solve(correlation, inverse.unsqueeze(-1) * right)
 

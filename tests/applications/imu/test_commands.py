@@ -113,3 +113,24 @@ def test_damaged_logs_raise_or_are_right(what, message, tmp_path, capsys):
     away = SO3().log(SO3().compose(found, SO3().inverse(truth)))[300:].rad2deg()
     away = away if what.startswith("NaN acc") else away - away.mean(0)  # without a magnetometer the heading is relative
     assert away.abs().max() < 4
+
+
+def test_later_readings_count(log, tmp_path):
+    """In the middle of a log the smoothed heading is known better, at its end as well."""
+    pytest.importorskip("matplotlib")
+    stds = []
+    for number, more in enumerate(([], ["--smooth"])):
+        out = tmp_path / str(number)
+        assert main(["orient", "--log", str(log[0]), "--out", str(out), *more]) == 0
+        stds.append(np.genfromtxt(out / "orientation.csv", delimiter=",", names=True)["std_heading_deg"])
+    assert (stds[1][:300] < 0.9 * stds[0][:300]).mean() > 0.9
+    assert stds[1][-1] == pytest.approx(stds[0][-1], rel=1e-3)
+
+
+def test_stamps_in_milliseconds(log, tmp_path, capsys):
+    if log[0].suffix == ".csv":
+        head, *rows = log[0].read_text().splitlines()
+        scaled = [f"{1000 * float(row.split(',', 1)[0])},{row.split(',', 1)[1]}" for row in rows]
+        (tmp_path / "ms.csv").write_text("\n".join([head, *scaled]))
+        assert main(["orient", "--log", str(tmp_path / "ms.csv"), "--out", str(tmp_path / "out")]) == 2
+        assert "not in ms" in capsys.readouterr().err

@@ -58,7 +58,7 @@ def imu_rows(
     Raises:
         ValueError: if shapes or units are wrong, a gyro's reading is not finite, or there is no whole block.
     """
-    check_number("rate", rate, above=0)
+    check_number("rate", rate, least=10, cure="It is readings a second; stamps are in s, and not in ms")
     for name, value in (("gyro", gyro), ("acceleration", acceleration), ("magnetometer", magnetometer)):
         if value is not None:
             check_shape(name, value, [len(gyro), 3], "[T, 3]")
@@ -142,9 +142,11 @@ def orientations(
     values = [None if value is None else value.to(dtype) for value in (gyro, acceleration, magnetometer)]
     rows = imu_rows(settings, *values, rate=rate)  # type: ignore[arg-type]
     _check_unit_of(values[0], values[1], rate)  # type: ignore[arg-type]
-    prefix = "smoothed" if smooth else "belief"
-    out = (RTSSmoother(model) if smooth else model).sequence(rows, keep=[(prefix, "mean"), (prefix, "cov")])
-    return at_readings(settings, out[prefix, "mean"], out[prefix, "cov"], values[0], rate)  # type: ignore[arg-type]
+    if smooth:
+        found = RTSSmoother(model).sequence(rows, keep=[])["smoothed"]
+    else:
+        found = model.sequence(rows, keep=[("belief", "mean"), ("belief", "cov")])["belief"]
+    return at_readings(settings, found["mean"], found["cov"], values[0], rate)  # type: ignore[arg-type]
 
 
 def at_readings(settings: ImuSettings, mean: Tensor, cov: Tensor, gyro: Tensor, rate: float) -> Orientations:

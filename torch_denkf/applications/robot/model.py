@@ -73,7 +73,7 @@ class Drifted(SubModel):
         return self.jacobian(ensemble, reading)[0]
 
     def jacobian(self, ensemble, reading):
-        """The same, and its Jacobian: linear, since a share is one of what was read, not of the state."""
+        """Returns both: the Jacobian is linear, since a share is one of what was read, not of the state."""
         factor = torch.where(self.shares, reading.nan_to_num(), 1.0).to(ensemble.dtype) * self.has
         predicted = ensemble[..., self.dims] + factor.unsqueeze(-2) * ensemble[..., self.places]
         every = torch.arange(ensemble.shape[-1], device=ensemble.device)

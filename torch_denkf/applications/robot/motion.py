@@ -93,7 +93,7 @@ class RobotMotion(Motion):
         return self._moved(state, dt)[0]
 
     def move_and_gradient(self, state, *, dt):
-        """The same, and its Jacobian."""
+        """Returns the states and the Jacobian."""
         moved, way, axes, rates, yaw = self._moved(state, dt)
         step = torch.as_tensor(dt, dtype=state.dtype, device=state.device).expand(*state.shape[:-1], 1).unsqueeze(-1)
         (sin, cos), (flat, tan) = (state[..., 3].sin(), state[..., 3].cos()), (state[..., 4].cos(), state[..., 4].tan())

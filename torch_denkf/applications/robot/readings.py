@@ -43,7 +43,7 @@ class Seen(NamedTuple):
 
 
 def from_north(name: str) -> bool:
-    """Whether a column is a compass heading, clockwise from north.
+    """Tells whether a column is a compass heading, clockwise from north.
 
     Examples:
         >>> from_north("Compass heading [deg]"), from_north("COG [deg]"), from_north("theta")

@@ -38,10 +38,9 @@ def made_once(key: Hashable, make: Callable[[], Tensor]) -> Tensor:
         return _MADE[key]
     made = make()
     if type(made) is Tensor and not torch.compiler.is_compiling() and not torch.compiler.is_exporting():
-        # torch.func's wrappers, of one call alone, have no storage; what inference mode makes, no gradient may meet.
         with suppress(NotImplementedError, RuntimeError), torch.inference_mode(False):
-            made.untyped_storage()
-            _MADE[key] = made = made.clone()
+            made.untyped_storage()  # torch.func's wrappers, of one call alone, have none
+            _MADE[key] = made = made.clone()  # no gradient may meet what inference mode made
     return made
 
 
