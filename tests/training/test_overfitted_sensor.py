@@ -9,6 +9,7 @@ from torch import nn
 from torch_denkf import FilterTrainer, FusedFilter, FusedSensor, GaussianLoss, SensorLoss, Stage
 from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import ConstantNoise, LinearTransition, MomentPrior, Select
+from torch_denkf.training.stage import parameters_without
 
 pytestmark = pytest.mark.usefixtures("float64")
 
@@ -103,3 +104,17 @@ def test_a_name_that_is_no_module_raises():
         Stage("fit", dict, dict, 1, frozen=["camera"]).groups(net)
     with pytest.raises(TypeError, match="list of names"):
         Stage("fit", dict, dict, 1, frozen="sensor")
+
+
+def test_a_stage_with_frozen_modules_trains_nothing_that_no_checkpoint_holds():
+    """A parameter of the loss alone is refused, as without frozen modules, and not left out in silence."""
+    net, other = nn.ModuleDict({"sensor": nn.Linear(1, 1), "head": nn.Linear(1, 1)}), nn.Parameter(torch.ones(1))
+    with pytest.raises(ValueError, match="1 parameters that the trainer's model does not hold"):
+        Stage("fit", dict, dict, 1, frozen=["sensor"], parameters=[*net.parameters(), other]).groups(net)
+
+
+def test_the_initial_belief_may_be_frozen():
+    net, initial = nn.Module(), nn.Linear(1, 1)
+    net.module, net.initial = nn.ModuleDict({"sensor": nn.Linear(1, 1)}), initial
+    assert parameters_without(net, ["initial"]) == list(net.module.parameters())
+    assert parameters_without(net, ["sensor"]) == list(initial.parameters())

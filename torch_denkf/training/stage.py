@@ -122,9 +122,9 @@ class Stage:
         groups = given if given and isinstance(given[0], dict) else [{"params": given}]
         groups = [dict(group) for group in groups]  # the optimiser adds its settings to them
         if self.frozen:
-            left = {id(parameter) for parameter in parameters_without(model, self.frozen)}
+            frozen = {*map(id, model.parameters())} - {*map(id, parameters_without(model, self.frozen))}
             for group in groups:
-                group["params"] = [parameter for parameter in group["params"] if id(parameter) in left]
+                group["params"] = [parameter for parameter in group["params"] if id(parameter) not in frozen]
         trained, held = [p for group in groups for p in group["params"]], {id(p) for p in model.parameters()}
         if not trained:
             raise ValueError(f"Stage {self.name!r} has no parameters to train; give parameters=...")
@@ -227,7 +227,7 @@ def parameters_without(model: nn.Module, names: Iterable[str]) -> list[nn.Parame
         (2, 4)
     """
     names = list(names)
-    modules = dict(getattr(model, "module", model).named_children())
+    modules = dict([*model.named_children(), *getattr(model, "module", model).named_children()])
     strange = sorted(set(names) - modules.keys())
     if strange:
         raise KeyError(f"the filter has no module {strange}; it has {list(modules)}.")
