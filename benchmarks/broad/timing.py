@@ -36,7 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     orientations(model, *log, rate=rate)  # type: ignore[arg-type]
     print(f"{len(log[0])} readings, 9 axes, eager: {time.process_time() - began:.1f} s of processor time")
     if options.package and not options.smoke:
-        rows = imu_rows(model.settings, *log, rate=rate)[:1000]  # type: ignore[arg-type]
+        model = model.double()  # as denkf orient runs it
+        rows = imu_rows(model.settings, *(value.double() for value in log), rate=rate)[:1000]  # type: ignore[arg-type]
         with tempfile.TemporaryDirectory() as folder:
             step = load_step(export_step(model, rows[0].clone(), Path(folder) / "imu.pt2"))
         with torch.inference_mode():

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torch_denkf.applications.imu import imu, imu_rows, orientations
 from torch_denkf.applications.imu.filter import SPACE, ImuSettings, moves
 from torch_denkf.functional.manifolds import SO3, rotate
+from torch_denkf.pretrained import from_pretrained
 from torch_denkf.smoothers import RTSSmoother
 
 SETTINGS = ImuSettings(
@@ -276,3 +277,15 @@ def test_a_log_that_is_not_one():
         imu_rows(SETTINGS, log["gyro"] / 0, log["acceleration"], rate=100.0)
     with pytest.raises(ValueError, match="poles"):
         imu(poles=(1.0, 2.0))
+
+
+@pytest.mark.slow
+def test_compiled_it_believes_the_same():
+    """The first compiled step is compared with the eager one, and raises if it differs."""
+    _, log = body_log(100)
+    model = from_pretrained("imu").double()
+    rows = imu_rows(model.settings, **{name: value.double() for name, value in log.items()}, rate=100.0)
+    row = model.initialise(rows[0].clone())
+    with torch.no_grad():
+        eager = model.step(row.clone())["belief", "cov"]
+        torch.testing.assert_close(model.compile().step(row.clone())["belief", "cov"], eager)

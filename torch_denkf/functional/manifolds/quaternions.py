@@ -23,6 +23,8 @@ class Table:
 
     def __call__(self, numbers: Tensor) -> Tensor:
         """Returns the numbers."""
+        if torch.compiler.is_compiling():  # inductor (torch 2.13) makes other numbers of the indices
+            return torch.stack([sign * numbers[..., at] for at, sign in zip(self.places, self.signs, strict=True)], -1)
         dtype, device = numbers.dtype, numbers.device
         places = made_once((self, device), lambda: torch.as_tensor(self.places, device=device))
         signs = made_once((self, dtype, device), lambda: torch.as_tensor(self.signs, dtype=dtype, device=device))
