@@ -105,7 +105,7 @@ XML = """<mujoco>
 
 
 class Reach(control.Task):
-    """What the arm shows, and what it is to do: reach the joint angles of a goal."""
+    """Shows the arm by camera and encoders; the task is to reach the joint angles of a goal."""
 
     def __init__(self):
         self._random, self.goal, self.ticks = np.random.RandomState(0), np.zeros(2), 0  # torchrl seeds ``_random``
@@ -306,7 +306,7 @@ def test(model: FusedFilter, actor: ProbabilisticActor, key, arms: int) -> float
 
 @torch.no_grad()
 def run(model: FusedFilter, actor: ProbabilisticActor) -> tuple[float, float]:
-    """What runs on the robot: a loop without an environment. Returns the return and the ms of a cycle."""
+    """Runs a loop without an environment, as on the robot; yields the return of an episode and the ms of a cycle."""
     arm, ahead = make_env(1, 2000), BeliefAhead(model, LATE)
     under_way, total, seconds = deque([torch.zeros(2)] * LATE), 0.0, []
     row = arm.reset()

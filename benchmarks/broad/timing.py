@@ -1,4 +1,4 @@
-"""How long a trial takes in plain PyTorch, and a step out of its package: ``python -m benchmarks.broad.timing``."""
+"""Times a trial in plain PyTorch, and a step out of its package: ``python -m benchmarks.broad.timing``."""
 
 from __future__ import annotations
 

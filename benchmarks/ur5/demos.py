@@ -124,7 +124,7 @@ class Roles:
 
 
 def _numbers(collections: Collections, name: str, split: str, end: int) -> list[int]:
-    """Returns those of a collection's demos of one side, below ``end``: the folder may hold more than is asked for."""
+    """Returns the demos of one side, numbered below ``end``: the folder may hold more than are asked for."""
     return [episode.demo for episode in collections.replay(name, split).episodes if episode.demo < end]
 
 

@@ -41,7 +41,7 @@ def test_a_split_keeps_the_contract():
 
 
 def test_rollouts_are_episodes_with_statistics_of_all_that_was_seen():
-    """What a mask hides, pictures and readings, counts nowhere; the rows are the root's."""
+    """Leaves masked pictures and readings out of the statistics; the rows are the root's."""
     shape = [4, ROWS]
     seen, read = torch.rand(*shape, 1) < 0.5, torch.rand(*shape, 1) < 0.5
     root = TensorDict({"state": torch.randn(*shape, 2), "action": torch.randn(*shape, 1).double()}, shape)

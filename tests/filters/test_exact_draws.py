@@ -242,7 +242,7 @@ def test_noise_of_some_dimensions_before_and_behind_the_motion():
 @pytest.mark.parametrize("dims", [None, [4, 0, 2, 5]])
 @pytest.mark.parametrize("space", [None, Euclidean(7)])
 def test_few_noises_of_many_dimensions_need_few_members(kind, dims, space):
-    """Of two noises in seven dimensions S + 9/8 q + 3 members are exact; of seven they were more."""
+    """Draws q = 2 noises of S = 7 states exactly with S + 9/8 q + 3 members."""
     inner = ConstantNoise(torch.tensor([0.3, 2.0]), **FORECAST)
     if kind == "covariance":
         inner = CholeskyNoise(2, r=torch.tensor([0.3, 2.0]), in_features=7, **FORECAST)
@@ -258,7 +258,7 @@ def test_few_noises_of_many_dimensions_need_few_members(kind, dims, space):
 
 
 def test_few_noises_of_a_car_are_exact_with_few_members():
-    """Those of speed and turn rate, through a matrix that depends on the state."""
+    """Draws the noises of speed and turn rate through a matrix that depends on the state."""
     noise = UnicycleNoise(ConstantNoise(torch.tensor([0.3, 0.1]), **FORECAST), dt=0.1)
     td = TensorDict({("belief", "ensemble"): torch.randn(3, 10, 5)}, [3])
     added = NoisyTransition(Still(), noise)(td.copy())["forecast", "ensemble"] - td["belief", "ensemble"]

@@ -107,7 +107,7 @@ def test_a_name_that_is_no_module_raises():
 
 
 def test_a_stage_with_frozen_modules_trains_nothing_that_no_checkpoint_holds():
-    """A parameter of the loss alone is refused, as without frozen modules, and not left out in silence."""
+    """Raises for a parameter that the loss alone holds, as it does without frozen modules."""
     net, other = nn.ModuleDict({"sensor": nn.Linear(1, 1), "head": nn.Linear(1, 1)}), nn.Parameter(torch.ones(1))
     with pytest.raises(ValueError, match="1 parameters that the trainer's model does not hold"):
         Stage("fit", dict, dict, 1, frozen=["sensor"], parameters=[*net.parameters(), other]).groups(net)

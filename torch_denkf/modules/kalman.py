@@ -185,12 +185,10 @@ class LinearTransition(Transition):
             constant = as_covariance(written[unravel_key(noise.out_keys[0])], mean)
             forecast_cov = forecast_cov + constant
         written = {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}
-        return written, (
-            torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device),
-            cov,
-            self.matrix,
-            constant,
-        ) if wanted else ()
+        if not wanted:
+            return written, ()
+        eye = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
+        return written, (eye, cov, self.matrix, constant)
 
 
 class KalmanAnalysis(Update):

@@ -53,7 +53,7 @@ class _Reading(SubModel):
         raise NotImplementedError
 
     def compute(self, ensemble, *given):
-        """The predicted readings."""
+        """Returns the predicted readings."""
         self.space.check(point=ensemble)
         return self.observe(ensemble.narrow(-1, self.begin, self.read_space.point_dim))
 
@@ -239,7 +239,7 @@ class PositionInBody(_Reading):
         return Euclidean(self.size * count)
 
     def compute(self, ensemble, *given):
-        """The predicted readings."""
+        """Returns the predicted readings."""
         self.space.check(point=ensemble)
         point, size = ensemble.narrow(-1, self.begin, self.read_space.point_dim), self.size * self.count
         if not given:

@@ -206,7 +206,7 @@ def only_trainable(model: nn.Module, parameters: Iterable[nn.Parameter]) -> Iter
 
 
 def parameters_without(model: nn.Module, names: Iterable[str]) -> list[nn.Parameter]:
-    """Parameters of a filter without those of some of its modules: what a stage trains while these stay as they are.
+    """Returns the parameters of a filter without those of some of its modules, which stay as they are.
 
     Args:
         model: a filter, or another one with named modules.

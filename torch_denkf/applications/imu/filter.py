@@ -137,13 +137,13 @@ class ImuMotion(Motion):
         self.register_buffer("stray_time", torch.tensor(stray_time))
 
     def move(self, state, gyro, moves, *, dt):
-        """The state one step later."""
+        """Returns the state one step later."""
         orientation, bias, errors, position, velocity, acceleration, *others, stray, lever = SPACE.points(state)
         turn = SO3().exp((gyro - bias - (errors.unflatten(-1, (3, 3)) * gyro.unsqueeze(-2)).sum(-1)) * dt)
         matrix, before = moves.unflatten(-1, (3, 3)), torch.stack([position, velocity, acceleration], -2)
         moved = (matrix.unsqueeze(-1) * before.unsqueeze(-3)).sum(-2)
         stray = stray * (-dt / self.stray_time).exp()
-        *moved, stray = (rotate(SO3().inverse(turn), vector) for vector in (*moved.unbind(-2), stray))
+        *moved, stray = (rotate(turn, vector, back=True) for vector in (*moved.unbind(-2), stray))
         return torch.cat([SO3().compose(orientation, turn), bias, errors, *moved, *others, stray, lever], -1)
 
 
@@ -181,7 +181,7 @@ class ImuNoise(SubModel):
         self.register_buffer("stray_time", torch.tensor(s.stray_time))
 
     def compute(self, mean, gyro, unrest, disturbance, dt):
-        """The variances of the step."""
+        """Returns the variances of the step."""
         rate, variance = gyro.square().sum(-1, keepdim=True), (2 * self.log_std).exp()
         white, by_rate, walk, motion, by_unrest, bias, field, stray, by_disturbance, lever = variance.unbind(-1)
         turn, push = white + by_rate * rate, self.damping * (motion + by_unrest * unrest.square())
@@ -199,10 +199,10 @@ class _Accelerometer(SubModel):
         self.register_buffer("up", torch.tensor([0.0, 0.0, gravity]))
 
     def compute(self, state, lever):
-        """Gravity, and the acceleration of the joint and about it; ``lever`` ``[*B, 9]``, see :func:`imu_rows`."""
+        """Sums gravity and the acceleration of the joint and about it; ``lever`` ``[*B, 9]``, see :func:`imu_rows`."""
         parts = SPACE.points(state)
         about = (lever.unflatten(-1, (3, 3)).unsqueeze(-3) * parts[10].unsqueeze(-2)).sum(-1)
-        return rotate(SO3().inverse(parts[0]), self.up) + parts[5] + about
+        return rotate(parts[0], self.up, back=True) + parts[5] + about
 
 
 class _Magnetometer(SubModel):
@@ -212,9 +212,9 @@ class _Magnetometer(SubModel):
         super().__init__(nn.Identity(), [("forecast", "ensemble"), "gyro"], [("forecast", "observation")])
 
     def compute(self, state, gyro):
-        """The field in the axes of the body as they were, and the bias."""
+        """Sums the field, in the axes of the body when it was read, and the bias."""
         orientation, *_, bias, field, lag, stray, _ = SPACE.points(state)
-        field = rotate(SO3().inverse(orientation), torch.nn.functional.pad(field, (1, 0))) + stray
+        field = rotate(orientation, torch.nn.functional.pad(field, (1, 0)), back=True) + stray
         return field + lag * torch.linalg.cross(gyro.unsqueeze(-2).expand_as(field), field) + bias
 
 

@@ -66,7 +66,7 @@ def icub_log(folder: Path) -> TensorDict:
     orientation = of_rpy(log["base_rpy"])
     true = {"orientation": orientation, "position": log["base_position"]}
     velocity = savitzky_golay(log["base_position"], log["time"])
-    true["velocity"] = rotate(SO3().inverse(orientation), velocity)
+    true["velocity"] = rotate(orientation, velocity, back=True)
     true["feet"] = torch.stack([log["left_foot_position"], log["right_foot_position"]], -2)
     entries = {"imu": imu, "dt": dt, "joints": log["joint_positions"], "joint_rates": log["joint_velocities"]}
     entries |= {"force": force, "contact": contacts(force, _ON, _OFF), "true": TensorDict(true, [len(dt)])}

@@ -141,7 +141,7 @@ class FeetRates(SubModel):
         """Returns the predicted readings."""
         self.observed_space.check(point=state)
         turn = self._turn(state, imu)
-        velocity = rotate(SO3().inverse(state[..., :4]), state[..., 4:7]).unsqueeze(-2)
+        velocity = rotate(state[..., :4], state[..., 4:7], back=True).unsqueeze(-2)
         rates = (-velocity - torch.linalg.cross(*torch.broadcast_tensors(turn, _feet(state)))).flatten(-2)
         return rates if moves is None else rates + moves.to(rates.dtype).unsqueeze(-2)
 
@@ -175,4 +175,4 @@ def _of_feet(state: Tensor, by_itself: Tensor, columns: list[Tensor]) -> Tensor:
 def _feet(state: Tensor) -> Tensor:
     """Returns the feet in the sensor's axes, ``[*, F, 3]``."""
     away = state[..., 16:].unflatten(-1, (-1, 3)) - state[..., None, 7:10]
-    return rotate(SO3().inverse(state[..., None, :4]), away)
+    return rotate(state[..., None, :4], away, back=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from torch_denkf.functional.manifolds import SO3, rotate, rotation_matrix, skew
+from torch_denkf.functional.manifolds import rotate, rotation_matrix, skew
 from torch_denkf.functional.moments import ensemble_mean, ensemble_var
 from torch_denkf.modules import AroundState, GaussianAround, SubModel
 from torch_denkf.submodel import Entries
@@ -26,7 +26,7 @@ def base_velocity(state: Tensor, gyro: Tensor, sensor: Tensor) -> Tensor:
     Returns:
         ``[*, 3]`` in m/s.
     """
-    seen = rotate(SO3().inverse(state[..., :4]), state[..., 4:7])
+    seen = rotate(state[..., :4], state[..., 4:7], back=True)
     turn = rotate(sensor[:4], gyro - state[..., 10:13])
     return rotate(sensor[:4], seen) - torch.linalg.cross(turn, sensor[4:].expand_as(turn))
 

@@ -130,7 +130,7 @@ def learn_noises(
 
 
 def _alike(gradient: Tensor, at: Sequence[int]) -> Tensor:
-    """A gradient that keeps the noises of x and y in the ratio in which they were."""
+    """Averages a gradient over x and y, which keeps the ratio of their noises."""
     where = torch.tensor(list(at))
     return gradient.index_copy(0, where, gradient[where].mean().expand(len(where)))
 
@@ -177,7 +177,7 @@ def _load(
 
 
 def _segments(model: RobotModel, rows: TensorDict, window: float, length: int) -> tuple[TensorDict, TensorDict]:
-    """Segments to learn from, and those held out, ``[B, length]``, with the beliefs that they start from."""
+    """Returns segments to learn from, and those held out, ``[B, length]``, with the beliefs that they start from."""
     with torch.no_grad():
         keys = [("belief", name) for name in ("mean", "cov", "var")]
         whole = model.filter.sequence(rows.clone(), keep=keys)
@@ -202,7 +202,7 @@ def _positions(model: RobotModel) -> list[str]:
 
 
 def fix_error(model: RobotModel, name: str, out: TensorDict) -> tuple[Tensor, Tensor]:
-    """Errors of the fixes that a smoothed belief predicts, drift included ``[*, 2]``, and covariances, noise included.
+    """Returns errors ``[*, 2]`` of fixes by a smoothed belief, drift included, and covariances, noise included.
 
     Args:
         model: of the belief.
@@ -218,7 +218,7 @@ def fix_error(model: RobotModel, name: str, out: TensorDict) -> tuple[Tensor, Te
 
 
 def _likelihood(model: RobotModel, segments: TensorDict) -> Tensor:
-    """Mean log-likelihood of hidden fixes by the smoother; of readings where there are none."""
+    """Returns the mean log-likelihood of hidden fixes by the smoother; of readings where there are none."""
     positions = [name for name in _positions(model) if segments[f"{name}_hidden"].any()]
     if not positions:
         out = model.filter.sequence(segments.clone(), keep=[("info", "log_likelihood")])

@@ -42,7 +42,7 @@ class RobotLog:
 
 
 def log_streams(*files: Path) -> dict[str, Stream]:
-    """The streams of a log of some files; raises as :func:`~torch_denkf.data.recordings.streams.streams_of`."""
+    """Returns the streams of a log of some files; raises as :func:`~torch_denkf.data.recordings.streams.streams_of`."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of float32, which no number becomes here, and of repeats, which are left out
         return streams_of(*files)
@@ -95,7 +95,7 @@ def read_log(file: Path | str, config: Config, streams: Mapping[str, Stream]) ->
 
 
 def drift_settings(log: RobotLog, model: RobotModel) -> dict:
-    """The settings, with drifts of all readings that vary, from which they are learned; those that are given stay.
+    """Returns the settings with drifts of all readings that vary, to learn from; those that are given stay.
 
     Rows are few: fast readings are means, whose noise is what matters for a path, and is learned for this rate alone.
     Velocities are held for a step, and without process noise in the settings it follows from how they change in 1 s.

@@ -69,7 +69,7 @@ class Drifted(SubModel):
         self.register_buffer("shares", torch.tensor(shares), persistent=False)
 
     def compute(self, ensemble, reading):
-        """The predicted reading."""
+        """Returns the predicted reading."""
         return self.jacobian(ensemble, reading)[0]
 
     def jacobian(self, ensemble, reading):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_count, check_number, check_shape
 from torch_denkf.applications.car.corners.camera import StereoCamera
-from torch_denkf.functional.manifolds import SE3, SO3, quaternion_of, rotate, rotation_matrix, skew
+from torch_denkf.functional.manifolds import SE3, quaternion_of, rotate, rotation_matrix, skew
 
 __all__ = ["CornerMotion", "CornerNoise", "corner_motion", "corner_motions", "started_by_ransac"]
 
@@ -142,7 +142,7 @@ def corner_motion(
         true = before + wrong.unsqueeze(-1) * own
         points, of_corner = camera.points(true), camera.jacobian_of_points(true)
         turn, moved = rotation_matrix(pose[..., :4]).unsqueeze(-3), points - pose[..., None, 4:]
-        moved = rotate(SO3().inverse(pose[..., None, :4]), moved)
+        moved = rotate(pose[..., None, :4], moved, back=True)
         ahead = seen & (moved[..., 2] > 1.0)
         moved = torch.where(ahead.unsqueeze(-1), moved, moved.new_tensor([0.0, 0.0, 10.0]))
         shown, slope = camera.project(moved), camera.jacobian(moved)
