@@ -166,15 +166,21 @@ def test_an_iterated_smoother_keeps_what_it_found_of_the_noise(iterations, proce
     torch.testing.assert_close(ensemble_cov(out["belief", "ensemble"]), oracle["belief", "cov"], rtol=0, atol=1e-9)
 
 
-def test_perturbed_members_have_the_covariance_of_the_square_root_filter():
+@pytest.mark.parametrize("space", [None, Euclidean(2) * Circle()])
+def test_perturbed_members_have_the_covariance_of_the_square_root_filter(space):
     """Draws are uncorrelated with the members and with predictions that are no linear function of them."""
-    forecast = torch.randn(5, E, S)
-    forecast = {"ensemble": forecast, "observation": forecast[..., :2].square() + forecast[..., 1:]}
+    forecast = torch.randn(5, E, S) if space is None else 0.3 * torch.randn(5, E, S)
+    predicted = forecast[..., :2].square() + forecast[..., 1:]
+    forecast = forecast if space is None else space.plus(torch.tensor([0.0, 0.0, 3.1]).expand(5, E, S), forecast)
+    forecast = {"ensemble": forecast, "observation": predicted}
     td = TensorDict({"forecast": forecast, "reading": torch.ones(5, 2), "sensor": {"noise": R.expand(5, 2)}}, [5])
     out, expected = (
-        EnsembleAnalysis(scheme, observation_key="reading")(td.copy())["belief"] for scheme in ("perturbed", "etkf")
+        EnsembleAnalysis(scheme, observation_key="reading", space=space)(td.copy())["belief"]["ensemble"]
+        for scheme in ("perturbed", "etkf")
     )
-    torch.testing.assert_close(ensemble_cov(out["ensemble"]), ensemble_cov(expected["ensemble"]), rtol=0, atol=1e-9)
+    if space is not None:
+        out, expected = (space.minus(members, torch.tensor([0.0, 0.0, 3.1])) for members in (out, expected))
+    torch.testing.assert_close(ensemble_cov(out), ensemble_cov(expected), rtol=0, atol=1e-9)
 
 
 def test_on_a_circle_members_lie_on_both_sides_of_the_turn():

@@ -421,6 +421,9 @@ def test_what_cannot_be_raises():
         {"share": 0.0, "trainable": True},
         {"width": 0.0},
         {"noise": [0.0]},
+        {"share": [0.1, 0.2]},
+        {"width": [2.0, 3.0]},
+        {"noise": 2.0},
     ):
         with pytest.raises(ValueError, match=next(iter(options))):
             Contaminated(inner, **options)
@@ -433,6 +436,9 @@ def test_what_cannot_be_raises():
         Contaminated(inner, nn.Linear(1, 1))
     with pytest.raises(KeyError, match="share"):
         Contaminated(SEVERAL["etkf"](), "share")(several())
+    for name, shape in (("share", [3]), ("share", [3, 2]), ("width", [3]), ("noise", [3, 2, 2])):
+        with pytest.raises(ValueError, match=rf"{name} '{name}' must be \[\*B, "):
+            Contaminated(SEVERAL["etkf"](), **{name: name})(several().set(name, torch.ones(shape)))
 
 
 @pytest.mark.parametrize("name", ["etkf", "Kalman", "particles"])

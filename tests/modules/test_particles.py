@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
-from torch_denkf.functional.manifolds import Circle
+from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules import (
     ConstantNoise,
@@ -20,6 +20,7 @@ from torch_denkf.modules import (
     NoisyTransition,
 )
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
+from torch_denkf.submodel import SubModel
 
 pytestmark = pytest.mark.usefixtures("float64")
 
@@ -116,10 +117,11 @@ def test_motion_noise_before_the_motion_moves_the_pose():
 
 
 @pytest.mark.parametrize("weights", [False, True])
-def test_noise_model_reads_the_weighted_mean(weights):
-    model = DiagonalNoise(1, in_features=S, num_cells=(4,), in_key=("belief", "mean"), out_key=("forecast", "q"))
+@pytest.mark.parametrize(("name", "space"), [("belief", None), ("forecast", None), ("belief", Euclidean(S))])
+def test_noise_model_reads_the_weighted_mean(weights, name, space):
+    model = DiagonalNoise(1, in_features=S, num_cells=(4,), in_key=(name, "mean"), out_key=("forecast", "q"))
     torch.nn.init.normal_(model.module.layers[-1].weight)
-    noisy = NoisyTransition(shift(), model, [1], draws="random")
+    noisy = NoisyTransition(shift(), model, [1], draws="random", space=space)
     assert noisy.in_keys == [("belief", "ensemble")]
     td = belief((4,)) if weights else belief((4,)).exclude(("belief", "log_weight"))
     td["belief", "mean"] = torch.full((4, S), torch.nan)  # whatever it was before
@@ -127,13 +129,27 @@ def test_noise_model_reads_the_weighted_mean(weights):
     out = noisy(td.copy())
     x = td["belief", "ensemble"]
     mean = weighted_mean(x, td["belief", "log_weight"]) if weights else x.mean(-2)
-    variance = model(TensorDict({("belief", "mean"): mean}, [4]))["forecast", "q"]
+    variance = model(TensorDict({(name, "mean"): mean + (name == "forecast")}, [4]))["forecast", "q"]
     expected = x + 1
     expected[..., 1] += variance.sqrt()
     torch.testing.assert_close(out["forecast", "ensemble"], expected)
     assert out["belief", "mean"].isnan().all(), "the tensordict's own mean is left as it is"
     out["forecast", "ensemble"].sum().backward()
     assert model.module.layers[0].weight.grad.abs().sum() > 0
+
+
+def test_noise_model_reads_what_it_may():
+    class Lit(SubModel):
+        def __init__(self):
+            super().__init__(torch.nn.Identity(), [("belief", "mean")], [("forecast", "q")], optional_keys=["light"])
+
+        def compute(self, mean, light=None):
+            return torch.ones_like(mean) if light is None else light.square()
+
+    td = belief((4,)).exclude(("belief", "log_weight")).set("light", torch.rand(4, S))
+    td["noise", "self"] = torch.ones(4, E, S)
+    out = NoisyTransition(shift(), Lit(), draws="random")(td.copy())["forecast", "ensemble"]
+    torch.testing.assert_close(out, td["belief", "ensemble"] + 1 + td["light"].unsqueeze(-2))
 
 
 # -------------------------------------------------------------------------------------------------- resampling

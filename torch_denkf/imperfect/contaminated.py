@@ -20,7 +20,7 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from torch_denkf._checks import check_number, check_values
+from torch_denkf._checks import check_number, check_shape, check_values
 from torch_denkf.filters.scan import where_rows
 from torch_denkf.imperfect.mixed import (
     MixedUpdate,
@@ -229,6 +229,9 @@ class Contaminated(MixedUpdate):
             hidden = {key: where_rows(seen, entries[key], torch.zeros_like(entries[key])) for key in read}
             entries = {**entries, **hidden}
         value = quantity(self, entries, call)
+        if quantity.key is not None:
+            size, layout = (value.shape[-1:], "[*B, O]") if name == "noise" else ((1,), "[*B, 1]")
+            check_shape(f"{name} {quantity.key!r}", value, (*like.shape[:-1], *size), layout)
         return value if seen is None or quantity.key is None else torch.where(seen, value, nothing)
 
     def _outlier_noise(self, entries: Entries, call: Call, seen: Tensor | None) -> Tensor:
@@ -284,6 +287,13 @@ class _Quantity(nn.Module):
             self.in_keys = [self.key]
         else:
             numbers = as_floating(value, name)
+            if name == "noise" and numbers.ndim != 1:
+                raise ValueError(f"noise must be standard deviations [O]; got {list(numbers.shape)}. Give a list of them.")
+            if name != "noise" and numbers.numel() != 1:
+                raise ValueError(
+                    f"{name} is one number, as a reading is an outlier as a whole; got {list(numbers.shape)}. Give "
+                    "components that fail apart a FusedSensor each, and rows that differ the key of an entry [*B, 1]."
+                )
             if name != "share":
                 check_values(name, numbers, above=0)
             elif trainable:
