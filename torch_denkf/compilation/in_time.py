@@ -185,6 +185,8 @@ class StepsInTime(NamedTuple):
         given = carry, inputs, call, resets, starts, cuts, keep
         if any(cuts) or FROM_STORED in inputs:
             return self.steps.scan(*given)
+        row = {key: value.select(time, 0) for key, value in inputs.items()}
+        self.steps.step({**row, **carry}, call, frames=False)  # its modules say what is wrong with a reading
         begin = None
         if resets is not None:
             resets = filled(resets, time, count, False)

@@ -9,7 +9,7 @@ import torch
 from tensordict import NestedKey, unravel_key
 from torch import nn
 
-from torch_denkf._checks import check_count, check_values
+from torch_denkf._checks import check_count, check_shape, check_values
 from torch_denkf.beliefs import moments_of
 from torch_denkf.functional.draws import exact_draws, is_exact
 from torch_denkf.functional.manifolds import Space, check_space
@@ -59,6 +59,9 @@ class _InitialEnsemble(Initial):
         """Returns ensemble, mean and variance."""
         if noise is None:
             noise = self.draw_noise(batch_size, device=center.device, dtype=center.dtype)
+        check_shape(
+            "the initial belief's noise", noise, (*batch_size, self.ensemble_size, self.state_dim), "[*B, E, S]"
+        )
         noise = noise.to(center.dtype)
         away = std.unsqueeze(-2) * (exact_draws(noise) if self.exact else noise)
         center = center.unsqueeze(-2)

@@ -10,6 +10,7 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_shape
 from torch_denkf.functional.draws import exact_draws, is_exact
 from torch_denkf.functional.linalg import as_covariance, semidefinite_root
 from torch_denkf.functional.manifolds import Space, check_space
@@ -163,6 +164,7 @@ class NoisyTransition(Transition):
         if normal is None:
             return ensemble
         normal = normal[..., : covariance.shape[-1]]  # a point may have more numbers than its tangent
+        check_shape(f"noise {call.place!r}", normal, (*ensemble.shape[:-1], covariance.shape[-1]), "[*B, E, N]")
         if self.exact and not call.raw and self.log_weight_key not in entries:
             away = ensemble if space is None else space.minus(ensemble, space.near(ensemble).unsqueeze(-2))
             normal = exact_draws(normal, away)
