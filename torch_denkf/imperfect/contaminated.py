@@ -288,9 +288,7 @@ class _Quantity(nn.Module):
         else:
             numbers = as_floating(value, name)
             if name == "noise" and numbers.ndim != 1:
-                raise ValueError(
-                    f"noise must be standard deviations [O]; got {list(numbers.shape)}. Give a list of them."
-                )
+                raise ValueError(f"noise must be a list of standard deviations [O]; got {list(numbers.shape)}")
             if name != "noise" and numbers.numel() != 1:
                 raise ValueError(
                     f"{name} is one number, as a reading is an outlier as a whole; got {list(numbers.shape)}. Give "
