@@ -158,3 +158,16 @@ def test_cuts_and_a_policys_data_are_taken_one_step_after_the_other(float64, sto
         found.append((out["belief", "mean"], *torch.autograd.grad(out["belief", "mean"][:, -1].sum(), observation)))
     assert_close(*found, rtol=1e-9, atol=1e-10)
     assert (found[1][1] == 0).all(-1)[0].tolist() == [True] * 3 + [not stored] + [False] * 2
+
+
+@pytest.mark.parametrize("kind", ["alone", "with starts", "from a belief"])
+def test_samples_of_a_reading_count_by_their_mean(float64, kind):
+    filter, key = linear_system(observation_key=("sensor", "ensemble")), ("sensor", "ensemble")
+    frames = TensorDict({key: torch.randn(2, 9, 5, 2)}, [2, 9])
+    if kind == "with starts":
+        frames["is_init"] = torch.rand(2, 9, 1) > 0.7
+    if kind == "from a belief":
+        frames["is_init"] = torch.zeros(2, 9, 1, dtype=torch.bool)
+        frames["belief"] = {"mean": torch.ones(2, 9, 3), "cov": torch.eye(3).expand(2, 9, 3, 3)}
+    expected = filter.sequence(frames.clone())["belief", "mean"]
+    assert_close(filter.compile(mode="in time").sequence(frames)["belief", "mean"], expected)

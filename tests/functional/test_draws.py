@@ -115,3 +115,9 @@ def test_units_are_dropped_independently_of_each_other():
     joint = (dropped.mT @ dropped / 32).mean(0)
     off = joint[~torch.eye(8, dtype=torch.bool)]
     assert (off - 1 / 16).abs().max() < 0.004  # of 4000 x 32 pairs, four standard deviations
+
+
+def test_any_two_members_lose_a_unit_together_as_often_as_others():
+    dropped = (balanced_bytes((4000,), 30, 8) < 64).double()
+    together = (dropped[:, :1] * dropped[:, 1:]).mean((0, 2))
+    assert (together - 49 / 870).abs().max() < 0.03  # of 30 members 7 or 8; there are 256 orders

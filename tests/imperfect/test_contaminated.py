@@ -126,7 +126,7 @@ def test_two_components_are_those_of_a_fine_grid(name):
     inner = inner.get(name[0], lambda: EKFAnalysis(LinearObservation(H), **keys))()
     td = TensorDict({"forecast": {"ensemble": members, "observation": members @ H.T, "mean": mean, "cov": cov}})
     td[KEY], td["sensor", "noise"] = y, full if "correlated" in name else noise
-    out = update_of(inner, 0.3, width=6.0)(td)
+    out = update_of(inner, 0.3, width=6.0)(td.expand(3).clone())[1]
 
     axes = [torch.linspace(-9, 9, 1201, dtype=torch.float64) * cov[i, i].sqrt() + mean[i] for i in range(2)]
     x = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
@@ -289,6 +289,8 @@ def test_masks_are_heeded(name):
     assert gradient.isfinite().all()
     assert gradient[1].item() == 0
     assert (gradient[[0, 2]] != 0).all()
+    number = update_of(inner, 0.4, noise=[2.0, 1.5])(td.clone())["info"]
+    assert [number[score][1].item() for score in ("nis", "log_likelihood", "outlier")] == [0, 0, 0]
     # The second component may be anything where it is hidden.
     again = td[2].clone().set("share", share[2].detach())
     again[KEY][..., 1], again["sensor", "noise"][1] = 3.0, 1.0

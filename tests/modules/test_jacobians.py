@@ -184,9 +184,10 @@ def test_what_a_chain_does_not_know_is_differentiated():
     hooked, outer = nn.Linear(3, 3), nn.Sequential(nn.Linear(3, 3))
     for layer in (hooked, outer):
         layer.register_forward_hook(lambda module, read, out: 2 * out)
-    still, watched, own = nn.Identity(), nn.Linear(3, 3), nn.Linear(3, 3)
+    still, watched, before, own = nn.Identity(), nn.Linear(3, 3), nn.Linear(3, 3), nn.Linear(3, 3)
     still.register_forward_hook(lambda module, read, out: 2 * out)
     watched.register_full_backward_hook(lambda module, read, out: None)
+    before.register_full_backward_pre_hook(lambda module, out: None)
     own.forward = lambda x: 2 * x
 
     class Twice(StochasticMLP):
@@ -194,7 +195,7 @@ def test_what_a_chain_does_not_know_is_differentiated():
             return 2 * super().forward(x, *args, **options)
 
     twice = Twice(3, 3, (4,), layer="none")
-    for network in (*others, weighted, hooked, outer, nn.Sequential(hooked), still, watched, own, twice):
+    for network in (*others, weighted, hooked, outer, nn.Sequential(hooked), still, watched, before, own, twice):
         assert jacobian_of_network(network, x, 3) is None
 
 

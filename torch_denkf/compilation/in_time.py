@@ -192,7 +192,7 @@ class StepsInTime(NamedTuple):
             resets = filled(resets, time, count, False)
             starts = {key: filled(value, time, count) for key, value in starts.items()}
             begin = [starts[key] for key in self.motion.in_keys[:2]]
-        elements = [value.movedim(time, 0) for value in self._elements(inputs, resets, begin)]
+        elements = [value.movedim(time, 0) for value in self._elements(inputs, time, resets, begin)]
         first = [carry[key].unsqueeze(0) for key in self.motion.in_keys[:2]]
         zero, nothing = torch.zeros_like(first[1]), torch.zeros_like(first[0]).unsqueeze(-1)
         whole = [zero, first[0].unsqueeze(-1), first[1], nothing, zero, torch.ones_like(zero[..., :1, :1]).bool()]
@@ -209,11 +209,11 @@ class StepsInTime(NamedTuple):
         last = {key: out[key].select(time, -1) for key in structure.carry}
         return last, {key: out[key] for key in keep}
 
-    def _elements(self, inputs: Entries, resets: Tensor | None, begin: Sequence[Tensor] | None) -> list[Tensor]:
+    def _elements(self, inputs: Entries, time: int, resets: Tensor | None, begin: Sequence[Tensor] | None):
         """Returns A, b, C, eta, J and where nothing goes on, ``[*B, T, ...]``."""
         move, q, matrix, r = self.motion.matrix, self.motion.noise, self.update.matrix, self.update.noise
         reading = inputs[self.update.in_keys[2]]
-        if reading.ndim > (resets if resets is not None else reading).ndim:
+        if reading.ndim > time + 2:
             reading = reading.mean(-2)
         size, observed = reading.shape, inputs.get(self.update.observed_key)
         r = as_covariance(r.expand(*size[:-1], *r.shape), reading)
