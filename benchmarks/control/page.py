@@ -196,7 +196,7 @@ def draw(rows: Sequence[dict], file: Path) -> None:
     tasks = [task for task in TITLES if len(noises(rows, task)) > 1]
     if not tasks:
         return
-    figure, axes = plt.subplots(1, len(tasks), figsize=(6.5 * len(tasks), 4.5), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(1, len(tasks), figsize=(3.4 * len(tasks), 3.4), squeeze=False, layout="constrained")
     for axis, task in zip(axes[0], tasks, strict=True):
         for arm in arms(rows, task):
             chosen = [(noise, returns(rows, task, cell, arm)) for cell, noise in noises(rows, task).items()]
@@ -208,6 +208,7 @@ def draw(rows: Sequence[dict], file: Path) -> None:
             style = "--" if arm in ("truth", "Kalman", "physics") else "-"
             axis.plot(noise, center, style, marker="o", markersize=3, color=color, label=arm)
             axis.fill_between(noise, low, high, color=color, alpha=0.12, linewidth=0)
-        axis.set(title=TITLES[task], xlabel="standard deviation of a reading", ylabel="return of an episode")
-        axis.legend(fontsize=8)
+        axis.set(xlabel="standard deviation of a reading", ylabel="return of an episode")
+        axis.set_title(TITLES[task], fontsize=10)
+        axis.legend(fontsize=7)
     save(figure, file)
