@@ -63,7 +63,14 @@ def start(program: str, log: IO[bytes]) -> int:
 
 
 def main() -> None:
-    """Runs all; prints what each said, and ends with an error if one failed."""
+    """Runs all; prints what each said, and ends with an error if one failed. What they leave is deleted."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["TMPDIR"] = tempfile.tempdir = folder
+        run_all()
+
+
+def run_all() -> None:
+    """Runs all, two side by side."""
     waiting, running, failed = programs(), {}, []
     while waiting or running:
         while waiting and len(running) < SIDE_BY_SIDE:
