@@ -25,7 +25,7 @@ def smoke(study: Study) -> Study:
     names = tuple(write_drives(folder / "kitti", ["a", "b", "c", "d"], frames=20, seed=0))
     budget = Budget(sensor=3, fine_tuning=2, filter=2, end_to_end=2, length=8)
     settings = {"size": (25, 75), "seeds": 1, "processes": 1, "drives": names, "test": names[:1], "budget": budget}
-    kinds = {"filters": (*study.filters, "denkf_gated"), "sensors": ("flow", "image"), "sizes": (4,)}
+    kinds = {"filters": (*study.filters, "denkf_gated"), "sensors": ("flow", "image"), "sizes": (4, 8)}
     return replace(study, root=folder / "kitti", out=folder / "out", **kinds, **settings)
 
 
@@ -50,8 +50,6 @@ def main() -> None:
     study.out.mkdir(parents=True, exist_ok=True)
     if study.command == "table" or study.smoke:
         table(study)
-    if study.smoke:
-        study = replace(study, sensors=study.sensors[:1])
     if study.command == "frontier" or study.smoke:
         print(*draw(study), sep="\n")
     if study.command == "past" or study.smoke:
