@@ -89,7 +89,7 @@ def make() -> DEnKF:
 # * The *likelihood* of the readings (``nll``) says how well the forecast told the next reading, and how sure it was.
 
 
-def fit(length: int, initial: torch.nn.Module, updates: int = 80, **options) -> DEnKF:
+def fit(length: int, initial: torch.nn.Module, updates: int = 110, **options) -> DEnKF:
     """Trains a new filter on windows of some length."""
     filter = make().with_modules(initial=initial)
     loss = DEnKFLoss(filter, state_scale=scale, **options)

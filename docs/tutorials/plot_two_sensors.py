@@ -143,8 +143,8 @@ def fit(loss: torch.nn.Module, sample, updates: int, lr: float) -> None:
     print(type(loss).__name__, {name: round(value.item(), 3) for name, value in terms.items()})
 
 
-fit(alone, lambda: pictures[torch.randint(len(pictures), (128,))], 150, 1e-2)
-fit(together, lambda: train[torch.randint(len(train), (32,)), :20], 20, 3e-3)
+fit(alone, lambda: pictures[torch.randint(len(pictures), (128,))], 250, 1e-2)
+fit(together, lambda: train[torch.randint(len(train), (32,)), :20], 30, 3e-3)
 
 # %%
 # What each sensor brings
