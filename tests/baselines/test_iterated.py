@@ -5,14 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
-from tests.filters.factories import (
-    NoisyLinear,
-    assert_equal,
-    linear_denkf,
-    linear_kalman,
-    linear_system,
-    random_draws,
-)
+from tests.filters.factories import NoisyLinear, assert_equal, linear_denkf, linear_kalman, linear_system, random_draws
 from tests.filters.gaussian_for_tests import directional_check, known_process_noise
 from tests.smoothers.joint import COV, MEAN, drive
 from torch_denkf.baselines import IEnKS

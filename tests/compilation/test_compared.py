@@ -193,12 +193,7 @@ def precise():
     sums = torch.tensor([[1.0, 1.0, 1.0]])
     cov = 1e4 * torch.ones(3, 3) + torch.diag(torch.tensor([1.0, 2.0, 3.0]))
     filter = KalmanFilter(
-        torch.eye(3),
-        sums,
-        process_noise_cov=0 * torch.eye(3),
-        noise=[1e-2],
-        mean=torch.zeros(3),
-        cov=cov,
+        torch.eye(3), sums, process_noise_cov=0 * torch.eye(3), noise=[1e-2], mean=torch.zeros(3), cov=cov
     )
     return filter, filter.initialise(TensorDict({"observation": 100 * torch.randn(2, 1)}, [2]))
 

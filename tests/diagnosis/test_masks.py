@@ -65,13 +65,7 @@ def test_a_mask_that_the_analysis_does_not_read_is_said_once(way):
 
 
 @pytest.mark.parametrize(
-    "make",
-    [
-        linear_denkf,
-        linear_kalman,
-        lambda: bootstrap(20),
-        lambda: with_analysis(Perturbed(masked=True)),
-    ],
+    "make", [linear_denkf, linear_kalman, lambda: bootstrap(20), lambda: with_analysis(Perturbed(masked=True))]
 )
 def test_no_false_alarm_where_the_mask_is_read(make):
     filter = make()

@@ -452,10 +452,7 @@ def test_a_fused_filter_is_what_one_would_compose_by_hand(float64):
         NoisyLinear(F),
         {
             "camera": FusedSensor(
-                Select([0, 1]),
-                [0.3, 0.4],
-                sensor=lamps(),
-                analysis=lambda **keys: EnsembleAnalysis("sensor", **keys),
+                Select([0, 1]), [0.3, 0.4], sensor=lamps(), analysis=lambda **keys: EnsembleAnalysis("sensor", **keys)
             ),
             "wheel": FusedSensor(Select([1]), [0.2]),
         },
@@ -504,10 +501,7 @@ def test_covariances_of_readings_side_by_side(float64):
         def compute(self, like, *, batch_size):
             return cov.expand(*batch_size, 2, 2)
 
-    both = {
-        "pair": FusedSensor(LinearObservation(H), Constant([1.0, 1.0])),
-        "one": FusedSensor(Select([1]), [0.7]),
-    }
+    both = {"pair": FusedSensor(LinearObservation(H), Constant([1.0, 1.0])), "one": FusedSensor(Select([1]), [0.7])}
     frames = TensorDict({"pair": torch.randn(4, 2), "one": torch.randn(4, 1)}, [4])
     outs = []
     for joint in (False, True):

@@ -6,9 +6,7 @@ import pytest
 import torch
 from torchrl.objectives import DDPGLoss
 
-from tests.objectives.test_torchrl_losses import (
-    with_other_beliefs,
-)
+from tests.objectives.test_torchrl_losses import with_other_beliefs
 from tests.test_docs import BLOCK, ROOT
 
 PAGE = ROOT / "docs/how_to/policies.md"

@@ -7,10 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from tests.filters.factories import (
-    NoisyLinear,
-    toy_denkf,
-)
+from tests.filters.factories import NoisyLinear, toy_denkf
 from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, score_by_hand
 from tests.objectives.problem_for_tests import problem, stepped
 from torch_denkf.filters import Filter

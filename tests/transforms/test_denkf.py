@@ -14,14 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
-from torchrl.envs import (
-    Compose,
-    InitTracker,
-    ParallelEnv,
-    SerialEnv,
-    TransformedEnv,
-    check_env_specs,
-)
+from torchrl.envs import Compose, InitTracker, ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
 
 from tests.filters.factories import assert_equal, linear_kalman
 from tests.transforms.envs_for_tests import (
@@ -112,8 +105,7 @@ def test_steps_equal_the_sequence(kind, update_at_reset):
 def test_collector_replay_buffer_loss_gradients():
     filter = toy_filter()
     env = TransformedEnv(
-        toy_base_env(batch_size=[3], max_steps=[7, 9, 50], missing=0.2),
-        Compose(InitTracker(), DEnKFTransform(filter)),
+        toy_base_env(batch_size=[3], max_steps=[7, 9, 50], missing=0.2), Compose(InitTracker(), DEnKFTransform(filter))
     )
     policy = TensorDictModule(nn.Linear(3, 2), in_keys=[("belief", "mean")], out_keys=["action"])
     collector = Collector(env, policy, frames_per_batch=90, total_frames=180)

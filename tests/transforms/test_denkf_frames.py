@@ -2,22 +2,11 @@
 
 import pytest
 import torch
-from torchrl.envs import (
-    Compose,
-    DoubleToFloat,
-    TransformedEnv,
-)
+from torchrl.envs import Compose, DoubleToFloat, TransformedEnv
 
 from tests.filters.factories import assert_equal, linear_denkf
 from tests.functional.checks import assert_refused
-from tests.transforms.envs_for_tests import (
-    BELIEF,
-    Changed,
-    base_env,
-    random_filter,
-    toy_base_env,
-    toy_filter,
-)
+from tests.transforms.envs_for_tests import BELIEF, Changed, base_env, random_filter, toy_base_env, toy_filter
 from torch_denkf.imperfect import RejectReadings
 from torch_denkf.transforms import DEnKFTransform
 
@@ -79,7 +68,6 @@ def test_float64_environment_and_float32_filter():
     with pytest.raises(TypeError, match="DoubleToFloat"):
         _ = TransformedEnv(base, DEnKFTransform(linear_denkf())).observation_spec
     mended = TransformedEnv(
-        base,
-        Compose(DoubleToFloat(in_keys=["observation"], in_keys_inv=["action"]), DEnKFTransform(linear_denkf())),
+        base, Compose(DoubleToFloat(in_keys=["observation"], in_keys_inv=["action"]), DEnKFTransform(linear_denkf()))
     )
     assert mended.rollout(3)["next", "belief", "mean"].dtype == torch.float32
