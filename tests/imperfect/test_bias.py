@@ -81,29 +81,6 @@ def beside_the_oracle(filter):
     return out, *map(torch.tensor, augmented_kalman_filter(readings, START))
 
 
-@pytest.mark.parametrize("kind", [EKF, UKF])
-def test_gaussian_filters_are_the_augmented_kalman_filter(kind):
-    _, transition, q, observation, r = parts()
-    initial = MomentPrior(torch.zeros(4, dtype=torch.double), torch.tensor(START, dtype=torch.double).square().diag())
-    filter = kind(transition, None, observation, r, process_noise=q, initial=initial, observation_key="reading")
-    out, mean, cov = beside_the_oracle(filter)
-    torch.testing.assert_close(out["belief", "mean"], mean, atol=1e-9, rtol=1e-7)
-    torch.testing.assert_close(out["belief", "cov"], cov, atol=1e-9, rtol=1e-7)
-
-
-def test_an_ensemble_comes_close_to_it():
-    _, transition, q, observation, r = parts()
-    initial = GaussianPrior(
-        torch.zeros(4, dtype=torch.double), torch.tensor(START, dtype=torch.double), ensemble_size=20000
-    )
-    analysis = EnsembleAnalysis("etkf", observation_key="reading")
-    filter = DEnKF(NoisyTransition(transition, q), None, observation, r, analysis, initial=initial)
-    out, mean, cov = beside_the_oracle(filter)
-    std = cov.diagonal(dim1=1, dim2=2).sqrt()
-    assert ((out["belief", "mean"] - mean).abs() / std).max() < 0.08  # members say it to 0.7 % a step
-    assert (out["belief", "var"].sqrt() / std - 1).abs().max() < 0.05
-
-
 def test_biases_stay_as_large_and_are_correlated_as_said():
     bias = FadingBias(torch.tensor([2.0, 0.5]), [4.0, 30.0])
     torch.testing.assert_close(bias.decay**2 * bias.std**2 + bias.variance, bias.std**2)
@@ -371,8 +348,5 @@ def test_white_residuals_and_few_are_refused():
         FadingBias.from_residuals(residuals(2, 20))
     with pytest.raises(ValueError, match=r"\[N, T, K\]"):
         FadingBias.from_residuals(torch.randn(50, 100))
-
-
-def test_of_one_run_nothing_is_the_runs_own():
     with pytest.raises(ValueError, match="about ten; got one"):
         FadingBias.from_residuals(residuals(1, 300), per_run=True)

@@ -8,9 +8,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch.testing import assert_close
 
-from torch_denkf.diagnosis import check_analysis
 from torch_denkf.functional.localisation import Neighbours
-from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.imperfect import Visibility, Visible
 from torch_denkf.modules import (
     EKFAnalysis,
@@ -18,10 +16,8 @@ from torch_denkf.modules import (
     GaussianLikelihood,
     KalmanAnalysis,
     LearnedLikelihood,
-    LinearObservation,
     LocalEnsembleAnalysis,
     Select,
-    SubModel,
     UKFAnalysis,
 )
 from torch_denkf.modules.particles import ParticleAnalysis
@@ -96,7 +92,7 @@ def test_one_step_is_that_of_a_fine_grid(name, reading, p):
 
 @pytest.mark.parametrize("name", ANALYSES)
 def test_the_gradient_by_p_is_that_of_finite_differences(name):
-    analysis, step = ANALYSES[name](), 1e-5
+    analysis = ANALYSES[name]()
     perturbation = torch.randn(40, 1, dtype=torch.float64)
 
     def value(p):
@@ -104,38 +100,7 @@ def test_the_gradient_by_p_is_that_of_finite_differences(name):
         td = analysis(td.set(("noise", "self"), perturbation) if name == "perturbed" else td)
         return td["belief", "mean"].sum() + 2 * td["belief", "var"].sum() + td["info", "log_likelihood"].sum()
 
-    p = torch.tensor([0.6], dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(value(p), p)
-    with torch.no_grad():
-        difference = (value(p + step) - value(p - step)) / (2 * step)
-    assert gradient.item() == pytest.approx(difference.item(), rel=1e-6)
-
-
-def of_check(analysis):
-    """Behind a module that says p = 1, so that the update must be the analysis'."""
-
-    class Sees(SubModel):
-        def __init__(self):
-            super().__init__(torch.nn.Identity(), [("forecast", "mean")], [VISIBLE])
-
-        def compute(self, mean):
-            return torch.ones_like(mean[..., :1])
-
-    return TensorDictSequential(Sees(), analysis)
-
-
-CHECKED = {
-    "etkf": lambda: Visible(EnsembleAnalysis("etkf", observation_key=KEY)),
-    "perturbed": lambda: Visible(EnsembleAnalysis("perturbed", observation_key=KEY)),
-    "Kalman": lambda: Visible(KalmanAnalysis(torch.eye(2, 3), None, observation_key=KEY)),
-    "EKF": lambda: Visible(EKFAnalysis(LinearObservation(torch.eye(2, 3)), observation_key=KEY)),
-    "UKF": lambda: Visible(UKFAnalysis(LinearObservation(torch.eye(2, 3)), observation_key=KEY)),
-}
-
-
-@pytest.mark.parametrize("name", CHECKED)
-def test_a_sensor_that_sees_for_certain_is_the_analysis_alone(name):
-    check_analysis(of_check(CHECKED[name]()), observation_key=KEY)
+    assert torch.autograd.gradcheck(value, torch.tensor([0.6], dtype=torch.float64, requires_grad=True))
 
 
 NEAR = Neighbours(torch.arange(2).expand(3, 2), torch.tensor([[1.0, 0.5], [0.5, 1.0], [0.2, 0.2]]).double())
@@ -268,26 +233,6 @@ def test_masks_are_heeded(name):
         assert_close(out["info", "log_likelihood"][2], torch.logaddexp(own + math.log(0.7), other + math.log(0.3)))
 
 
-@pytest.mark.parametrize("name", ["etkf", "Kalman", "UKF", "particles"])
-def test_gradients_reach_the_head_and_are_finite_far_out(name):
-    """Readings of NIS up to 1e6, in single precision."""
-    torch.manual_seed(0)
-    likelihood = GaussianLikelihood(observation_key=KEY)
-    inner = ParticleAnalysis(likelihood) if name == "particles" else SEVERAL[name]()
-    head = Visibility(4)
-    modules = [head, *([likelihood] if name == "particles" else []), Visible(inner)]
-    update = TensorDictSequential(*modules).float()
-    td = several(dtype=torch.float32)
-    td["sensor", "encoding"] = torch.randn(3, 4)
-    td[KEY] = td["forecast", "mean"][:, :2] + torch.tensor([[0.0, 0.0], [20.0, 0.0], [1300.0, 0.0]])
-    out = update(td)
-    assert out["info", "nis"].max() > 5e5
-    loss = out["belief", "mean"].square().sum() + out["belief", "var"].sum() - out["info", "log_likelihood"].sum()
-    gradients = torch.autograd.grad(loss, list(head.parameters()), allow_unused=True)
-    assert all(gradient.isfinite().all() for gradient in gradients)
-    assert gradients[-1].abs().max() > 0
-
-
 def test_a_head_says_what_it_was_told_to_start_from():
     head = Visibility(4, start=0.7, floor=0.01)
     encoding = torch.randn(5, 4)
@@ -314,20 +259,3 @@ def test_what_cannot_be_is_refused():
             Visible(other)
     with pytest.raises(KeyError, match="visible"):
         Visible(inner)(several(samples=True).exclude(VISIBLE).rename_key_(KEY, ("sensor", "ensemble")))
-
-
-@pytest.mark.parametrize("name", ["etkf", "UKF", "particles"])
-def test_a_turn_more_is_the_same_reading(name):
-    likelihood = GaussianLikelihood(observation_key=KEY, reading_space=Circle() * Euclidean(1))
-    inner = {
-        "etkf": lambda: EnsembleAnalysis("etkf", observation_key=KEY, reading_space=Circle() * Euclidean(1)),
-        "UKF": lambda: UKFAnalysis(Select([0, 1]), observation_key=KEY, reading_space=Circle() * Euclidean(1)),
-        "particles": lambda: ParticleAnalysis(likelihood),
-    }[name]()
-    update = TensorDictSequential(*([likelihood] if name == "particles" else []), Visible(inner))
-    td = several()
-    turned = td.clone()
-    turned[KEY][..., 0] += 2 * math.pi
-    out, other = update(td), update(turned)
-    for key in (("belief", "mean"), ("belief", "var"), ("info", "visible"), ("info", "log_likelihood")):
-        assert_close(out[key], other[key])

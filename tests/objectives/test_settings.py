@@ -13,7 +13,7 @@ from tests.objectives.problem_for_tests import problem, stepped
 from torch_denkf.filters import Filter
 from torch_denkf.functional.manifolds import Flat
 from torch_denkf.modules import Initial, SubModel
-from torch_denkf.objectives import DEnKFLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
+from torch_denkf.objectives import DEnKFLoss, SensorLoss, TransitionLoss
 
 SCORES = ["crps", "energy", "mse"]
 
@@ -55,23 +55,6 @@ def test_a_dimension_with_infinite_scale_does_not_count(score):
     assert one_step(frames)["loss_transition"].equal(first)
 
 
-def test_infinite_scales_of_the_observation_model():
-    filter = toy_denkf()
-    frames, _ = problem(filter)
-    error = (filter["observation"].module(frames["state"]) - frames["target_observation"])[..., 1] / 3
-    loss = ObservationLoss(filter, observation_scale=[math.inf, 3.0])
-    torch.testing.assert_close(loss(frames)["loss_observation"], error.square().mean(), **CLOSE)
-
-
-def test_infinite_scales_of_a_mixture_are_those_of_fewer_dimensions():
-    filter = toy_denkf()
-    frames, _ = problem(filter)
-    for score in ("mixture", "crps"):
-        some = MixtureLoss(filter, score=score, state_scale=[0.5, math.inf, 4.0])(frames)["loss_state"]
-        chosen = MixtureLoss(filter, score=score, state_scale=[0.5, 4.0], dims=[0, 2])(frames)["loss_state"]
-        torch.testing.assert_close(some, chosen, **CLOSE)
-
-
 def test_a_loaded_scale_counts_other_dimensions():
     filter = toy_denkf()
     frames, _ = problem(filter)
@@ -80,9 +63,6 @@ def test_a_loaded_scale_counts_other_dimensions():
     assert not second(frames)["loss_state"].equal(first(frames)["loss_state"])
     second.load_state_dict(first.state_dict())
     assert second(frames)["loss_state"].equal(first(frames)["loss_state"])
-
-
-# ------------------------------------------------------------------------------------- filters without a sensor
 
 
 # --------------------------------------------------------------------------------------------------- one member

@@ -171,26 +171,6 @@ def test_clipped_ppo(float64):
     assert_same_gradients(out["loss_critic"], by_hand, [filter, critic_head])
 
 
-def test_sac(float64):
-    filter, frames = filter_and_frames()
-    data = collected(filter, frames)
-    data["action"] = data["action"].tanh() * 0.9
-    actor, head, options = sac(filter, inside=True)
-    loss = SACLoss(actor, q_network(), num_qvalue_nets=1, **options)
-    torch.manual_seed(3)
-    actor_loss, _ = loss.actor_loss(data.copy())
-    actor_loss = actor_loss.mean()
-
-    torch.manual_seed(3)
-    roots, _ = beliefs_by_hand(filter, data)
-    distribution = TanhNormal(*head(roots))
-    action = distribution.rsample()
-    q = q_of(loss, roots, action)
-    by_hand = (0.3 * distribution.log_prob(action).unsqueeze(-1) - q).mean()
-    torch.testing.assert_close(actor_loss, by_hand)
-    assert_same_gradients(actor_loss, by_hand, [filter, head])
-
-
 def q_of(loss, mean, action, number=0):
     params = loss.qvalue_network_params[number].detach()
     with params.to_module(loss.qvalue_network):
