@@ -77,18 +77,3 @@ def test_a_step_is_the_kalman_filter_of_what_the_networks_say(float64):
     names = {name for name, _ in filter.named_parameters()}
     assert {"module.transition.matrix", "module.transition.control"} <= names
     assert not any("analysis" in name for name in names), "C gives the observation its meaning, and is given"
-
-
-def test_the_motion_is_learned_where_it_is_trainable():
-    F, *_ = linear_system()
-    frames = simulate(2000, 8, torch.Generator().manual_seed(1))
-    frames["flag"] = frames["features"][..., 2:]
-    filter = make_filter(trainable=True)
-    with torch.no_grad():
-        filter["transition"].matrix.copy_(0.5 * torch.eye(2))
-        filter["sensor"].module.weight.copy_(torch.tensor([[0.5, 0, 0], [0, 0.5, 0]]))
-        filter["sensor"].module.bias.fill_(-0.5)
-    loss = GaussianLoss(filter, state=0.0, transition=0.0, sensor=0.0, nll=1.0)
-    parameters = [filter["transition"].matrix, *filter["noise"].parameters()]
-    minimise(loss, frames, parameters, 25)
-    torch.testing.assert_close(filter["transition"].matrix.detach(), F, rtol=0, atol=0.05)

@@ -19,7 +19,6 @@ from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, LinearTransition, MomentPrior, Select
 from torch_denkf.running import named_modules_of
 
-VERSION = tuple(map(int, torch.__version__.split(".")[:2]))
 needs_compiler = pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
 
 
@@ -63,25 +62,6 @@ def rounded(graph, inputs):
 
 
 # -------------------------------------------------------------------------------------------- errors of inductor
-
-
-def rows_of_a_jacobian(state):
-    _, pull_back = torch.func.vjp(lambda s: s.index_select(-1, torch.tensor([0, 1])), state[None])
-    return torch.func.vmap(lambda v: pull_back(v)[0])(torch.eye(2)[:, None]).squeeze(1)
-
-
-@needs_compiler
-@pytest.mark.slow
-@pytest.mark.skipif(VERSION >= (2, 15), reason="right in torch 2.15; Select avoids it for torch 2.13")
-def test_torch_still_adds_up_the_rows_of_a_jacobian_of_index_select():
-    """Tells when torch 2.13 is no longer supported: then `Select` may use index_select again, and this test may go."""
-    state = torch.zeros(4)
-    assert rows_of_a_jacobian(state).equal(torch.eye(4)[:2])
-    found = torch.compile(rows_of_a_jacobian)(state)
-    assert found.equal(torch.tensor([[1.0, 1.0, 0.0, 0.0]] * 2)), (
-        f"torch {torch.__version__} compiles vmap over the backward pass of index_select to {found.tolist()}; if these "
-        "are the first two rows of the identity, let modules.Select use index_select again, and delete this test"
-    )
 
 
 def ekf():

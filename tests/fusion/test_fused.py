@@ -180,20 +180,6 @@ def test_late_readings_of_an_ensemble_whose_motion_is_known(float64, joint, patt
             assert_close(out["belief", name][:, now], expected["belief", name][:, -1], rtol=0, atol=1e-10)
 
 
-def test_late_readings_of_a_noisy_ensemble_within_the_error_of_its_members(float64):
-    """With process noise, members are only a sample of its covariance with the past: 1 / sqrt(E)."""
-    frames, late = readings(), PATTERNS["three steps late"]
-    errors = []
-    for count in (500, 8000):
-        torch.manual_seed(2)
-        members = torch.tensor([1.0, -1.0]) + torch.tensor([1.0, 2.0]).sqrt() * torch.randn(count, 2)
-        out = fused("ensemble", delay=DELAY, members=members).sequence(arriving(frames, late))
-        expected = fused("Kalman", delay=DELAY).sequence(arriving(frames, late))
-        errors.append((out["belief", "mean"] - expected["belief", "mean"]).square().mean().sqrt())
-    assert errors[1] < 0.02
-    assert errors[1] < 0.5 * errors[0]
-
-
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
 def test_what_belongs_to_the_time_before_an_episode_is_not_observed(float64, kind):
     frames = readings()

@@ -62,15 +62,6 @@ def test_a_log_gives_what_a_filter_gives_that_goes_from_message_to_message(float
     assert_close(out["belief", "cov"][-1].numpy(), cov, rtol=1e-9, atol=1e-11)
 
 
-@pytest.mark.slow
-def test_compiled(float64):
-    rows = message_rows(irregular_log(), start=0.0)
-    eager, compiled = (
-        each.sequence(rows.copy()) for each in (glider(), glider().compile(chunk=2, backend="aot_eager"))
-    )
-    assert_close(compiled["belief", "cov"], eager["belief", "cov"], rtol=1e-9, atol=1e-11)
-
-
 def test_delays_in_seconds_put_messages_where_they_belong(float64):
     log = irregular_log()
     late = [(stamp + 0.45 * (name == "speed"), name, *rest) for stamp, name, *rest in log]

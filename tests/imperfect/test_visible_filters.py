@@ -71,6 +71,10 @@ def frames(*batch):
     return td
 
 
+#: One of each. To trace a step takes seconds.
+TRACED = [("etkf", "visible"), ("Kalman", "outlier")]
+
+
 @BOTH
 @pytest.mark.parametrize("name", MAKERS)
 def test_steps_are_the_sequence_and_the_compiled_sequence(float64, name, share):
@@ -85,15 +89,14 @@ def test_steps_are_the_sequence_and_the_compiled_sequence(float64, name, share):
         belief = out.select(*filter.belief_keys)
         for key in filter.belief_keys:
             assert_close(belief[key], whole[key][:, t], rtol=0, atol=1e-12)
+    if (name, share) not in TRACED:
+        return
     compiled = filter.compile(chunk=2, backend="eager").sequence(td.copy())
     for key in filter.out_keys:
         assert_close(compiled[key], whole[key], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("share", "name"),
-    [("visible", "etkf"), ("visible", "EKF"), ("visible", "UKF"), ("outlier", "etkf"), ("outlier", "Kalman")],
-)
+@pytest.mark.parametrize(("share", "name"), [("visible", "EKF"), ("outlier", "etkf")])
 def test_a_packaged_step_is_the_step(name, share, tmp_path):
     options = {"share": 0.3, "width": 4.0} if share == "outlier" else {}
     filter, td = WRAPPED[share](MAKERS[name](), **options), frames(4).exclude("is_init")

@@ -298,19 +298,6 @@ def test_steps_sequences_and_environments_agree(response):
         assert torch.allclose(rollout["next", *key], sequence[key], atol=1e-4), key
 
 
-@pytest.mark.parametrize(
-    "response", ["reject", *(pytest.param(soft, marks=pytest.mark.slow) for soft in ("student", "huber"))]
-)
-def test_compiled_steps_give_the_same(response):
-    def made():
-        return Gated(linear_denkf(), DIM, response=response, rate=0.3, by_component=True, adapt_inflation=0.1)
-
-    td = data(2, 7)
-    eager, compiled = run(made(), td), run(made().compile(chunk=2, backend="aot_eager"), td)
-    for key in (("belief", "mean"), ("gate", "factor"), ("gate", "terms")):
-        assert torch.allclose(eager[key], compiled[key], atol=1e-5, equal_nan=False), key
-
-
 def test_calibration_holds_what_clean_data_show():
     """Innovations twice as large as expected open no gate that was calibrated on such."""
     gated = still(1.0, 0.25, response="reject", window=3, rate=0.01)

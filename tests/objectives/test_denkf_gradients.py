@@ -10,8 +10,9 @@ from tests.objectives.problem_for_tests import problem
 from torch_denkf.objectives import DEnKFLoss
 
 
-@pytest.mark.parametrize("score", ["crps", "energy", "mse"])
-@pytest.mark.parametrize("layer", ["dropout", "flipout"])
+@pytest.mark.parametrize(
+    ("score", "layer"), [("crps", "dropout"), ("crps", "flipout"), ("energy", "dropout"), ("mse", "dropout")]
+)
 def test_gradient_by_finite_differences(float64, score, layer):
     filter = toy_denkf("sensor", layer)
     frames, _ = problem(filter)

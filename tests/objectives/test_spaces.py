@@ -185,11 +185,11 @@ def test_members_that_are_drawn_like_the_truth_score_best(space):
     labels = Labels(truth, torch.ones(count, size, dtype=torch.bool), range(size), space=space)
     moved = torch.zeros(2 * size, requires_grad=True)
     center = space.exp(moved[:size])
-    members = space.plus(center, (torch.randn(count, 16, size) @ factor.mT) * (1 + moved[size:]))
+    members = space.plus(center, (torch.randn(count, 8, size) @ factor.mT) * (1 + moved[size:]))
     off = {}
     for each in (False, True):
         errors = labels.errors(members, each=each)
-        pairs = (errors.unsqueeze(-2) - errors.unsqueeze(-3)).abs().sum((-3, -2)) / (16 * 15)
+        pairs = (errors.unsqueeze(-2) - errors.unsqueeze(-3)).abs().sum((-3, -2)) / (8 * 7)
         score = (errors.abs().mean(-2) - pairs / 2).sum(-1)
         (gradient,) = torch.autograd.grad(score.mean(), moved, retain_graph=True)
         off[each] = gradient.abs().max()

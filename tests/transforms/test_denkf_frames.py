@@ -56,6 +56,13 @@ def test_observed_nan_raises_and_names_the_key(make_base, make_filter):
     assert_equal(make(reject).rollout(8)["next"], make(honest=True).rollout(8)["next"], BELIEF)
 
 
+def test_divergence_is_told_apart():
+    filter = linear_denkf()
+    filter["transition"].matrix.mul_(1e30)
+    env = TransformedEnv(base_env(), DEnKFTransform(filter))
+    assert_refused(ValueError, "all inputs are finite, and the filter diverged", env.rollout, 5)
+
+
 # ------------------------------------------------------------------------------------------------------ errors
 
 

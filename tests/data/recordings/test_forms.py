@@ -1,12 +1,9 @@
 """Text logs in the forms in which robots and their tools write them, each read as it is, and ROS bags."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from tests.real_data import SHARED
-from torch_denkf.data import Table, Video
+from torch_denkf.data import Table
 
 S = [1395837505.25, 1395837505.5, 1395837505.75]  # s since 1970, which float64 holds
 X = [1.5, -2.0, 3.0]
@@ -81,7 +78,6 @@ FORMS = {
     "ms by name": (lines("millis,x", lambda t, x: f"{t},{x}", [500, 750, 1000]), {}, [0.5, 0.75, 1.0]),
     "us by size": (lines("timestamp,x", lambda t, x: f"{t},{x}", whole(1e6)), {}, S),
     "a row of units": (lines("time,x\n[ms],[m]", lambda t, x: f"{t},{x}", [500, 750, 1000]), {}, [0.5, 0.75, 1.0]),
-    "the same column twice": (lines("time,x,x", lambda t, x: f"{t},{x},7"), {"columns": ["x"]}, S),
     "empty cells of slow sensors": (
         lines("time,imu,gps", lambda t, x: f"{t},0.5,{x}\n{t + 0.125},0.25,"),
         {"columns": ["gps"]},
@@ -183,19 +179,3 @@ def test_bags(tmp_path, version):
     (tmp_path / "cut.mcap").write_bytes(b"nothing")
     with pytest.raises(ValueError, match=r"cut.mcap is no complete bag"):
         Table(tmp_path / "cut.mcap").read()
-
-
-def test_a_bag_of_a_turtlebot():
-    pytest.importorskip("rosbags")
-    bag = SHARED / "logs" / "turtlebot.mcap"
-    if not bag.exists():
-        pytest.skip("the bag is not here")
-    counts = {"/odom": 380, "/ekf_state": 1519}
-    for topic, count in counts.items():
-        assert Table(bag, ["pose.pose.position.x"], topic=topic).read().values.shape == (count, 1)
-
-
-def test_times_of_a_video_in_the_form_of_kitti(tmp_path):
-    (tmp_path / "times.txt").write_text("0.0e+00\n1.0e-01\n")
-    with pytest.raises(FileNotFoundError, match="no video"):
-        Video(tmp_path / "none.mp4", times=Path(tmp_path / "times.txt")).read((8, 8), None, False)

@@ -50,18 +50,6 @@ def test_delays_that_are_known():
     assert held >= 34
 
 
-def test_intervals_of_delays_by_poor_fixes():
-    """Fixes of 0.5 m: of 40 intervals of the GPS's delay beside the gyro, 38 hold on average."""
-    held = []
-    for seed in range(40):
-        tables = drive(seed, noise=0.5)
-        delays = {(one.late, one.early): one for one in delays_between(tables, most=2.0)}
-        if found := delays.get(("gps", "gyro")):
-            held.append(abs(found.seconds - LATE["gps"]) < 1.96 * found.std)
-    assert len(held) > 35
-    assert np.mean(held) > 0.9
-
-
 def test_scales_tell_units():
     tables = drive(0)
     scales = {(delay.late, delay.early): delay.scale for delay in delays_between(tables, most=2.0)}
