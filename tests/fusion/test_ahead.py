@@ -238,11 +238,3 @@ def test_what_is_missing_is_named():
         BeliefAhead(filter, "delay", most=2)(out.set("delay", torch.full((4, 6, 1), 3)))
     with pytest.raises(KeyError, match="keep names"):
         BeliefAhead(filter, K, keep=["ensemble"])
-
-
-def test_an_analysis_of_samples_can_do_without_them():
-    """``predict`` with the scheme ``"sensor"``: the belief is the forecast."""
-    filter = toy_denkf()
-    row = filter.initialise(TensorDict({"measurement": torch.randn(3, 4), "action": torch.randn(3, 2)}, [3]))
-    out = filter.predict(row)
-    torch.testing.assert_close(out["belief", "ensemble"], out["forecast", "ensemble"], rtol=0, atol=0)

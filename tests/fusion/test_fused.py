@@ -19,7 +19,7 @@ from tests.filters.gaussian_for_tests import directional_check
 from torch_denkf.filters import EKF, DEnKF, KalmanFilter
 from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.manifolds import Circle, Euclidean
-from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
+from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.fusion.parts import JoinedReading
 from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import (
@@ -272,17 +272,6 @@ def inflated(frames, factor, *, noise=1.0, mean=None, cov=None):
         means.append(mean)
         covs.append(cov)
     return means, covs, moved
-
-
-def test_inflation_is_that_of_readings_in_their_order_when_they_are_filtered_again(float64):
-    frames, late = readings(), PATTERNS["out of order"]
-    lately = {"late": ("second", "second_observed")}
-    out = Refiltering(fused("Kalman", analysis=SPREAD["Kalman"]), lately, DELAY).sequence(arriving(frames, late))
-    start = {"mean": torch.tensor([1.0, -1.0]), "cov": torch.diag(torch.tensor([1.0, 2.0]))}
-    for now in range(T):
-        means, covs, _ = inflated(arrived(frames, late, now), 1.3, **start)
-        assert_close(out["belief", "mean"][:, now], means[-1], rtol=0, atol=1e-10)
-        assert_close(out["belief", "cov"][:, now], covs[-1], rtol=0, atol=1e-10)
 
 
 def test_inflation_spreads_the_present_and_the_past_follows_where_a_lag_is_put_around(float64):

@@ -134,6 +134,22 @@ SEVERAL = {
 }
 
 
+def around(name, wrap=lambda inner: inner):
+    """The update of that name in a wrapper; that of particles behind its likelihood."""
+    if name != "particles":
+        return TensorDictSequential(wrap(SEVERAL[name]()))
+    likelihood = GaussianLikelihood(observation_key=KEY)
+    return TensorDictSequential(likelihood, wrap(ParticleAnalysis(likelihood)))
+
+
+def hidden_in_part(name):
+    """A row that is observed, one that is not, and one of which the first component alone is."""
+    td = several(samples=name == "sensor")
+    td["observed"] = torch.tensor([[True, True], [False, False], [True, False]])
+    shown = td["observed"].unsqueeze(-2) if name == "sensor" else td["observed"]
+    return td.set(KEY, torch.where(shown, td[KEY], torch.nan))
+
+
 def moments(td, prefix):
     if td.get((prefix, "cov"), None) is not None and td.get((prefix, "ensemble"), None) is None:
         return td[prefix, "mean"], td[prefix, "cov"]
@@ -166,10 +182,8 @@ def test_moments_of_the_belief_are_those_of_the_mixture(name):
 
 
 def test_particles_are_the_exact_mixture_of_weights():
-    likelihood = GaussianLikelihood(observation_key=KEY)
-    plain, td = TensorDictSequential(likelihood, ParticleAnalysis(likelihood)), several()
-    alone = plain(td.clone())
-    mixed = TensorDictSequential(likelihood, Visible(ParticleAnalysis(likelihood)))(td.clone())
+    td = several()
+    alone, mixed = around("particles")(td.clone()), around("particles", Visible)(td.clone())
     q = mixed["info", "visible"]
     weight = q * alone["belief", "log_weight"].exp() + (1 - q) * td["forecast", "log_weight"].exp()
     assert_close(mixed["belief", "log_weight"].exp(), weight)
@@ -180,15 +194,12 @@ def test_particles_are_the_exact_mixture_of_weights():
 @pytest.mark.parametrize("name", [*SEVERAL, "particles"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_p_of_one_and_of_zero(name, dtype):
-    likelihood = GaussianLikelihood(observation_key=KEY)
-    inner = ParticleAnalysis(likelihood) if name == "particles" else SEVERAL[name]()
-    inner = inner.to(dtype)
-    first = [likelihood] if name == "particles" else []
     td = several(samples=name == "sensor", dtype=dtype)
-    alone = TensorDictSequential(*first, inner)(td.clone())
+    alone = around(name).to(dtype)(td.clone())
     tolerance = 2e-5 if dtype == torch.float32 else 1e-11
     for p, prefix, expected in ((1.0, "belief", alone), (0.0, "forecast", td)):
-        out = TensorDictSequential(*first, Visible(inner))(td.clone().set(VISIBLE, torch.full((3, 1), p, dtype=dtype)))
+        sees = torch.full((3, 1), p, dtype=dtype)
+        out = around(name, Visible).to(dtype)(td.clone().set(VISIBLE, sees))
         for key in BELIEF:
             wanted = expected.get((prefix, key), None)
             unknown = wanted is None or out.get(("belief", key), None) is None
@@ -203,18 +214,11 @@ def test_p_of_one_and_of_zero(name, dtype):
 @pytest.mark.parametrize("name", [*SEVERAL, "particles"])
 def test_masks_are_heeded(name):
     """Keeps the forecast bit for bit where nothing is observed, whatever p; NaN spoils neither value nor gradient."""
-    likelihood = GaussianLikelihood(observation_key=KEY)
-    inner = ParticleAnalysis(likelihood) if name == "particles" else SEVERAL[name]()
-    update = TensorDictSequential(*([likelihood] if name == "particles" else []), Visible(inner))
-    td = several(samples=name == "sensor")
-    td["observed"] = torch.tensor([[True, True], [False, False], [True, False]])
-    shown = td["observed"].unsqueeze(-2) if name == "sensor" else td["observed"]
-    td[KEY] = torch.where(shown, td[KEY], torch.nan)
+    td, plain = hidden_in_part(name), around(name)
     p = torch.tensor([[0.4], [torch.nan], [0.7]], dtype=torch.float64, requires_grad=True)
-    out = update(td.clone().set(VISIBLE, p))
+    out = around(name, Visible)(td.clone().set(VISIBLE, p))
     key = "mean" if name in ("Kalman", "UKF") else "log_weight" if name == "particles" else "ensemble"
-    alone = TensorDictSequential(*update[:-1], inner)(td.clone())
-    assert torch.equal(out["belief", key][1], alone["belief", key][1])
+    assert torch.equal(out["belief", key][1], plain(td.clone())["belief", key][1])
     assert_close(out["belief", key][1], td["forecast", key][1])
     assert out["info", "log_likelihood"][1].item() == 0
     assert out["info", "visible"][1].item() == 0
@@ -225,9 +229,7 @@ def test_masks_are_heeded(name):
     # The density of one component alone: as many as are observed count.
     one = several(samples=name == "sensor")[2]
     one["observed"] = torch.tensor([True, False])
-    nis, own = out["info", "nis"][2], None
-    plain = TensorDictSequential(*([likelihood] if name == "particles" else []), inner)(one.clone())
-    own = plain["info", "log_likelihood"]
+    nis, own = out["info", "nis"][2], plain(one)["info", "log_likelihood"]
     if name != "particles":
         other = own + 0.5 * nis * (1 - 0.01) - math.log(10)
         assert_close(out["info", "log_likelihood"][2], torch.logaddexp(own + math.log(0.7), other + math.log(0.3)))

@@ -10,7 +10,6 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import RenameTransform, TransformedEnv
 from torchrl.modules import (
-    MLP,
     IndependentNormal,
     NormalParamExtractor,
     ProbabilisticActor,
@@ -18,7 +17,7 @@ from torchrl.modules import (
     set_recurrent_mode,
 )
 from torchrl.modules.utils import get_env_transforms_from_module
-from torchrl.objectives import A2CLoss, ClipPPOLoss, SACLoss
+from torchrl.objectives import A2CLoss, ClipPPOLoss
 
 from tests.filters.differences_for_tests import central_difference
 from tests.filters.factories import OBS, A, M, S, toy_denkf
@@ -140,28 +139,6 @@ def test_clipping_and_a2c_see_no_change(float64):
     loss = A2CLoss(policy, critic, entropy_bonus=False)(data)["loss_objective"]
     by_hand = -(data["action_log_prob"].unsqueeze(-1) * data["advantage"]).mean()
     torch.testing.assert_close(loss, by_hand, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("keep", [True, False])
-def test_sac_sees_the_beliefs_that_were_collected(float64, keep):
-    """The filter stands in front of the loss: before an update it writes the same beliefs, from the same noise."""
-    policy = make_policy(toy_denkf(keep_noise=keep))
-    data = rollout(policy).reshape(-1, 4)
-    filter, actor = policy[0], ProbabilisticTensorDictSequential(*list(policy)[1:])
-    again = data.clone()
-    with torch.no_grad(), set_recurrent_mode(True):
-        filter(again)
-        ratio = actor.get_dist(again).log_prob(data["action"]) - data["action_log_prob"]
-    assert (ratio.abs().max() < 1e-9) == keep
-    value = ValueOperator(MLP(S + A, 1, num_cells=[]), in_keys=[("belief", "mean"), "action"])
-    loss = SACLoss(actor, value, target_entropy=-1.0)
-    terms = []
-    for rows in (data, again):
-        rows["next", "belief", "mean"] = data["belief", "mean"]
-        rows["next", "reward"] = torch.ones(*rows.shape, 1)
-        torch.manual_seed(0)  # of the loss's own actions
-        terms.append(loss(rows)["loss_actor"].detach())
-    assert (abs(terms[1] - terms[0]) < 1e-9) == keep
 
 
 def test_gradients_are_those_of_the_steps_that_were_taken(float64):

@@ -169,11 +169,13 @@ def test_a_gaussian_is_one_of_tangents_at_its_mean():
 
 
 def test_one_member_is_scored_by_its_distance():
-    space = SO3()
-    data = for_kind("members", beliefs(space, space.exp(torch.randn(3))))
-    data["belief", "ensemble"] = data["belief", "ensemble"][..., :1, :]
-    distance = space.distance(data["belief", "ensemble"][..., 0, :], data["state"])
-    torch.testing.assert_close(value("members, energy", data, space=space)[0], distance)
+    for space in (SO3(), Euclidean(2)):
+        data = for_kind("members", beliefs(space, space.exp(torch.randn(space.tangent_dim))))
+        data["belief", "ensemble"] = data["belief", "ensemble"][..., :1, :]
+        away = space.minus(data["state"], data["belief", "ensemble"].squeeze(-2))
+        expected = {"energy": away.norm(dim=-1), "crps": away.abs().mean(-1), "mse": away.square().mean(-1)}
+        for score, by_hand in expected.items():
+            torch.testing.assert_close(value(f"members, {score}", data, space=space)[0], by_hand)
 
 
 @pytest.mark.parametrize("space", [SO3(), pytest.param(SE3(), marks=pytest.mark.slow)], ids=repr)

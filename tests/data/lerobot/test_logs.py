@@ -182,21 +182,6 @@ def test_large_numbers(tmp_path, cached):
     assert_close(each["action"], torch.from_numpy(actions(0, 40) - 1))
 
 
-@pytest.mark.parametrize(
-    ("origin", "error", "match"),
-    [
-        (5.0, TypeError, "origin holds numbers for 'state' and 'action'"),
-        ({"joints": 1.0}, ValueError, r"origin names \['joints'\]; it holds numbers for \['state', 'action'\]"),
-        ({"state": [1.0, 2.0]}, ValueError, "origin of 'state' must be a finite number, or 3 of them"),
-        ({"state": "far"}, ValueError, "origin of 'state' must be a finite number"),
-    ],
-)
-def test_origins_that_are_none(tmp_path, origin, error, match):
-    write_version_2(tmp_path, [3])
-    with pytest.raises(error, match=match):
-        open_all(tmp_path, origin=origin)
-
-
 def test_a_stamp_that_is_missing_leaves_the_others_their_steps(tmp_path):
     write_version_2(tmp_path, [20])
     file = tmp_path / "data/chunk-000/episode_000000.parquet"

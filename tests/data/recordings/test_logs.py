@@ -156,17 +156,6 @@ def bursts(count=1000):
         (queued(100.0), "comes in bursts: .* below"),
         (queued(20.0), "comes in bursts: .* below"),
     ],
-    ids=[
-        "ns",
-        "ms",
-        "too short",
-        "since 1970",
-        "first is zero",
-        "two runs",
-        "bursts",
-        "a queue of 100 Hz",
-        "a queue of 20 Hz",
-    ],
 )
 def test_times_that_no_log_has(tmp_path, time, seen):
     file = write_csv(tmp_path / "run.csv", time=time, x=np.arange(len(time)))
