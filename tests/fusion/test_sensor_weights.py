@@ -182,7 +182,7 @@ def test_the_gradient_reaches_the_weights(float64, kind, slope):
     )
 
 
-def test_step_is_sequence_and_compiled_is_eager(float64):
+def test_step_is_sequence_and_compiled_weights_are_eager(float64):
     torch.manual_seed(0)
     attention = SensorAttention({"first": 1, "second": 1}, size=4)
     with torch.no_grad():
@@ -196,8 +196,9 @@ def test_step_is_sequence_and_compiled_is_eager(float64):
         row = filter.step(rows[:, t].copy().update(row.select(*filter.carry_keys)))
     assert_close(row["belief", "ensemble"], expected["belief", "ensemble"][:, -1], rtol=0, atol=1e-12)
     assert_close(row["weight"], expected["weight"][:, -1], rtol=0, atol=1e-12)
-    compiled = filter.compile(chunk=1, backend="eager").sequence(rows[:, :3].copy())
-    assert_close(compiled["belief", "ensemble"], expected["belief", "ensemble"][:, :3], rtol=0, atol=1e-10)
+    given = {name: torch.randn(3, 1) for name in ("first", "second")}, torch.rand(3, 2) < 0.5, {}
+    compiled = torch.compile(attention, backend="eager", fullgraph=True)
+    assert_close(compiled(*given), attention(*given), rtol=0, atol=1e-10)
 
 
 def test_a_long_lag_in_single_precision():

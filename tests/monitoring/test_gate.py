@@ -171,8 +171,8 @@ def test_adaptive_noise_converges_to_the_true_one(kind, factor):
     filter = linear_kalman() if kind == "Kalman" else linear_denkf("etkf", noisy=True, ensemble_size=100)
     gated = Gated(filter, DIM, rate=0.0, adapt_noise=0.02, by_component="by" in kind)
     with torch.no_grad():
-        out = run(gated, simulate(32, 600, factor)[1])
-    found = out["gate", "log_noise"][:, 350:].double().exp().mean((0, 1))
+        out = run(gated, simulate(32, 700, factor)[1])
+    found = out["gate", "log_noise"][:, 450:].double().exp().mean((0, 1))
     assert found.tolist() == pytest.approx([factor] * len(found), rel=0.15)
 
 
@@ -196,7 +196,7 @@ def test_adaptive_inflation_finds_the_missing_process_noise():
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_outliers_do_less_harm(name):
-    truth, td = simulate(20, 60)
+    truth, td = simulate(32, 36)
     td["observation"][:, 5::6] += 30 * linear_system()[3].sqrt()
     error = {}
     for response in ("none", *RESPONSES):

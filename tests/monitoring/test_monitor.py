@@ -58,7 +58,7 @@ def test_false_alarms_of_one_step_come_at_their_rate(rate):
 
 
 def test_false_alarms_of_windows_come_at_their_rate():
-    out = Monitored(kalman(), monitor(window=5)).sequence(simulate(2000, 256))
+    out = Monitored(kalman(), monitor(window=5)).sequence(simulate(5000, 106))
     tests = out["monitor", "gps"][:, 5::5]  # windows that do not overlap; the first step sees no reading
     count = tests.numel()
     assert count > 1e5
@@ -126,18 +126,18 @@ def test_calibration_finds_the_distribution_of_few_members():
     draws = torch.randn(count, members + 1, dim, generator=generator, dtype=torch.float64)
     noise = torch.full((count, dim), 1e-12, dtype=torch.float64)
     result = analyse(draws[:, 1:], draws[:, 1:], draws[:, 0], noise, scheme="etkf", space="observation")
-    clean = TensorDict({"info": {"innovation": result.innovation, "nis": result.nis}}, [count]).reshape(600, 100)
+    clean = TensorDict({"info": {"innovation": result.innovation, "nis": result.nis}}, [count]).reshape(1200, 50)
     watch = InnovationMonitor({"gps": MonitoredSensor("info", dim)}, window=1).double()
     naive = (watch.replay(clean)["monitor", "gps", "p_value"] < 0.01).double().mean()
     assert naive > 0.08  # eight times as many as promised
-    watch.calibrate([clean[:300]])
+    watch.calibrate([clean[:600]])
     for rate in (0.2, 0.01):
         # The value that Hotelling's distribution exceeds at this rate gets this p-value.
         factor = (members - 1) * dim / (members - dim) * (1 + 1 / members)
         value = torch.tensor([[factor * f_distribution.isf(rate, dim, members - dim)]], dtype=torch.float64)
         one = TensorDict({"info": {"innovation": value.sqrt().expand(1, dim), "nis": value}}, [1])
         assert watch.replay(one)["monitor", "gps", "p_value"].item() == pytest.approx(rate, rel=0.1)
-    fresh = watch.replay(clean[300:])["monitor", "gps", "p_value"]
+    fresh = watch.replay(clean[600:])["monitor", "gps", "p_value"]
     assert within_binomial_error((fresh < 0.01).double().mean().item(), 0.01, 30_000, 6.0)  # both sides are samples
 
 
@@ -194,17 +194,17 @@ def test_a_marked_beginning_forgets():
 def test_a_claimed_noise_that_jumps_raises_the_alarm():
     """A sensor that says itself that it sees nothing has innovations that are too small, not too large."""
     generator = torch.Generator().manual_seed(0)
-    noise = torch.exp(0.3 * torch.randn(4, 300, 1, generator=generator))
-    innovation = noise.sqrt() * torch.randn(4, 300, 1, generator=generator)
+    noise = torch.exp(0.3 * torch.randn(12, 100, 1, generator=generator))
+    innovation = noise.sqrt() * torch.randn(12, 100, 1, generator=generator)
     nis = innovation.square() / noise
-    data = TensorDict({"info": {"innovation": innovation, "nis": nis}, "sensor": {"noise": noise}}, [4, 300])
+    data = TensorDict({"info": {"innovation": innovation, "nis": nis}, "sensor": {"noise": noise}}, [12, 100])
     sensor = MonitoredSensor("info", 1, noise_key=("sensor", "noise"))
     watch = InnovationMonitor({"camera": sensor}).calibrate([data])
     blind = data.clone()
-    blind["sensor", "noise"][:, 200:] *= 50
-    blind["info", "nis"][:, 200:] /= 50
-    assert not watch.replay(data)["monitor", "alarm"][:, 200:].any()
-    assert watch.replay(blind)["monitor", "alarm"][:, 202:].all()
+    blind["sensor", "noise"][:, 60:] *= 50
+    blind["info", "nis"][:, 60:] /= 50
+    assert not watch.replay(data)["monitor", "alarm"][:, 60:].any()
+    assert watch.replay(blind)["monitor", "alarm"][:, 62:].all()
 
 
 def test_wrong_arguments_are_named():

@@ -71,10 +71,12 @@ def test_the_package_is_what_runs(packages):
     def fail(*_):
         raise RuntimeError("it runs")
 
-    plain, packaged = envs(packages, "action")
-    hook = packages["action"][0]["transition"].register_forward_pre_hook(fail)
-    assert packaged.rollout(3)["next", "belief", "mean"].isfinite().all()
-    assert_refused(RuntimeError, "it runs", plain.rollout, 3)
+    filter, path, _, _ = packages["[3]"]
+    plain, packaged = (packaged_env(filter, step, batch_size=[3]) for step in (None, load_step(path)))
+    rows = [env.rand_action(env.reset()) for env in (plain, packaged)]
+    hook = filter["transition"].register_forward_pre_hook(fail)
+    assert packaged.step(rows[1])["next", "belief", "mean"].isfinite().all()
+    assert_refused(RuntimeError, "it runs", plain.step, rows[0])
     hook.remove()
 
 
