@@ -173,7 +173,7 @@ def collected(kind, policy, *, envs):
         collector.shutdown()
 
 
-@pytest.mark.parametrize("kind", [Collector, MultiSyncCollector])
+@pytest.mark.parametrize("kind", [Collector, pytest.param(MultiSyncCollector, marks=pytest.mark.slow)])
 def test_collectors_keep_it(kind):
     """The second batch goes on in the middle of episodes."""
     policy = make_policy(toy_denkf())
