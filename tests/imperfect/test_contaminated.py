@@ -293,6 +293,7 @@ def test_masks_are_heeded(name):
     assert_close(out["belief", key][1], td["forecast", key][1], rtol=0, atol=1e-14)
     for score in ("nis", "log_likelihood", "outlier"):
         assert out["info", score][1].item() == 0
+    assert update_of(inner, 0.3)(td.clone())["info", "outlier"][1].item() == 0
     loss = out["belief", "mean"].sum() + out["info", "log_likelihood"].sum() + out["info", "nis"].sum()
     (gradient,) = torch.autograd.grad(loss, share)
     assert gradient.isfinite().all()
