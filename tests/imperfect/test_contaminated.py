@@ -430,3 +430,11 @@ def test_a_turn_more_is_the_same_reading(name, share):
     out, other = update(td), update(turned)
     for key in (("belief", "mean"), ("belief", "var"), ("info", share), ("info", "log_likelihood")):
         assert_close(out[key], other[key])
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.3, 0.4])
+def test_particles_of_a_missing_observation_keep_their_weights_bit_for_bit(share):
+    td = several().float().set("observed", torch.zeros(3, 1, dtype=torch.bool))
+    contaminated = around("particles", lambda inner: Contaminated(inner, share)).float()
+    expected = around("particles").float()(td.clone())["belief", "log_weight"]
+    assert contaminated(td.clone())["belief", "log_weight"].equal(expected)
