@@ -34,14 +34,7 @@ from torch_denkf.modules import (
     UKFTransition,
 )
 from torch_denkf.monitoring import Gated, GatedAnalysis
-from torch_denkf.objectives import (
-    DEnKFLoss,
-    GaussianLoss,
-    MixtureLoss,
-    ObservationLoss,
-    SensorLoss,
-    TransitionLoss,
-)
+from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from torch_denkf.smoothers import FixedLag
 
 B, T, E = 3, 14, 12

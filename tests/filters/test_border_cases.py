@@ -6,16 +6,9 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
 from tests.filters.beliefs_for_tests import BELIEF, COV, ENSEMBLE, MEAN, VAR, close
-from tests.filters.factories import (
-    linear_denkf,
-    linear_kalman,
-    toy_denkf,
-    toy_frames,
-)
+from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf, toy_frames
 from tests.transforms.envs_for_tests import base_env
-from torch_denkf.modules import (
-    EnsembleAnalysis,
-)
+from torch_denkf.modules import EnsembleAnalysis
 from torch_denkf.transforms import DEnKFTransform
 
 # --------------------------------------------------------------------------------------------------- stored beliefs

@@ -13,13 +13,7 @@ from tests.filters.composed import FEATURES, B, E, ReplayedFrames, S, T, compose
 from tests.filters.factories import NoisyLinear, linear_kalman, linear_system, stepwise
 from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.filters import Filter
-from torch_denkf.modules import (
-    ConstantNoise,
-    EnsembleAnalysis,
-    GaussianPrior,
-    LinearObservation,
-    VectorSensor,
-)
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LinearObservation, VectorSensor
 from torch_denkf.transforms import DEnKFTransform
 
 BELIEF = [("belief", name) for name in ("ensemble", "mean", "var")]

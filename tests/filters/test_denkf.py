@@ -7,10 +7,7 @@ from torch import nn
 
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
 from torch_denkf.filters import DEnKF
-from torch_denkf.modules import (
-    ConstantNoise,
-    LinearObservation,
-)
+from torch_denkf.modules import ConstantNoise, LinearObservation
 from torch_denkf.modules.stochastic import FlipoutLinear
 
 

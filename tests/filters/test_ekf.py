@@ -18,10 +18,7 @@ from tests.filters.gaussian_for_tests import (
     minimise,
     prior,
 )
-from torch_denkf.modules import (
-    CholeskyNoise,
-    ConstantNoise,
-)
+from torch_denkf.modules import CholeskyNoise, ConstantNoise
 from torch_denkf.objectives import GaussianLoss
 
 ALL = pytest.mark.parametrize("name", FILTERS)

@@ -7,14 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.beliefs_for_tests import BELIEF, ENSEMBLE, MEAN, VAR, close
-from tests.filters.factories import (
-    NoisyLinear,
-    linear_denkf,
-    linear_kalman,
-    linear_system,
-    linear_with,
-    random_draws,
-)
+from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system, linear_with, random_draws
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.particle_for_tests import bootstrap
 from tests.filters.test_several_analyses import reads

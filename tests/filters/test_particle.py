@@ -7,13 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.differences_for_tests import check_largest_gradients
-from tests.filters.factories import (
-    NoisyLinear,
-    assert_equal,
-    linear_system,
-    random_draws,
-    toy_frames,
-)
+from tests.filters.factories import NoisyLinear, assert_equal, linear_system, random_draws, toy_frames
 from tests.filters.particle_for_tests import BELIEF, SCHEMES, E, bootstrap, toy_filter
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.modules import ConstantNoise, GaussianLikelihood, LinearObservation

@@ -6,10 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.beliefs_for_tests import COV, MEAN, close
-from tests.filters.factories import (
-    NoisyLinear,
-    linear_system,
-)
+from tests.filters.factories import NoisyLinear, linear_system
 from tests.filters.gaussian_for_tests import linear_filter
 from torch_denkf.filters import EKF, UKF, KalmanFilter
 from torch_denkf.modules import ConstantNoise, LinearObservation, MomentPrior

@@ -124,12 +124,7 @@ def test_black_pictures_and_readings_that_cannot_be_true(float64, where):
         filter = Filter({**parts, "sensor": sensor}, initial=plain.initial)
     elif where == "DEnKF":
         filter = DEnKF(
-            parts["transition"],
-            sensor,
-            parts["observation"],
-            parts["noise"],
-            parts["analysis"],
-            initial=plain.initial,
+            parts["transition"], sensor, parts["observation"], parts["noise"], parts["analysis"], initial=plain.initial
         )
     else:
         fused = FusedSensor(parts["observation"], parts["noise"], sensor=sensor)

@@ -14,12 +14,7 @@ from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import PairObservation, with_history
 from torch_denkf.filters import Filter
-from torch_denkf.modules import (
-    AroundState,
-    ConstantNoise,
-    EnsembleAnalysis,
-    Select,
-)
+from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, Select
 from torch_denkf.transforms import DEnKFTransform
 
 # ------------------------------------------------------------------------------------------------ resets that update

@@ -19,13 +19,7 @@ from tests.filters.factories import (
     toy_frames,
 )
 from torch_denkf.filters import DEnKF
-from torch_denkf.modules import (
-    ConstantNoise,
-    EnsembleAnalysis,
-    LearnedObservation,
-    LinearObservation,
-    StochasticMLP,
-)
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, LearnedObservation, LinearObservation, StochasticMLP
 
 SCHEMES = ["sensor", "perturbed", "etkf", "sakov"]
 BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]

@@ -214,9 +214,7 @@ def test_steps_lead_there_and_back(space):
     torch.testing.assert_close(space.distance(moved, point), tangent.norm(dim=-1), rtol=0, atol=1e-11)
     first, second = points(space, 3, 20), points(space, 3, 20)
     assert_same_points(
-        space,
-        space.compose(space.compose(first, second), point),
-        space.compose(first, space.compose(second, point)),
+        space, space.compose(space.compose(first, second), point), space.compose(first, space.compose(second, point))
     )
     noise, std = torch.randn_like(tangent), torch.rand(space.tangent_dim)
     assert space.perturb(point, std, noise).equal(space.plus(point, std * noise))

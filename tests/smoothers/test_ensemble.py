@@ -20,12 +20,7 @@ from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.smoothing.ensemble import enrts_smooth, enrts_step
 from torch_denkf.imperfect import RejectReadings
-from torch_denkf.modules import (
-    ConstantNoise,
-    EnsembleAnalysis,
-    GaussianPrior,
-    LinearObservation,
-)
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LinearObservation
 from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
 

@@ -3,12 +3,7 @@
 import pytest
 import torch
 
-from torch_denkf.functional.kernels.small_system import (
-    LARGEST,
-    LARGEST_FACTOR,
-    WrittenOut,
-    made_once,
-)
+from torch_denkf.functional.kernels.small_system import LARGEST, LARGEST_FACTOR, WrittenOut, made_once
 from torch_denkf.functional.linalg import cholesky
 
 
