@@ -5,7 +5,6 @@ import shutil
 
 import pytest
 import torch
-from torch.distributions import MultivariateNormal
 
 from tests.functional.checks import assert_refused
 from torch_denkf.functional import analyse, ensemble_mean, kalman_update
@@ -67,7 +66,11 @@ def test_schemes_reproduce_the_kalman_update(sizes, batch, mask, space):
     problem = Problem(*sizes, batch, mask=mask)
     expected = problem.kalman()
     rotation = random_rotation(sizes[0], batch, generator=problem.generator, dtype=torch.float64)
-    for scheme, options in [("etkf", {}), ("etkf", {"rotation": rotation}), ("sakov", {}), ("perturbed", {})]:
+    for scheme, options in [
+        ("etkf", {}),
+        ("etkf", {"rotation": rotation}),
+        *((name, {}) for name in SCHEMES if name != "etkf"),
+    ]:
         result = problem.analyse(scheme, space=space, **options)
         torch.testing.assert_close(ensemble_mean(result.ensemble), expected.mean, **EXACT)
         torch.testing.assert_close(result.innovation, expected.innovation, **EXACT)
@@ -121,16 +124,6 @@ def test_sensor_scheme_is_the_papers_equations(sizes, space):
 
 
 @pytest.mark.parametrize("space", SPACES)
-@pytest.mark.parametrize("sizes", SIZES)
-def test_log_likelihood_is_that_of_the_innovation(sizes, space):
-    problem = Problem(*sizes, (2,))
-    covariance = ensemble_cov(problem.predicted) + problem.noise.diag_embed()
-    result = problem.analyse("sensor", space=space)
-    expected = MultivariateNormal(ensemble_mean(problem.predicted), covariance).log_prob(problem.samples.mean(-2))
-    torch.testing.assert_close(result.log_likelihood.squeeze(-1), expected, **EXACT)
-
-
-@pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize(("scheme", "rotated"), [*((scheme, False) for scheme in SCHEMES), ("etkf", True)])
 def test_unobserved_rows_come_back_bit_for_bit(scheme, rotated, space):
     problem = Problem(6, 4, 3, (2,), dtype=torch.float32)
@@ -167,17 +160,6 @@ def test_tiny_noise_gives_finite_gradients(scheme, sizes, dtype, noise):
     result = problem.analyse(scheme)
     gradients = torch.autograd.grad(sum(value.square().sum() for value in result), inputs)
     assert all(value.isfinite().all() for value in (*result, *gradients))
-
-
-@pytest.mark.parametrize("sizes", SIZES)
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_single_precision_follows_double(scheme, sizes):
-    # Condition numbers below 1e4 times the unit round-off 6e-8: three digits; seen: about 1e-5.
-    expected = Problem(*sizes, (3,)).analyse(scheme)
-    result = Problem(*sizes, (3,), dtype=torch.float32).analyse(scheme)
-    for ours, theirs in zip(result, expected, strict=True):
-        assert ours.dtype == torch.float32
-        torch.testing.assert_close(ours, theirs.float(), rtol=1e-3, atol=1e-3)
 
 
 def test_perturbations_drawn_here_follow_the_seed_and_have_the_noise_variance():
