@@ -24,12 +24,11 @@ from tests.filters.factories import (
 from tests.filters.gaussian_for_tests import CONTROL, linear_filter
 from tests.filters.gaussian_for_tests import FILTERS as GAUSSIAN_FILTERS
 from tests.filters.particle_for_tests import bootstrap
-from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
 from torch_denkf.baselines import LSTMFilter
 from torch_denkf.envs.linear import LinearGaussianEnv
-from torch_denkf.filters import DEnKF, Filter
+from torch_denkf.filters import Filter
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis
-from torch_denkf.modules.observation import LinearObservation, Select
+from torch_denkf.modules.observation import LinearObservation
 from torch_denkf.transforms import DEnKFTransform
 
 BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
@@ -62,31 +61,6 @@ def test_nested_sequences_are_the_flat_filter(float64):
     with pytest.raises(KeyError, match=r"'noise', 'sensor'.* is noise of no module"):
         nested.sequence(of_flat)
     assert_equal(stepwise(nested, frames), nested.sequence(frames.copy()), BELIEF, atol=1e-12)
-
-
-def test_motion_behind_the_analysis(float64):
-    # The velocities of every step are those of the analysis, and the pose is their sum from the start.
-    members = torch.randn(6, 5)
-    filter = DEnKF(
-        UnicycleTransition(torch.nn.Linear(2, 2), 0.1),
-        None,
-        Select([3, 4]),
-        ConstantNoise([0.5, 0.5], in_key="y"),
-        TensorDictSequential(
-            EnsembleAnalysis("etkf", observation_key="y", belief_prefix="analysis"), UnicycleMotion(0.1)
-        ),
-        initial=FixedEnsemble(members),
-    )
-    frames = TensorDict({"y": torch.randn(3, 9, 2), "is_init": torch.zeros(3, 9, 1, dtype=torch.bool)}, [3, 9])
-    frames["is_init"][:, 0] = frames["is_init"][1, 4] = True
-    out = filter.sequence(frames.copy())
-    assert_equal(stepwise(filter, frames), out, BELIEF)
-    belief, velocity = out["belief", "ensemble"], out["analysis", "ensemble"][..., 3:]
-    going = ~frames["is_init"].squeeze(-1)
-    assert belief[..., 3:][going].equal(velocity[going])
-    heading = members[:, 2] + 0.1 * velocity[0, 1:, :, 1].sum(0)
-    torch.testing.assert_close(belief[0, -1, :, 2], heading, rtol=0, atol=1e-13)
-    assert belief[1, 4].equal(members)
 
 
 def test_a_filter_with_other_keys(float64):
@@ -136,7 +110,18 @@ def test_a_state_dict_is_all_that_is_learned(float64):
     assert_equal(fresh.sequence(frames.copy()), expected, filter.out_keys)
 
 
-# ------------------------------------------------------------------------------------------------ compilation
+def test_keep_returns_what_is_asked_for(float64):
+    filter, frames = toy_denkf(), toy_frames((2, 3))
+    filter.draw_noise(frames)
+    expected = filter.sequence(frames.copy())
+    for chunk in (0, 2):
+        filter.compile(chunk=chunk, backend="eager")
+        for keep in ([BELIEF[1], ("sensor", "ensemble"), ("info", "nis")], BELIEF[:0:-1]):
+            out = filter.sequence(frames.copy(), keep=keep)
+            assert set(out.exclude(*frames.keys()).keys(True, True)) == set(keep)
+            assert_equal(out, expected, keep, atol=1e-12)
+    with pytest.raises(ValueError, match=r"keep names \['nothing'\]"):
+        filter.sequence(frames, keep=["nothing"])
 
 
 # ----------------------------------------------------------------------------------------------- in a policy

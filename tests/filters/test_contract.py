@@ -163,9 +163,9 @@ def test_steps_are_the_sequence(float64, name, width):
         row = frames[:, t].copy().update(row.select(*filter.carry_keys))
         row = filter(row)  # a start starts anew
         rows.append(row)
-    assert_equal(torch.stack(rows, 1), expected, filter.belief_keys, atol=1e-10)
+    assert_equal(torch.stack(rows, 1), expected, filter.out_keys, atol=1e-10)
     with set_recurrent_mode(True):
-        assert_equal(filter(frames.copy()), expected, filter.belief_keys)
+        assert_equal(filter(frames.copy()), expected, filter.out_keys)
 
 
 @some_filters
@@ -199,6 +199,18 @@ def test_what_is_not_observed_may_be_anything(float64, name, width):
     assert_equal(broken, expected, filter.belief_keys)
     broken["belief", "mean"].sum().backward()
     assert leaf.grad.isfinite().all()
+
+
+@every_filter
+def test_a_step_without_a_reading_is_the_forecast(float64, name):
+    filter, frames = with_noise(name, 3, 2)
+    row = frames[:, 1].copy().update(filter.initialise(frames[:, 0].copy()).select(*filter.carry_keys))
+    hidden = filter.step(row.copy().set("observed", torch.zeros(3, 1, dtype=torch.bool)))
+    out = filter.predict(row.exclude("observation", "observed"))
+    assert_equal(out, hidden, filter.belief_keys, atol=1e-12)
+    assert out.get("observation", None) is None
+    with pytest.raises(KeyError, match="'observation'"):
+        filter.step(row.exclude("observation"))
 
 
 @every_filter

@@ -206,13 +206,15 @@ def test_of_a_pose_that_is_not_known_nothing_moves():
     assert out["info", "nis"][1].item() == 0
 
 
-@pytest.mark.parametrize("name", [name for name in SPACES if name != "numbers"])
+@pytest.mark.parametrize("name", SPACES)
 def test_covariances_of_members_are_of_tangents(name):
     """Also at a start, where they follow from the members."""
     space, data = SPACES[name], frames(SPACES[name])[0][0, :1].exclude("observed")
     filter = make("etkf", space)
     analysis = EnsembleAnalysis("etkf", space=space, reading_space=space, observation_key="pose", covariance=True)
-    out = filtered(filter.with_modules(analysis=analysis), data.unsqueeze(0))[0]
+    filter = filter.with_modules(analysis=analysis)
+    assert ("belief", "cov") in filter.belief_keys
+    out = filtered(filter, data.unsqueeze(0))[0]
     away = space.minus(out["belief", "ensemble"], space.mean(out["belief", "ensemble"]).unsqueeze(-2))
     expected = away.mT @ away / (E - 1)
     torch.testing.assert_close(out["belief", "cov"], expected, rtol=0, atol=1e-3)  # an update's mean is rounded

@@ -6,7 +6,6 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.modules import set_recurrent_mode
 
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import (
@@ -71,53 +70,6 @@ def test_noise_that_depends_on_the_action_is_no_transition(float64, place):
     frames["is_init"] = torch.zeros(2, 6, 1, dtype=torch.bool)
     frames["is_init"][:, 0] = True
     torch.testing.assert_close(stepwise(filter, frames)[MEAN], out[MEAN], rtol=0, atol=1e-12)
-
-
-# ------------------------------------------------------------------------------------------------ marks, known beliefs
-
-
-def test_a_mark_at_a_known_belief_goes_on_in_a_step_as_in_a_sequence(float64):
-    """A slice of a policy's data begins with ``is_init``, as SliceSampler marks it, and with the belief before it."""
-    filter = linear_kalman()
-    row = TensorDict({"observation": torch.randn(3, 2)}, [3])
-    row["is_init"] = torch.tensor([[True], [True], [False]])
-    row["previous", "known"] = torch.tensor([[True], [False], [True]])
-    before = filter.initialise(row.copy())
-    for key in filter.carry_keys:
-        row["previous", *key] = before[key] + (1.0 if key[-1] == "mean" else 0.0)
-    step = filter(row.copy())
-    with set_recurrent_mode(True):
-        sequence = filter(row.unsqueeze(-1).copy())[:, 0]
-    for key in filter.out_keys:
-        torch.testing.assert_close(step[key], sequence[key], rtol=0, atol=1e-12)
-    fresh = filter.initialise(row.copy())
-    assert torch.equal(step[MEAN][1], fresh[MEAN][1])
-    assert not torch.equal(step[MEAN][0], fresh[MEAN][0])
-
-
-def test_an_episode_that_diverged_leaves_no_gradient_of_nan(float64):
-    """The belief before the second element is NaN, and the element begins an episode of its own."""
-    filter = linear_denkf(noisy=True)
-    weight = nn.Parameter(filter["transition"].matrix.clone())
-    del filter["transition"].matrix
-    filter["transition"].matrix = weight
-    frames = TensorDict({"observation": torch.randn(2, 4, 2)}, [2, 4])
-    for key in filter.carry_keys:
-        stored = torch.randn(2, 4, 6, 2)
-        stored[0, 2] = torch.nan
-        frames["previous", *key] = stored
-    frames["previous", "known"] = torch.ones(2, 4, 1, dtype=torch.bool)
-    frames["previous", "known"][0, 2] = False
-    frames["is_init"] = torch.zeros(2, 4, 1, dtype=torch.bool)
-    frames["is_init"][0, 2] = True
-    row = frames[:, 2].copy()
-    filter(row)[MEAN].sum().backward()
-    assert weight.grad.isfinite().all()
-    assert weight.grad.abs().sum() > 0
-    weight.grad = None
-    filter.sequence(frames[:, 2:].copy())[MEAN].sum().backward()
-    assert weight.grad.isfinite().all()
-    assert weight.grad.abs().sum() > 0
 
 
 # -------------------------------------------------------------------------------------------- readings in policies

@@ -7,8 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.beliefs_for_tests import BELIEF, ENSEMBLE, MEAN, VAR, close
-from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system, linear_with, random_draws
-from tests.filters.gaussian_for_tests import linear_filter
+from tests.filters.factories import NoisyLinear, linear_denkf, linear_system, linear_with, random_draws
 from tests.filters.particle_for_tests import bootstrap
 from tests.filters.test_several_analyses import reads
 from tests.filters.two_readings_for_tests import parts_of_reading
@@ -25,24 +24,6 @@ def test_noise_that_is_given_and_is_not_finite_is_named():
     td["noise", "transition"][3, 1] = torch.inf
     with pytest.raises(ValueError, match=r"NaN or infinity in \[\('noise', 'transition'\)\]"):
         filter.step(td)
-
-
-@pytest.mark.parametrize(
-    "make",
-    [linear_denkf, linear_kalman, lambda: bootstrap(50), *(lambda n=n: linear_filter(n) for n in ("EKF", "UKF"))],
-)
-def test_a_step_without_a_frame_is_the_forecast(float64, make):
-    filter = make()
-    td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
-    hidden = td.copy().set("observed", torch.tensor([False]))
-    torch.manual_seed(0)
-    expected = filter.step(hidden)
-    torch.manual_seed(0)
-    out = filter.predict(td.exclude("observation"))
-    close(out, expected, filter.belief_keys)
-    assert out.get("observation", None) is None
-    with pytest.raises(KeyError, match="'observation'"):
-        filter.step(td.exclude("observation"))
 
 
 @pytest.mark.parametrize("observed", [None, True])

@@ -48,16 +48,6 @@ def test_an_update_at_a_reset_sees_nothing_of_the_episode_before(float64, histor
     close(whole, halves, filter.belief_keys)
 
 
-def test_elements_without_a_belief_before_them_do_not_count_as_steps():
-    filter = linear_denkf()
-    data = TensorDict({"observation": torch.randn(9, 2)}, [9])
-    data["previous", "belief", "ensemble"] = torch.randn(9, 6, 2)
-    data["previous", "known"] = torch.tensor([0, 1, 1, 1, 0, 1, 1, 1, 1]).bool().unsqueeze(-1)
-    assert filter.stepped(data).equal(data["previous", "known"].squeeze(-1))
-    assert filter.stepped(data.exclude(("previous", "known"))).all()
-    assert not filter.stepped(data.exclude("previous"))[0]
-
-
 # ------------------------------------------------------------------------------------------------ nested sequences
 
 
@@ -138,32 +128,23 @@ def test_a_buffer_that_filters_before_its_slices_are_marked_is_refused():
 
 # ---------------------------------------------------------------------------------------------------- marks in data
 
-
-def marked(*entries):
-    """Readings of nine steps with a mark at the fourth, and those with ``is_init`` at the fifth."""
-    frames = TensorDict({"observation": torch.randn(9, 2)}, [9])
-    ends = torch.zeros(9, 1, dtype=torch.bool)
-    ends[3] = True
-    starts = torch.zeros(9, 1, dtype=torch.bool)
-    starts[[0, 4]] = True
-    return frames.copy().update(dict.fromkeys(entries, ends)), frames.set("is_init", starts)
+ENDS = [("next", "done"), ("next", "truncated"), "done", ("next", "agents", "done"), ("next", "agents", "truncated")]
 
 
-@pytest.mark.parametrize("mark", [("next", "done"), ("next", "truncated"), "done", ("next", "agents", "truncated")])
-def test_what_ends_an_episode_starts_the_next(float64, mark):
-    filter, (data, expected) = linear_denkf(), marked()
-    data[mark] = torch.zeros(9, *(2,) * ("agents" in mark), 1, dtype=torch.bool)
-    data[mark][3] = True
-    close(filter.sequence(data), filter.sequence(expected), [ENSEMBLE, MEAN])
-
-
-def test_marks_of_beginnings_stand_above_those_of_ends(float64):
+@pytest.mark.parametrize("mark", [*ENDS, ("agents", "is_init")])
+def test_what_ends_an_episode_starts_the_next_unless_beginnings_are_marked(float64, mark):
     """SliceSampler sets both; an environment's time limit alone ends nothing where is_init says so."""
-    filter, (data, _) = linear_denkf(), marked(("next", "done"))
-    plain = filter.sequence(data.select("observation").copy())
-    data["is_init"] = torch.zeros(9, 1, dtype=torch.bool)
-    data["is_init"][0] = True
-    close(filter.sequence(data), plain, [ENSEMBLE, MEAN])
+    filter, frames = linear_denkf(), TensorDict({"observation": torch.randn(2, 9, 2)}, [2, 9])
+    begins = torch.zeros(2, 9, 1, dtype=torch.bool)
+    begins[:, 0] = begins[1, 4] = True
+    marked = torch.zeros(2, 9, *[3] * ("agents" in mark), 1, dtype=torch.bool)
+    marked[1, 4 if "is_init" in mark else 3].view(-1)[-1] = True  # of one agent
+    data = frames.copy().set(mark, marked)
+    close(filter.sequence(data.copy()), filter.sequence(frames.copy().set("is_init", begins)), [ENSEMBLE, MEAN])
+    if "is_init" not in mark:
+        only = torch.zeros_like(begins)
+        only[:, 0] = True
+        close(filter.sequence(data.set("is_init", only)), filter.sequence(frames.copy()), [ENSEMBLE, MEAN])
 
 
 def test_other_modules_make_a_new_filter():

@@ -12,7 +12,6 @@ from tests.filters.factories import (
     S,
     assert_equal,
     linear_denkf,
-    linear_system,
     make_dyadic,
     stepwise,
     toy_denkf,
@@ -90,34 +89,6 @@ def test_update_at_reset_is_the_analysis_of_the_initial_belief(float64):
     assert plain["belief", "ensemble"][0].equal(filter.initial.members)
 
 
-def test_stored_belief_starts_the_sequence_and_is_not_updated_again(float64):
-    for update_at_reset in (False, True):
-        filter = linear_denkf(update_at_reset=update_at_reset)
-        frames = TensorDict({"observation": torch.randn(2, 10, 2)}, [2, 10])
-        whole = filter.sequence(frames.copy())
-        tail = filter.sequence(whole[:, 4:].copy())
-        assert tail["belief", "ensemble"][:, 0].equal(whole["belief", "ensemble"][:, 4])
-        assert_equal(tail, whole[:, 4:], BELIEF)
-        # An ensemble that was not stored: the sequence starts from the initial belief.
-        fresh = filter.sequence(whole[:, 4:].exclude(("belief", "ensemble")))
-        assert not fresh["belief", "mean"].equal(whole["belief", "mean"][:, 4:])
-        assert fresh["belief", "mean"].equal(filter.sequence(frames[:, 4:].copy())["belief", "mean"])
-
-
-def test_flat_slices_are_the_slices(float64):
-    filter = linear_denkf()
-    whole = filter.sequence(TensorDict({"observation": torch.randn(20, 2)}, [20]))
-    starts = [3, 11, 7]
-    slices = [whole[start : start + 5].copy() for start in starts]
-    flat = torch.cat(slices)
-    flat["is_init"] = (torch.arange(15) % 5 == 0).unsqueeze(-1)
-    torch.nn.init.normal_(flat["forecast", "ensemble"])  # what follows from the belief is computed anew
-    out = filter.sequence(flat)
-    expected = torch.cat([filter.sequence(part) for part in slices])
-    assert_equal(out, expected, [*BELIEF, ("forecast", "ensemble")])
-    assert_equal(out, torch.cat([whole[start : start + 5] for start in starts]), BELIEF)
-
-
 # ------------------------------------------------------------------------------------------------- controls
 
 
@@ -144,30 +115,6 @@ def test_action_is_read_one_step_earlier(float64):
     # A step takes the action that is in its tensordict.
     row = filter.step(filter.initialise(td[:, 0].copy()))
     torch.testing.assert_close(row["belief", "mean"], td["action"][:, 0], rtol=0, atol=1e-14)
-
-
-# ---------------------------------------------------------------------------------------------------- masks
-
-
-@pytest.mark.parametrize("scheme", ["etkf", "sakov"])
-@pytest.mark.parametrize("kept", [0, 1])
-def test_partial_mask_is_the_filter_of_the_remaining_dimensions(float64, scheme, kept):
-    both = linear_denkf(scheme)
-    one = DEnKF(
-        both["transition"],
-        None,
-        LinearObservation(both["observation"].matrix[[kept]]),
-        ConstantNoise(linear_system()[3][[kept]].sqrt(), in_key="observation"),
-        both["analysis"],
-        initial=both.initial,
-    )
-    readings = torch.randn(2, 10, 2)
-    observed = torch.tensor([kept == 0, kept == 1]).expand(2, 10, 2)
-    broken = torch.where(observed, readings, torch.nan)
-    masked = both.sequence(TensorDict({"observation": broken, "observed": observed}, [2, 10]))
-    single = one.sequence(TensorDict({"observation": readings[..., [kept]]}, [2, 10]))
-    # Cholesky factors of 2 x 2 with an identity row and of 1 x 1 may differ in the last digit.
-    assert_equal(masked, single, [*BELIEF, ("info", "nis"), ("info", "log_likelihood")], atol=1e-12)
 
 
 # ------------------------------------------------------------------------------------------------- gradients

@@ -197,8 +197,7 @@ def test_transport_without_regularisation_is_the_linear_programme():
     torch.testing.assert_close(out, expected, rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("dim", [1, 2])
-@pytest.mark.parametrize("epsilon", [0.1, 0.5])
+@pytest.mark.parametrize(("dim", "epsilon"), [(1, 0.1), (1, 0.5), (2, 0.5)])
 def test_transport_shrinks_the_spread_as_stated(dim, epsilon):
     # Quantiles of N(0, I) as particles, weighted with N(1, I): their weighted distribution is N(1/2, I/2), k^2 = 2.
     size = 400 if dim == 1 else 24
