@@ -141,7 +141,7 @@ def test_what_ends_an_episode_starts_the_next_unless_beginnings_are_marked(float
     marked[1, 4 if "is_init" in mark else 3].view(-1)[-1] = True  # of one agent
     data = frames.copy().set(mark, marked)
     close(filter.sequence(data.copy()), filter.sequence(frames.copy().set("is_init", begins)), [ENSEMBLE, MEAN])
-    if "is_init" not in mark:
+    if mark[0] == "next":
         only = torch.zeros_like(begins)
         only[:, 0] = True
         close(filter.sequence(data.set("is_init", only)), filter.sequence(frames.copy()), [ENSEMBLE, MEAN])

@@ -154,6 +154,3 @@ def test_a_stochastic_observation_model_draws_its_own_noise(float64, layer):
     assert_equal(stepwise(filter, frames), first, BELIEF, atol=1e-12)
     fresh = filter.sequence(frames.exclude(("noise", "observation")))
     assert not fresh["belief", "mean"].equal(first["belief", "mean"])
-    if layer == "dropout":
-        compiled = filter.compile(chunk=2, backend="eager").sequence(frames.copy())
-        assert_equal(compiled, first, BELIEF, atol=1e-12)
