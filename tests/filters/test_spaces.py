@@ -135,7 +135,7 @@ def numpy_ekf(data):
     """An error-state extended Kalman filter of one run, with scipy's rotations: means and covariances at each step."""
 
     def right(v):  # the right Jacobian
-        a, k = np.linalg.norm(v), np.cross(np.eye(3), -v)
+        a, k = np.linalg.norm(v), np.cross(np.eye(3), v)
         return np.eye(3) - (1 - np.cos(a)) / a**2 * k + (a - np.sin(a)) / a**3 * k @ k
 
     gyro, pose, seen, start = (data[key].numpy() for key in ("action", "pose", "observed", "start"))
@@ -244,7 +244,7 @@ def test_a_turned_world_turns_the_belief_and_nothing_else(kind, turn):
     here, there = turned_beliefs(filter, turn, data.clone())
     assert_turned(here, there, turn, 1e-8)
     close(there["info"], here["info"], ["log_likelihood"], atol=1e-8)
-    for smoother in SMOOTHERS.get(kind, []) if turn[3] else []:  # of one turn
+    for smoother in SMOOTHERS.get(kind, []) if turn[2] else []:  # of one turn
         assert_turned(*turned_beliefs(smoother(filter), turn, data.clone()), turn, 1e-8)
 
 

@@ -136,7 +136,7 @@ def iterated(size=8, key="pose", **options):
 
 def test_the_iterated_smoother_of_many_members_is_that_of_moments():
     """An extended Kalman filter is as good as exact here. The bound is ten standard errors of so many members."""
-    data, size = log(), 400
+    data, size = log(steps=8), 400
     expected = FixedLag(make("EKF"), 1).sequence(data.clone())
     torch.manual_seed(0)
     with torch.no_grad():
