@@ -68,16 +68,9 @@ def test_a_filter_with_other_keys(float64):
     plain = linear_denkf()
     F, _, H, R = linear_system()
 
-    class Renamed(NoisyLinear):
-        def __init__(self):
-            super().__init__(F)
-            self.in_keys, self.out_keys = [("two", "ensemble")], [("two_forecast", "ensemble")]
-
-    class RenamedStart(FixedEnsemble):
-        def __init__(self, members):
-            super().__init__(members)
-            self.out_keys = [("two", name) for name in ("ensemble", "mean", "var")]
-
+    motion, start = NoisyLinear(F), FixedEnsemble(plain.initial.members)
+    motion.in_keys, motion.out_keys = [("two", "ensemble")], [("two_forecast", "ensemble")]
+    start.out_keys = [("two", name) for name in ("ensemble", "mean", "var")]
     names = {
         "predicted_key": ("two_forecast", "y"),
         "noise_variance_key": "r",
@@ -85,13 +78,13 @@ def test_a_filter_with_other_keys(float64):
         "info_prefix": "i",
     }
     other = Filter(
-        Renamed(),
+        motion,
         LinearObservation(H, in_key=("two_forecast", "ensemble"), out_key=("two_forecast", "y")),
         ConstantNoise(R.sqrt(), in_key="y", out_key="r"),
         EnsembleAnalysis(
             "etkf", forecast_key=("two_forecast", "ensemble"), observation_key="y", observed_key="seen", **names
         ),
-        initial=RenamedStart(plain.initial.members),
+        initial=start,
         init_key="first",
     )
     y, seen, first = torch.randn(2, 7, 2), torch.rand(2, 7, 1) < 0.7, torch.rand(2, 7, 1) < 0.3

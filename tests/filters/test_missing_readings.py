@@ -7,10 +7,16 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.beliefs_for_tests import BELIEF, ENSEMBLE, MEAN, VAR, close
-from tests.filters.factories import NoisyLinear, linear_denkf, linear_system, linear_with, random_draws
+from tests.filters.factories import (
+    NoisyLinear,
+    linear_denkf,
+    linear_system,
+    linear_with,
+    parts_of_reading,
+    random_draws,
+)
 from tests.filters.particle_for_tests import bootstrap
 from tests.filters.test_several_analyses import reads
-from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter, ParticleFilter
 from torch_denkf.modules import ConstantNoise, FromSensor, GaussianPrior, LinearObservation
 from torch_denkf.modules.particles import with_weights

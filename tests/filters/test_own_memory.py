@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import nn
 
 from tests.filters.test_contract import FILTERS, every_filter, readings
@@ -68,21 +67,6 @@ def test_every_way_to_run_a_filter_writes_memory_of_its_own(float64, name, batch
     policy = filter(row)
     keys = [*filter.out_keys, *(("next", "previous", *key) for key in filter.carry_keys)]
     check_apart(filter, entries(policy, keys), before)
-
-
-def test_a_belief_that_is_written_to_leaves_the_next_episode_alone():
-    one = torch.eye(1)
-    filter = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
-    belief = filter.initialise(TensorDict({}, [3]))
-    belief["belief", "mean"][0] = 7.0
-    belief["belief", "cov"].mul_(100.0)
-    assert belief["belief", "mean"].flatten().tolist() == [7.0, 0.0, 0.0]
-    fresh = filter.initialise(TensorDict({}, [3]))
-    assert fresh["belief", "mean"].flatten().tolist() == [0.0, 0.0, 0.0]
-    assert fresh["belief", "var"].flatten().tolist() == [1.0, 1.0, 1.0]
-    assert one.item() == 1.0
-    step = filter.step(fresh.set("observation", torch.ones(3, 1)))
-    assert torch.allclose(step["belief", "mean"], torch.full((3, 1), 2 / 3))  # gain (1 + 1) / (1 + 1 + 1)
 
 
 # ------------------------------------------------------------------------------------------------------- constructors

@@ -9,8 +9,7 @@ from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
 from tests.filters.beliefs_for_tests import ENSEMBLE, MEAN, VAR, close
-from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_with
-from tests.filters.two_readings_for_tests import parts_of_reading
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_with, parts_of_reading
 from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import PairObservation, with_history
 from torch_denkf.filters import Filter

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 
 from tests.filters.factories import (
     OBS,
@@ -12,13 +13,23 @@ from tests.filters.factories import (
     S,
     assert_equal,
     linear_denkf,
+    linear_system,
+    linear_with,
     make_dyadic,
     stepwise,
     toy_denkf,
     toy_frames,
 )
+from tests.filters.test_forecasts import Reversed
 from torch_denkf.filters import DEnKF
-from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, LearnedObservation, LinearObservation, StochasticMLP
+from torch_denkf.modules import (
+    ConstantNoise,
+    EnsembleAnalysis,
+    FromSensor,
+    LearnedObservation,
+    LinearObservation,
+    StochasticMLP,
+)
 
 SCHEMES = ["sensor", "perturbed", "etkf", "sakov"]
 BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
@@ -87,6 +98,30 @@ def test_update_at_reset_is_the_analysis_of_the_initial_belief(float64):
     assert_equal(filter.sequence(td.unsqueeze(1)).squeeze(1), row, BELIEF)
     plain = linear_denkf().initialise(td.copy())
     assert plain["belief", "ensemble"][0].equal(filter.initial.members)
+
+
+def test_a_start_that_is_updated_needs_no_action(float64):
+    """The first observation of an episode comes before any action."""
+    plain = linear_denkf(update_at_reset=True)
+    driven = Reversed(linear_system()[0], torch.tensor([[0.5], [-1.0]]))
+    filter = linear_with({"transition": driven}, update_at_reset=True)
+    td = TensorDict({"observation": torch.randn(3, 2)}, [3])
+    start = filter.initialise(td.copy())
+    assert start.get(("forecast", "speed"), None) is None
+    torch.testing.assert_close(start[BELIEF[1]], plain.initialise(td.copy())[BELIEF[1]])
+
+
+def test_a_start_from_the_sensors_reading_runs_the_sensor(float64):
+    """Also where it is not updated with that frame: the initial belief reads what the frame modules write."""
+    *_, R = linear_system()
+    sensor = TensorDictModule(lambda raw: 2.0 * raw, ["raw"], ["observation"])
+    initial = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=20_000, observation_key="observation")
+    filter = linear_with({"sensor": sensor}, initial=initial)
+    out = filter.initialise(TensorDict({"raw": torch.tensor([[1.0, -3.0]])}, [1]))
+    # 5 standard errors of 20,000 members.
+    assert ((out[BELIEF[1]] - torch.tensor([2.0, -6.0])).abs() < 5 * (R / 20_000).sqrt()).all()
+    torch.testing.assert_close(out[BELIEF[2]][0], R, rtol=5 * (2 / 20_000) ** 0.5, atol=0)
+    assert filter.initialise({"raw": torch.zeros(2)})[BELIEF[1]].shape == (2,)
 
 
 # ------------------------------------------------------------------------------------------------- controls

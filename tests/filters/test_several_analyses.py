@@ -7,8 +7,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from tests.filters.beliefs_for_tests import ENSEMBLE, MEAN, VAR, close
-from tests.filters.factories import linear_denkf, linear_system, linear_with, stepwise
-from tests.filters.two_readings_for_tests import parts_of_reading
+from tests.filters.factories import linear_denkf, linear_system, linear_with, parts_of_reading, stepwise
 from torch_denkf.filters import Filter
 from torch_denkf.modules import SubModel
 
