@@ -35,9 +35,7 @@ R = torch.tensor([0.5, 0.2], dtype=torch.float64)
 FORECAST = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}
 
 
-@pytest.fixture(autouse=True)
-def double(float64):
-    """All in double precision: then the two are equal to rounding."""
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def system():

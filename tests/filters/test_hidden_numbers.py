@@ -46,9 +46,7 @@ KINDS = ("EKF", "UKF", "etkf", "perturbed", "particles", "fused", "gated", "lagg
 MEAN, VAR = ("belief", "mean"), ("belief", "var")
 
 
-@pytest.fixture(autouse=True)
-def _double(float64):
-    return
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 class Stays(SubModel):

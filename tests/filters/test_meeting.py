@@ -13,14 +13,11 @@ from tests.filters.factories import (
     NoisyLinear,
     linear_denkf,
     linear_kalman,
-    linear_with,
     random_walk,
     stepwise,
 )
 from torch_denkf.filters import Filter
-from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
-from torch_denkf.imperfect import RejectReadings
-from torch_denkf.modules import EnsembleAnalysis, LinearObservation, SubModel, Update
+from torch_denkf.modules import EnsembleAnalysis, LinearObservation, SubModel
 from torch_denkf.transforms import DEnKFTransform, LastAction
 
 MEAN = ("belief", "mean")
@@ -93,37 +90,6 @@ def test_readings_of_several_robots_are_not_averaged(make, way):
         match=r"'observation' is .* 1 dimension\(s\) too many. Readings of sev|observation must be \[\*B, E, O\]",
     ):
         run[way]()
-
-
-# ------------------------------------------------------------------------------------- an analysis of a user's own
-
-
-class Robust(Update):
-    """An ensemble update that trusts a reading the less, the further it is from what was predicted."""
-
-    def __init__(self):
-        reads = [("forecast", "ensemble"), ("forecast", "observation"), "observation", ("sensor", "noise")]
-        writes = [("belief", name) for name in ("ensemble", "mean", "var")]
-        super().__init__(nn.Identity(), reads, writes, optional_keys=["observed"])
-        self.reading_keys, self.observed_key = self.in_keys[2:], "observed"
-
-    def compute(self, forecast, predicted, reading, variance, observed=None):
-        ensemble = analyse(forecast, predicted, reading, variance, scheme="etkf", observed=observed).ensemble
-        return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)
-
-
-def robust():
-    return linear_with({}, analysis=Robust())
-
-
-def test_an_analysis_whose_reading_is_rejected(float64):
-    frames = TensorDict({"observation": torch.randn(2, 6, 2)}, [2, 6])
-    frames["observation"][0, 3] = torch.nan
-    seen = frames["observation"].isfinite()
-    out = robust().sequence(RejectReadings({"observation": "observed"})(frames.copy()))
-    expected = robust().sequence(frames.copy().set("observed", seen))
-    torch.testing.assert_close(out[MEAN], expected[MEAN], rtol=0, atol=1e-12)
-    assert out["info", "rejected"].sum() == 1
 
 
 # ------------------------------------------------------------------------------------------- groups that end alone

@@ -1,5 +1,7 @@
 """Tests that what a filter writes is its own memory, and that what it was given is copied."""
 
+from functools import partial
+
 import pytest
 import torch
 from torch import nn
@@ -72,6 +74,7 @@ def test_every_way_to_run_a_filter_writes_memory_of_its_own(float64, name, batch
 # ------------------------------------------------------------------------------------------------------- constructors
 
 MATRIX, VECTOR = (2, 2), (2,)
+noise = partial(ConstantNoise, [0.5, 0.5])
 #: Constructors, and the shapes of the constants that they take.
 TAKES = {
     "KalmanFilter": (
@@ -79,16 +82,10 @@ TAKES = {
         [MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, MATRIX],
     ),
     "BackpropKF": (
-        lambda a, b, c, d, e: BackpropKF(
-            a,
-            None,
-            c,
-            ConstantNoise([0.5, 0.5], in_key="observation"),
-            process_noise_cov=b,
-            initial=MomentPrior(d, e),
-            observation_key="observation",
+        lambda a, b, c: BackpropKF(
+            a, None, c, noise(), process_noise_cov=b, initial=MomentPrior([0.0] * 2, torch.eye(2))
         ),
-        [MATRIX, MATRIX, MATRIX, VECTOR, MATRIX],
+        [MATRIX, MATRIX, MATRIX],
     ),
     "GaussianPrior": (lambda a, b: GaussianPrior(a, b, ensemble_size=4), [VECTOR, VECTOR]),
     "AroundState": (lambda a: AroundState(a), [VECTOR]),

@@ -86,20 +86,6 @@ def test_reset_rows_get_the_initial_belief_and_others_do_not(float64):
     assert (out["belief", "ensemble"][~start] != members).any(-1).any(-1).all()
 
 
-def test_update_at_reset_is_the_analysis_of_the_initial_belief(float64):
-    filter = linear_denkf(update_at_reset=True)
-    td = TensorDict({"observation": torch.randn(3, 2)}, [3])
-    out = filter.initialise(td.copy())
-    row = filter.initial(td.copy())
-    row["forecast", "ensemble"] = row["belief", "ensemble"]
-    for name in ("noise", "observation", "analysis"):
-        row = filter[name](row)
-    assert_equal(out, row, BELIEF)
-    assert_equal(filter.sequence(td.unsqueeze(1)).squeeze(1), row, BELIEF)
-    plain = linear_denkf().initialise(td.copy())
-    assert plain["belief", "ensemble"][0].equal(filter.initial.members)
-
-
 def test_a_start_that_is_updated_needs_no_action(float64):
     """The first observation of an episode comes before any action."""
     plain = linear_denkf(update_at_reset=True)

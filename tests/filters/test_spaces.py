@@ -12,7 +12,7 @@ from torch import nn
 from tests.filters.beliefs_for_tests import close
 from torch_denkf.baselines import BackpropKF
 from torch_denkf.filters import EKF, UKF, DEnKF, ParticleFilter
-from torch_denkf.functional.manifolds import SO3, Circle, Euclidean, Opposite, Product
+from torch_denkf.functional.manifolds import SO3, Circle, Euclidean, Product
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import (
@@ -36,9 +36,7 @@ MEAN, VAR = ("belief", "mean"), ("belief", "var")
 KINDS = ("EKF", "UKF", "perturbed", "etkf", "significance", "fused", "gated", "particles")
 
 
-@pytest.fixture(autouse=True)
-def _double(float64):
-    return
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 class Turning(SubModel):
@@ -169,31 +167,6 @@ def test_ekf_is_that_of_numpy():
         away = SPACE.minus(out[MEAN][run], torch.from_numpy(means))
         assert away.abs().max() < 1e-9
         assert (out["belief", "cov"][run] - torch.from_numpy(covs)).abs().max() < 1e-9
-
-
-def test_a_circle_is_an_angle():
-    data = TensorDict({"pose": 3 + torch.randn(B, T, 2), "start": torch.full((B, T, 2), 3.0)}, [B, T])
-    parts = (
-        LearnedTransition(nn.Identity(), residual=False),
-        None,
-        Select([0, 1]),
-        ConstantNoise([0.3, 0.4], in_key="pose"),
-    )
-    start = GaussianAround([0.5, 0.6], state_key="start")
-    wraps = Product(Circle(), Euclidean(1))
-    for filter in (EKF, UKF):
-        options = {"process_noise": [0.1, 0.2], "observation_key": "pose", "initial": start}
-        one = filter(*parts, reading_space=wraps, **options).sequence(data.clone())
-        other = filter(*parts, reading_space=Opposite(wraps), **options).sequence(data.clone())  # not in closed form
-        close(one, other, [MEAN, ("belief", "cov"), ("info", "nis")])
-    around = AroundState([0.5, 0.6], ensemble_size=E, state_key="start")
-    options = {"process_noise": [0.1, 0.2], "initial": around}
-    one, other = (
-        DEnKF(*parts, EnsembleAnalysis("etkf", observation_key="pose", **told), **options)
-        for told in ({"reading_space": wraps}, {"reading_space": Opposite(wraps)})
-    )
-    noisy = with_noise(one, data)
-    close(one.sequence(noisy.clone()), other.sequence(noisy.clone()), [MEAN, VAR, ("info", "nis")])
 
 
 def test_particles_on_a_circle_are_a_grids():

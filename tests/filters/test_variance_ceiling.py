@@ -11,9 +11,7 @@ from torch_denkf.filters import KalmanFilter
 ENSEMBLE, MEAN, COV, VAR = (("belief", name) for name in ("ensemble", "mean", "cov", "var"))
 
 
-@pytest.fixture(autouse=True)
-def _double(float64):
-    torch.manual_seed(0)
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def unseen(*batch):

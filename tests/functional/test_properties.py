@@ -16,11 +16,13 @@ from torch_denkf.functional import (
     ensemble_var,
     kalman_predict,
     kalman_update,
+    sigma_points,
     transport_resample,
 )
 from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.functional.inflation import inflate, relax_to_prior_spread
 from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.unscented import unscented_moments, unscented_weights
 from torch_denkf.functional.weighted import weighted_mean
 
 SPACES = st.sampled_from(["observation", "ensemble"])
@@ -169,6 +171,23 @@ def test_inflation_keeps_the_mean(seed, batch, members, states, scale, factor, r
     wanted = (1 - relaxation) * ensemble_var(ensemble).sqrt() + relaxation * ensemble_var(forecast).sqrt()
     close(ensemble_mean(relaxed), ensemble_mean(ensemble), atol=1e-7)
     close(ensemble_var(relaxed).sqrt(), wanted)
+
+
+@FIXED
+@given(SEEDS, BATCHES, DIMS, SCALES, SCALES, DTYPES)
+def test_sigma_points_have_the_moments(seed, batch, states, scale, spread, dtype):
+    draw = Draw(seed)
+    mean, units = scale * draw.normal(*batch, states), draw.units(spread, states)
+    cov = draw.covariance(*batch, states) * units * units.unsqueeze(-1)
+    weights = unscented_weights(states, dtype=torch.float64)
+    points = sigma_points(mean, cov)
+    found, found_cov = unscented_moments(points, weights)
+    near = max(scale, spread)
+    torch.testing.assert_close(found / near, mean / near, rtol=1e-9, atol=1e-9)
+    limit = 1e-7 + 1e-13 * (scale / spread) ** 2  # what is left of a spread that is small beside the mean
+    outer = units * units.unsqueeze(-1)
+    torch.testing.assert_close(found_cov / outer, cov / outer, rtol=limit, atol=limit)
+    assert sigma_points(mean.to(dtype), cov.to(dtype)).dtype == dtype
 
 
 @FIXED

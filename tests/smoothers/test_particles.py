@@ -118,15 +118,6 @@ def test_gradients_are_those_of_finite_differences(float64):
     assert torch.autograd.gradcheck(backward_weights, [value.requires_grad_() for value in inputs])
 
 
-def test_densities_of_pairs(float64):
-    values, means, root = torch.randn(3, 4, 2), torch.randn(3, 4, 2), torch.randn(3, 2, 2)
-    cov = root @ root.mT + torch.eye(2)
-    found = log_density_of_pairs(values, means, cov)
-    for i in range(4):
-        for j in range(4):
-            assert_close(found[:, i, j], gaussian_log_prob(values[:, j], means[:, i], cov))
-
-
 @pytest.mark.parametrize("previous", [False, True])
 def test_each_step_uses_the_action_that_led_into_it(float64, previous):
     """The action stored at a time leads out of it; a policy's data store it one step later."""

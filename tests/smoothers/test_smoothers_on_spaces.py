@@ -26,7 +26,7 @@ from tests.smoothers.small_angles import PROCESS, STARTS, assert_small_differenc
 from torch_denkf.baselines import IEnKS
 from torch_denkf.filters import EKF, UKF, DEnKF, ParticleFilter
 from torch_denkf.functional.gaussian import gaussian_log_prob
-from torch_denkf.functional.manifolds import SO3
+from torch_denkf.functional.manifolds import SO3, Euclidean
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, SubModel
 from torch_denkf.smoothers import FixedLag, ParticleSmoother, RTSSmoother
 from torch_denkf.smoothers.particles import log_density_of_pairs
@@ -35,9 +35,7 @@ GAUSSIAN = {"EKF": EKF, "UKF": UKF}
 SMOOTHED = [("smoothed", "mean"), ("smoothed", "var")]
 
 
-@pytest.fixture(autouse=True)
-def _double(float64):
-    return
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def filter_of(kind, parts, own, std, q, space=None, reading_space=None, *, size=24, key="pose", **options):
@@ -117,14 +115,15 @@ def test_particles_are_the_smoother_of_moments():
     assert away.square().mean().sqrt() < 0.15 < 0.3 < before.square().mean().sqrt()
 
 
-def test_densities_of_pairs_are_those_of_their_tangents():
-    values, means = (SPACE.exp(torch.randn(B, 4, 6)) for _ in range(2))
-    root = torch.randn(B, 6, 6)
+@pytest.mark.parametrize("space", [None, SPACE])
+def test_densities_of_pairs_are_those_of_their_tangents(space):
+    on, root = Euclidean(6) if space is None else space, torch.randn(B, 6, 6)
+    values, means = (on.exp(torch.randn(B, 4, 6)) for _ in range(2))
     cov = root @ root.mT + torch.eye(6)
-    found = log_density_of_pairs(values, means, cov, SPACE)
+    found = log_density_of_pairs(values, means, cov, *([] if space is None else [space]))
     for i in range(4):
         for j in range(4):
-            away = SPACE.minus(values[:, j], means[:, i])
+            away = on.minus(values[:, j], means[:, i])
             due = gaussian_log_prob(away, torch.zeros_like(away), cov)
             torch.testing.assert_close(found[:, i, j], due.reshape(found[:, i, j].shape))
 
