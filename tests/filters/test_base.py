@@ -107,11 +107,8 @@ def test_keep_returns_what_is_asked_for(float64):
     filter, frames = toy_denkf(), toy_frames((2, 3))
     filter.draw_noise(frames)
     expected = filter.sequence(frames.copy())
-    for chunk, keep in (
-        (0, [BELIEF[1], ("sensor", "ensemble"), ("info", "nis")]),
-        (0, BELIEF[:0:-1]),
-        (1, BELIEF[:0:-1]),
-    ):
+    some, moments = [BELIEF[1], ("sensor", "ensemble"), ("info", "nis")], BELIEF[:0:-1]
+    for chunk, keep in ((0, some), (0, moments), (1, moments)):
         out = filter.compile(chunk=chunk, backend="eager").sequence(frames.copy(), keep=keep)
         assert set(out.exclude(*frames.keys()).keys(True, True)) == set(keep)
         assert_equal(out, expected, keep, atol=1e-12)

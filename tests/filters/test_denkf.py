@@ -1,13 +1,14 @@
 """Oracle: Table I of the paper, worked out by hand."""
 
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
-from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
+from tests.filters.factories import linear_denkf, linear_kalman
 from torch_denkf.filters import DEnKF
-from torch_denkf.modules import ConstantNoise, LinearObservation
 from torch_denkf.modules.stochastic import FlipoutLinear
 
 
@@ -78,27 +79,14 @@ def test_reference_is_the_authors_code():
 
 def test_the_mask_of_a_filters_default_analysis_can_be_named(float64):
     """Oracle: the mask under its usual name."""
-    F, Q, H, R = linear_system()
     frames = TensorDict({"observation": torch.randn(3, 6, 2), "gps_observed": torch.rand(3, 6, 2) < 0.5}, [3, 6])
-    renamed = frames.clone().rename_key_("gps_observed", "observed")
-    noise = ConstantNoise(R.sqrt(), in_key="observation")
-    initial = linear_denkf().initial
-    for make in (
-        lambda **keys: linear_kalman(**keys),
-        lambda **keys: DEnKF(
-            NoisyLinear(F, torch.linalg.cholesky(Q)),
-            None,
-            LinearObservation(H),
-            noise,
-            initial=initial,
-            observation_key="observation",
-            **keys,
-        ),
-    ):
+    usual, plain = frames.clone().rename_key_("gps_observed", "observed"), linear_denkf()
+    noise, options = plain["noise"], {"initial": plain.initial, "observation_key": "observation"}
+    for make in (linear_kalman, partial(DEnKF, plain["transition"], None, plain["observation"], noise, **options)):
         outs = []
-        for filter, given in ((make(), renamed), (make(observed_key="gps_observed"), frames)):
+        for filter, given in ((make(), usual), (make(observed_key="gps_observed"), frames)):
             torch.manual_seed(1)
             outs.append(filter.sequence(given.copy())["belief", "mean"])
         assert outs[0].equal(outs[1])
     with pytest.raises(ValueError, match="observed_key are for the default analysis"):
-        DEnKF(noise, None, noise, noise, linear_denkf()["analysis"], initial=initial, observed_key="gps_observed")
+        DEnKF(noise, None, noise, noise, plain["analysis"], initial=plain.initial, observed_key="gps_observed")

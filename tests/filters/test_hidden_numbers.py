@@ -195,15 +195,6 @@ def test_a_rotation_that_is_not_a_number_is_a_missing_reading(kind, name):
     assert all(one.isfinite().all() and one.any() for one in gradients)
 
 
-def test_of_a_pose_that_is_not_known_nothing_moves():
-    """Standing at (0.5, 50, 20), of which a reading lacks x."""
-    data = TensorDict({"start": torch.tensor([0.5, 50.0, 20.0]).expand(2, 3)}, [2])
-    data["pose"] = torch.tensor([0.5, NAN, 20.0]).expand(2, 3)
-    out = make("EKF", SE2()).sequence(RejectReadings({"pose": "observed"}, spaces={"pose": SE2()})(data))
-    assert out[MEAN][1].tolist() == [0.5, 50.0, 20.0]
-    assert out["info", "nis"][1].item() == 0
-
-
 @pytest.mark.parametrize("name", SPACES)
 def test_covariances_of_members_are_of_tangents(name):
     """Also at a start, where they follow from the members."""

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import nn
 
+from tests.filters.gaussian_for_tests import prior
 from tests.filters.test_contract import FILTERS, every_filter, readings
 from torch_denkf.baselines import BackpropKF
 from torch_denkf.filters import KalmanFilter
@@ -74,7 +75,7 @@ def test_every_way_to_run_a_filter_writes_memory_of_its_own(float64, name, batch
 # ------------------------------------------------------------------------------------------------------- constructors
 
 MATRIX, VECTOR = (2, 2), (2,)
-noise = partial(ConstantNoise, [0.5, 0.5])
+noise = partial(ConstantNoise, [0.5, 0.5], in_key="observation")
 #: Constructors, and the shapes of the constants that they take.
 TAKES = {
     "KalmanFilter": (
@@ -82,9 +83,7 @@ TAKES = {
         [MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, MATRIX],
     ),
     "BackpropKF": (
-        lambda a, b, c: BackpropKF(
-            a, None, c, noise(), process_noise_cov=b, initial=MomentPrior([0.0] * 2, torch.eye(2))
-        ),
+        lambda a, b, c: BackpropKF(a, None, c, noise(), process_noise_cov=b, initial=prior()),
         [MATRIX, MATRIX, MATRIX],
     ),
     "GaussianPrior": (lambda a, b: GaussianPrior(a, b, ensemble_size=4), [VECTOR, VECTOR]),

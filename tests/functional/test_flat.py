@@ -175,16 +175,6 @@ def test_what_a_mask_hides_may_be_nan():
     assert Euclidean(2).align(predicted, reading)[0] is predicted
 
 
-def test_the_mean_of_angles_is_that_of_deviations_from_their_direction():
-    samples = torch.tensor([[3.0, 1.0], [-3.0, 2.0], [-3.1, 6.0]])
-    expected = torch.tensor([(3.0 + (2 * math.pi - 3.0) + (2 * math.pi - 3.1)) / 3, 3.0])
-    mean = FIRST.mean(samples)
-    torch.testing.assert_close(mean.cos(), expected.cos(), rtol=0, atol=1e-12)
-    torch.testing.assert_close(mean.sin(), expected.sin(), rtol=0, atol=1e-12)
-    torch.testing.assert_close(mean[1], expected[1], rtol=0, atol=1e-12)
-    assert Euclidean(2).mean(samples).equal(samples.mean(0))
-
-
 def test_gradients_are_those_of_numbers_on_a_line():
     # The turn is a constant: the mean of a reading moves with each sample by 1/n.
     samples = (math.pi + 0.3 * torch.randn(6, 1)).requires_grad_()

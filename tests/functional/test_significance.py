@@ -108,21 +108,6 @@ def test_the_threshold_has_the_gradient_of_finite_differences(cases):
     assert math.isfinite(float(torch.autograd.grad(means(threshold).sum(), threshold)[0].sum()))
 
 
-def test_more_precise_readings_than_members_can_tell_apart_stay_positive_definite(float64):
-    """Twelve readings that are nearly exact, of eight members: products of factors with their matrix are indefinite."""
-    torch.manual_seed(3)
-    forecast = torch.randn(50, 8, 12)
-    noise = torch.full((50, 12), 1e-8)
-    result = analyse(forecast, forecast, torch.zeros(50, 12), noise, scheme="etkf", significance=1.0)
-    seen = (forecast - forecast.mean(-2, keepdim=True)) / (7 * noise).sqrt().unsqueeze(-2)
-    gram = seen.mT @ seen
-    factors = significant(gram, seen, seen, 1.0)
-    assert torch.linalg.eigvalsh(torch.eye(12) + gram * factors)[..., 0].min() < -1
-    assert (result.nis > 0).all()
-    assert result.ensemble.isfinite().all()
-    assert (result.ensemble.var(-2) < forecast.var(-2)).all()
-
-
 def test_a_local_analysis_weighs_by_the_factors(cases):
     """As its taper times the same factors, which have no gradient; finite differences of the threshold."""
     forecast, predicted, reading, noise = cases

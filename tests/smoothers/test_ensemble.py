@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch.testing import assert_close
 
 from tests.filters.factories import (
@@ -193,18 +192,6 @@ def test_gradients_of_a_step_are_those_of_finite_differences(float64, size):
         return enrts_step(before, forecast, forecast + weights @ (forecast - forecast.mean(-2, keepdim=True)))
 
     assert torch.autograd.gradcheck(smooth, inputs)
-
-
-def test_what_cannot_be_smoothed_says_so():
-    assert_refused(TypeError, "EnRTS takes a filter with an ensemble", EnRTS, linear_kalman())
-    assert_refused(TypeError, "EnKS takes a filter with an ensemble", EnKS, linear_kalman())
-    with pytest.raises(TypeError, match="takes a filter with a mean and a covariance; DEnKF carries"):
-        RTSSmoother(linear_denkf())
-    assert_refused(ValueError, "at least 1", FixedLag, linear_denkf(), 0)
-    assert_refused(ValueError, "lag must be a whole number, at least 0; got -1", EnRTS, linear_denkf(), -1)
-    assert_refused(TypeError, "carries a past already", FixedLag, FixedLag(linear_denkf(), 2), 2)
-    stored = linear_denkf().sequence(TensorDict({"observation": torch.zeros(4, 2)}, [4]))
-    assert_refused(KeyError, "stored without a lag", FixedLag(linear_denkf(), 2).sequence, stored)
 
 
 @pytest.mark.parametrize("smoother", [lambda f: FixedLag(f, 2), lambda f: EnKS(f, 2), EnRTS, RTSSmoother])

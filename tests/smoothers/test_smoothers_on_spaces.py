@@ -4,11 +4,9 @@ from functools import partial
 
 import pytest
 import torch
-from torch import nn
 
 from tests.filters.beliefs_for_tests import close
 from tests.filters.test_spaces import (
-    DT,
     SPACE,
     STD,
     B,
@@ -27,7 +25,7 @@ from torch_denkf.baselines import IEnKS
 from torch_denkf.filters import EKF, UKF, DEnKF, ParticleFilter
 from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.functional.manifolds import SO3, Euclidean
-from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, SubModel
+from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround
 from torch_denkf.smoothers import FixedLag, ParticleSmoother, RTSSmoother
 from torch_denkf.smoothers.particles import log_density_of_pairs
 
@@ -86,33 +84,6 @@ def test_online_lag_is_the_smoother(kind):
         assert (SPACE.minus(later["mean"], own["mean"]).abs() / std).max() < away
         assert (later["var"] / own["var"] - 1).abs().max() < var
         assert (online["smoothed", "age"][:, lag:] == lag).all()
-
-
-class GyroTurn(SubModel):
-    """Turns by what a gyro reads."""
-
-    def __init__(self):
-        super().__init__(nn.Identity(), [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
-
-    def compute(self, state, gyro):
-        return SO3().plus(state, DT * gyro.unsqueeze(-2))
-
-
-def test_particles_are_the_smoother_of_moments():
-    """Within 3.5 standard errors of as many draws as the fewest particles that ever counted; of orientations alone."""
-    data, size, std, q = log(steps=6, hidden=False), 600, [0.2] * 3, [0.1] * 3
-    data["start"], turn = data["state"][:, :1, :4].expand(B, 6, 4).contiguous(), GyroTurn()
-    parts = (turn, None, Orientation()), ConstantNoise([0.1] * 3, in_key="pose"), std, q, SO3(), SO3()
-    expected = RTSSmoother(filter_of("EKF", *parts))(data.clone())
-    torch.manual_seed(1)
-    with torch.no_grad():
-        out = ParticleSmoother(filter_of("particles", *parts, size=size))(data.clone())
-    ess = out["info", "ess"]
-    fewest, std = torch.where(ess > 0, ess, size).amin(1, keepdim=True), expected["smoothed", "var"].sqrt()
-    away, before = (SO3().minus(out[key, "mean"], expected["smoothed", "mean"]) / std for key in ("smoothed", "belief"))
-    assert (away.abs() < 3.5 / fewest.sqrt()).all()
-    assert ((out["smoothed", "var"] / std.square() - 1).abs() < 3.5 * (2 / fewest).sqrt()).all()
-    assert away.square().mean().sqrt() < 0.15 < 0.3 < before.square().mean().sqrt()
 
 
 @pytest.mark.parametrize("space", [None, SPACE])
