@@ -95,15 +95,8 @@ FILTERS = {
 }
 LAGGED = ("DEnKF etkf", "DEnKF significance", "DEnKF perturbed", "Kalman", "UKF", "particles, jitter")
 FILTERS |= {f"{name}, lag": partial(lambda inner: FixedLag(inner(), 3), FILTERS[name]) for name in LAGGED}
-FILTERS_WITHOUT_NOISE = {
-    "DEnKF etkf",
-    "DEnKF significance",
-    "Kalman",
-    "EKF",
-    "UKF",
-    "Backprop KF",
-    "LSTM",
-}  # of their own
+#: Of their own.
+FILTERS_WITHOUT_NOISE = {"DEnKF etkf", "DEnKF significance", "Kalman", "EKF", "UKF", "Backprop KF", "LSTM"}
 FILTERS_WITHOUT_NOISE |= {"fused Kalman, late", "fused Kalman, late, joint"}
 FILTERS_WITHOUT_NOISE |= {f"{name}, lag" for name in FILTERS_WITHOUT_NOISE}
 every_filter = pytest.mark.parametrize("name", FILTERS)

@@ -31,13 +31,9 @@ def test_paper_is_table_one():
     assert widths(noise) == [(2, 16), (16, 16), (16, 2)]
     # 50 x 150 halves (rounded up) to 25 x 75, 13 x 38, 7 x 19; 16 channels: 2128 features.
     assert widths(sensor["head"]) == [(2128, 64), (64, 64), (64, 32), (32, 32), (32, 2)]
-    assert [net.layer for net in (transition, observation, noise, sensor["head"])] == [
-        "dropout",
-        "none",
-        "none",
-        "dropout",
-    ]
-    assert all(isinstance(net.activation, nn.ReLU) for net in (transition, observation, noise, sensor["head"]))
+    networks = (transition, observation, noise, sensor["head"])
+    assert [net.layer for net in networks] == ["dropout", "none", "none", "dropout"]
+    assert all(isinstance(net.activation, nn.ReLU) for net in networks)
     trunk = [(c.in_channels, c.out_channels, c.kernel_size, c.stride) for c in sensor["trunk"] if hasattr(c, "stride")]
     assert trunk == [(6, 64, (7, 7), (2, 2)), (64, 32, (3, 3), (2, 2)), (32, 16, (3, 3), (2, 2))]
     # f: 192 + 1056 + 2112 + 4160 + 325; h: the same but 130 at the end; r: 48 + 272 + 34.

@@ -16,11 +16,6 @@ def test_float64_matrices_beside_float32_are_refused():
     F, Q, H, R = linear_system(torch.float64)
     with pytest.raises(TypeError, match=r"mean is torch.float32 and transition is torch.float64; convert one"):
         KalmanFilter(F, H, process_noise_cov=Q, noise=R.sqrt(), mean=torch.zeros(2), cov=torch.eye(2))
-    kf = KalmanFilter(
-        F, H, process_noise_cov=Q, noise=R.sqrt(), mean=torch.zeros(2).double(), cov=torch.eye(2).double()
-    )
-    frames = TensorDict({"observation": torch.randn(5, 2, dtype=torch.float64)}, [5])
-    assert kf.sequence(frames)[MEAN].dtype == torch.float64
 
 
 def test_float64_readings_are_refused_by_name():

@@ -15,6 +15,7 @@ from tests.smoothers.joint import drive, joint_beliefs
 from torch_denkf.baselines import LSTMFilter
 from torch_denkf.functional.smoothing.ensemble import enrts_step
 from torch_denkf.modules import GaussianPrior
+from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
 
 KINDS = {
@@ -114,6 +115,7 @@ REFUSED = [
     (TypeError, "damping must be a number", partial(EnRTS, damping="0.9"), linear_denkf),
     *((TypeError, "before and after a step", smoother, LSTM) for smoother in (partial(FixedLag, lag=2), RTSSmoother)),
     *((TypeError, "LSTMFilter carries", smoother, LSTM) for smoother in (EnKS, EnRTS)),
+    (ValueError, r"adapt_inflation=0.1.*damping=", EnRTS, lambda: Gated(linear_denkf(), adapt_inflation=0.1)),
     (TypeError, "EnRTS takes a filter with an ensemble", EnRTS, linear_kalman),
     (TypeError, "EnKS takes a filter with an ensemble", EnKS, linear_kalman),
     (TypeError, "takes a filter with a mean and a covariance; DEnKF carries", RTSSmoother, linear_denkf),

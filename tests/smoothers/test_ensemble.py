@@ -18,9 +18,7 @@ from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.smoothing.ensemble import enrts_smooth, enrts_step
-from torch_denkf.imperfect import RejectReadings
 from torch_denkf.modules import EnsembleAnalysis, GaussianPrior, LinearObservation
-from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
 
 MEMBERS = 10_000
@@ -172,11 +170,6 @@ def test_inflation_needs_a_damping(float64, lag):
     EnRTS(filter, lag)(frames.copy())
 
 
-def test_adapted_inflation_needs_a_damping():
-    gated = Gated(linear_denkf("etkf"), adapt_inflation=0.1)
-    assert_refused(ValueError, r"adapt_inflation=0.1.*damping=", EnRTS, gated)
-
-
 @pytest.mark.parametrize("size", [4, 7])
 def test_gradients_of_a_step_are_those_of_finite_differences(float64, size):
     """In state space (fewer dimensions than members) and in the members' space."""
@@ -192,15 +185,3 @@ def test_gradients_of_a_step_are_those_of_finite_differences(float64, size):
         return enrts_step(before, forecast, forecast + weights @ (forecast - forecast.mean(-2, keepdim=True)))
 
     assert torch.autograd.gradcheck(smooth, inputs)
-
-
-@pytest.mark.parametrize("smoother", [lambda f: FixedLag(f, 2), lambda f: EnKS(f, 2), EnRTS, RTSSmoother])
-def test_rejected_readings_are_missing_ones(float64, smoother):
-    filter = (linear_kalman if smoother is RTSSmoother else linear_denkf)()
-    frames = drive(2, 7, missing=0.0, resets=False)
-    masked = frames.copy()
-    masked["observed"] = frames["observed"].clone()
-    masked["observed"][:, 3, 0] = False
-    frames["observation"][:, 3, 0] = torch.nan
-    made, reject = smoother(filter), RejectReadings({"observation": "observed"}, by_component=["observation"])
-    assert made.sequence(reject(frames))["smoothed", "mean"].equal(made.sequence(masked)["smoothed", "mean"])
