@@ -76,6 +76,7 @@ def test_every_way_to_run_a_filter_writes_memory_of_its_own(float64, name, batch
 
 MATRIX, VECTOR = (2, 2), (2,)
 noise = partial(ConstantNoise, [0.5, 0.5], in_key="observation")
+READ = {"initial": prior(), "observation_key": "observation"}
 #: Constructors, and the shapes of the constants that they take.
 TAKES = {
     "KalmanFilter": (
@@ -83,7 +84,7 @@ TAKES = {
         [MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, MATRIX],
     ),
     "BackpropKF": (
-        lambda a, b, c: BackpropKF(a, None, c, noise(), process_noise_cov=b, initial=prior()),
+        lambda a, b, c: BackpropKF(a, None, c, noise(), process_noise_cov=b, **READ),
         [MATRIX, MATRIX, MATRIX],
     ),
     "GaussianPrior": (lambda a, b: GaussianPrior(a, b, ensemble_size=4), [VECTOR, VECTOR]),
