@@ -8,14 +8,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from tests.filters.composed import ReplayedFrames
-from tests.filters.factories import (
-    FixedEnsemble,
-    NoisyLinear,
-    linear_denkf,
-    linear_kalman,
-    random_walk,
-    stepwise,
-)
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_kalman, random_walk, stepwise
 from torch_denkf.filters import Filter
 from torch_denkf.modules import EnsembleAnalysis, LinearObservation, SubModel
 from torch_denkf.transforms import DEnKFTransform, LastAction
