@@ -17,8 +17,6 @@ from torch_denkf.transforms import DEnKFTransform
 
 BELIEF = [("belief", name) for name in ("ensemble", "mean", "var")]
 PAIRS = [pair for pair in combinations(FEATURES, 2) if set(pair) != {"flipout", "dropout"}]
-
-
 close = partial(assert_equal, atol=1e-10)  # float64: rounding of a few steps
 
 

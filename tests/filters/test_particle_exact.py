@@ -52,13 +52,8 @@ def test_many_particles_are_the_kalman_filter(float64, scheme):
     with torch.no_grad():
         out = bootstrap(size, **SCHEMES[scheme]).sequence(td.expand(rows, 20).clone())
     unseen = ~td["observed"].any(-1)
-    for key in (
-        ("belief", "mean"),
-        ("belief", "var"),
-        ("info", "innovation"),
-        ("info", "nis"),
-        ("info", "log_likelihood"),
-    ):
+    info = [("info", name) for name in ("innovation", "nis", "log_likelihood")]
+    for key in (("belief", "mean"), ("belief", "var"), *info):
         error = out[key] - exact[key]
         if key[0] == "info":  # zero, exactly, where nothing is observed
             assert (out[key][:, unseen] == 0).all()

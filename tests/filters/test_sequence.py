@@ -1,4 +1,4 @@
-"""The loop: one step and a sequence are the same; resets, stored beliefs, controls, masks, gradients."""
+"""The loop: one step and a sequence are the same; resets, controls, gradients."""
 
 import pytest
 import torch
