@@ -5,7 +5,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.functional.checks import assert_refused
 from tests.plots.test_bands_of_spaces import SPACE
 from torch_denkf.metrics import pit
 from torch_denkf.plots import plot_calibration, plot_spread_error
@@ -71,18 +70,3 @@ def test_ranks_and_probabilities_are_those_of_the_metrics():
     counts = torch.stack([torch.histc(column, 10, 0, 1) for column in values.unbind(-1)])
     drawn = heights(plot_calibration(run, space=SPACE, kind="pit"))
     np.testing.assert_allclose(drawn, 100 * counts.numpy() / RUNS, rtol=1e-12)
-
-
-def test_the_truth_of_a_leading_part_and_of_some_rows():
-    run = beliefs()
-    whole = lines(plot_spread_error(run, space=SPACE, dims=[0, 2]))
-    part = run["state"][:, :4]
-    known = lines(plot_spread_error(run, part, space=SPACE, dims=[0, 2]))
-    for label, values in whole.items():
-        np.testing.assert_allclose(known[label], values, rtol=1e-12)
-    assert_refused(ValueError, "the truth has 3 dimensions", plot_spread_error, run, part, space=SPACE)
-    torn = run["state"].clone()
-    torn[::2, 1] = torch.nan  # one number of a quaternion
-    expected = spread_error(run["belief", "mean"], run["belief", "var"], torn, ensemble_size=E, space=SPACE)
-    drawn = lines(plot_spread_error(run, torn, space=SPACE))
-    np.testing.assert_allclose(drawn["about y, deg"][1], expected.error[1].numpy() * 180 / np.pi, rtol=1e-12)

@@ -41,15 +41,6 @@ def test_points_by_hand():
     assert high > 30
 
 
-def test_few_members_are_expected_to_err_more_than_they_spread():
-    rng = torch.Generator().manual_seed(0)
-    draws = torch.randn(20_000, 5, 1, generator=rng)
-    axes = plot_spread_error(TensorDict({"ensemble": draws[:, 1:]}, [20_000]), draws[:, 0], bins=1)
-    spread, error = data(axes)["state 0"]
-    assert error[0] == pytest.approx(1.25**0.5, abs=0.02)
-    assert spread[0] == pytest.approx(error[0], abs=0.02)
-
-
 def test_angles_are_wrapped():
     belief = TensorDict({"mean": torch.tensor([[0.0, 3.1]]), "var": torch.ones(1, 2)}, [1])
     axes = plot_spread_error(

@@ -1,6 +1,5 @@
-"""Two real processes under ``torchrun``, against one process on the batches of both."""
+"""Two real processes, as ``torchrun`` starts them, against one process on the batches of both."""
 
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -19,10 +18,8 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture(scope="module")
 def ranks(tmp_path_factory):
     out = tmp_path_factory.mktemp("two")
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    command = [*launcher, "-m", "tests.training.two_processes", str(out)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    command = [sys.executable, "-m", "tests.training.two_processes", str(out)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return [torch.load(out / f"rank_{rank}.pt", weights_only=False) for rank in (0, 1)]
 

@@ -7,9 +7,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from torch_denkf import FilterTrainer, FusedFilter, FusedSensor, GaussianLoss, SensorLoss, Stage
-from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import ConstantNoise, LinearTransition, MomentPrior, Select
-from torch_denkf.training.stage import parameters_without
 
 pytestmark = pytest.mark.usefixtures("float64")
 
@@ -76,45 +74,3 @@ def test_both_are_no_worse_than_one_where_noise_is_learned_on_rows_that_the_head
     alone = error(filter, unseen, camera=False)
     assert alone == pytest.approx(riccati(ENCODER**2), rel=0.03)
     assert found["held"] < alone < 0.4 * found["seen"]
-
-
-def test_errors_that_last_are_no_white_noise():
-    """The camera errs for thirty steps at a time: taken for white noise of the same size it makes matters worse."""
-    held, unseen = record(16, 200, 1), record(64, 200, 2)
-    true = FadingBias([0.5], time=30.0, trainable=False)
-    for data in (held, unseen):
-        off = [0.5 * torch.randn(len(data), 1)]
-        for _ in range(199):
-            off.append(true.decay * off[-1] + true.variance.sqrt() * torch.randn(len(data), 1))
-        data["picture"] = data["state"] + torch.stack(off, 1) + 0.05 * torch.randn_like(data["state"])
-    residuals = held["picture"] - held["state"]
-    white = make_filter(nn.Identity(), residuals.square().mean((0, 1)).sqrt().tolist())
-    bias, rest = FadingBias.from_residuals(residuals, trainable=False)
-    lasting = make_filter(nn.Identity(), rest.tolist(), sensor_error=bias)
-    alone = error(white, unseen, camera=False)
-    assert error(white, unseen) > 1.2 * alone
-    assert error(lasting, unseen) < 0.95 * alone
-
-
-def test_a_name_that_is_no_module_raises():
-    net = nn.ModuleDict({"sensor": nn.Linear(1, 1), "motion": nn.Linear(1, 1)})
-    stage = Stage("fit", dict, dict, 1, frozen=["sensor"])
-    assert [p for group in stage.groups(net) for p in group["params"]] == list(net["motion"].parameters())
-    with pytest.raises(KeyError, match=r"no module.*camera"):
-        Stage("fit", dict, dict, 1, frozen=["camera"]).groups(net)
-    with pytest.raises(TypeError, match="list of names"):
-        Stage("fit", dict, dict, 1, frozen="sensor")
-
-
-def test_a_stage_with_frozen_modules_trains_nothing_that_no_checkpoint_holds():
-    """Raises for a parameter that the loss alone holds, as it does without frozen modules."""
-    net, other = nn.ModuleDict({"sensor": nn.Linear(1, 1), "head": nn.Linear(1, 1)}), nn.Parameter(torch.ones(1))
-    with pytest.raises(ValueError, match="1 parameters that the trainer's model does not hold"):
-        Stage("fit", dict, dict, 1, frozen=["sensor"], parameters=[*net.parameters(), other]).groups(net)
-
-
-def test_the_initial_belief_may_be_frozen():
-    net, initial = nn.Module(), nn.Linear(1, 1)
-    net.module, net.initial = nn.ModuleDict({"sensor": nn.Linear(1, 1)}), initial
-    assert parameters_without(net, ["initial"]) == list(net.module.parameters())
-    assert parameters_without(net, ["sensor"]) == list(initial.parameters())

@@ -5,13 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 
 from torch_denkf.applications.imu import imu, imu_rows, orientations
-from torch_denkf.applications.imu.filter import SPACE, ImuSettings, moves
+from torch_denkf.applications.imu.filter import ImuSettings
 from torch_denkf.functional.manifolds import SO3, rotate
 from torch_denkf.pretrained import from_pretrained
-from torch_denkf.smoothers import RTSSmoother
 
 SETTINGS = ImuSettings(
     gyro=0.003,
@@ -158,62 +156,6 @@ def test_it_is_the_error_state_kalman_filter(axes):
     assert np.abs(out["mean"][:, 4:].numpy() - x).max() < 1e-6
     scale = np.sqrt(np.einsum("tii->ti", cov))
     assert np.abs((out["cov"].numpy() - cov) / (scale[:, :, None] * scale[:, None])).max() < 1e-6
-
-
-# ------------------------------------------------------------------------------------- data of the model itself
-
-
-def drawn_rows(settings, runs=200, steps=45, seed=0):
-    """Rows and states of bodies that move, and whose sensors err, as the filter expects."""
-    torch.manual_seed(seed)
-    model, dt = imu(**dataclasses.asdict(settings)).double(), 0.035
-    rows = TensorDict(batch_size=[runs, steps])
-    time = torch.arange(steps, dtype=torch.float64) * dt
-    rows["gyro"] = torch.stack([(time * f).sin() for f in (1.0, 1.7, 2.3)], -1).expand(runs, -1, -1).contiguous()
-    rows["dt"] = torch.full((runs, steps, 1), dt, dtype=torch.float64)
-    rows["moves"] = moves(settings.poles, dt).expand(runs, steps, 9).contiguous()
-    rows["unrest"] = torch.full_like(rows["dt"], 0.5)
-    rows["disturbance"] = torch.full_like(rows["dt"], 0.3)
-    rows["lever"] = torch.randn(runs, steps, 9, dtype=torch.float64)
-    rows["rest_observed"] = torch.zeros(runs, steps, 1, dtype=torch.bool)
-    middle = SPACE.neutral(rows["dt"])
-    middle[28:30] = torch.tensor([16.0, -41.0])
-    rows["start"] = middle.expand(runs, steps, -1).contiguous()
-    transition, noise = model["transition"].module, model["transition"].process_noise
-    std = model.initial.std
-    states, accelerometer, magnetometer = [], [], []
-    for t in range(steps):
-        if t == 0:
-            state = SPACE.plus(rows["start"][:, 0], std * torch.randn(runs, 36, dtype=torch.float64))
-        else:
-            now = rows[:, t].clone()
-            now["belief", "ensemble"], now["belief", "mean"] = state.unsqueeze(1), state
-            state, variance = transition(now)["forecast", "ensemble"].squeeze(1), noise(now)["forecast", "noise"]
-            state = SPACE.plus(state, variance.sqrt() * torch.randn(runs, 36, dtype=torch.float64))
-        now = TensorDict({"forecast": {"ensemble": state.unsqueeze(1)}, **rows[:, t]}, [runs])
-        for name, to in (("accelerometer", accelerometer), ("magnetometer", magnetometer)):
-            value = model[name].module.module(now.clone()).get(("forecast", "observation")).squeeze(1)
-            variance = settings.accelerometer**2
-            if name == "magnetometer":
-                variance = model["magnetometer_noise"].module.compute(rows["gyro"][:, t])
-            to.append(value + torch.as_tensor(variance).sqrt() * torch.randn(runs, 3, dtype=torch.float64))
-        states.append(state)
-    rows["accelerometer"], rows["magnetometer"] = torch.stack(accelerometer, 1), torch.stack(magnetometer, 1)
-    return model, rows, torch.stack(states, 1)
-
-
-@torch.no_grad()
-def test_intervals_hold_on_data_of_the_model():
-    model, rows, states = drawn_rows(dataclasses.replace(SETTINGS, motion_unrest=2.0))
-    smoothed = RTSSmoother(model).sequence(rows)
-    errors = {}
-    for prefix in ("belief", "smoothed"):
-        away = SPACE.minus(states, smoothed[prefix, "mean"])[:, 20:, :3]
-        variance = smoothed[prefix, "var"][:, 20:, :3]
-        held = (away.square() < 1.645**2 * variance).double().mean((0, 1))
-        assert ((held > 0.85) & (held < 0.95)).all(), (prefix, held)
-        errors[prefix] = away.square().mean((0, 1))
-    assert (errors["smoothed"] < errors["belief"]).all()
 
 
 # --------------------------------------------------------------------------------------------------- a whole log

@@ -136,34 +136,6 @@ def test_the_loss_is_that_of_the_feet_that_stand(model, log):
     assert_close(contacts.loss(rows), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_they_find_the_foot_that_slides_and_how(model):
-    torch.manual_seed(0)
-    contacts = contacts_of(model, rows=1, num_cells=(32,))
-    log = standing(model, 256)[0][:, 1]
-    contacts.standardise(log)
-    optimiser = torch.optim.Adam(contacts.parameters(), 0.01)
-    for _ in range(200):
-        loss = contacts.loss(log)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    test, moves = standing(model, 64)
-    noises = LeggedNoises(velocity=0.5, tilt=0.01, rate=RATE)
-    filters = [
-        legged_filter(model, **QUADRUPED, dt=0.01, kind="EKF", noises=noises, contacts=each)
-        for each in (contacts, None)
-    ]
-    row = test[:, 1]
-    with torch.no_grad():
-        found = contacts(row.clone())["legs", "moves"].unflatten(-1, (4, 3))
-        velocity = [filter.sequence(test.clone())["belief", "velocity"][:, 1] for filter in filters]
-    assert (found.norm(dim=-1).argmax(-1) == moves.int().argmax(-1)).float().mean() > 0.9
-    true = contacts.kinematics.velocities(row["joints"], row["joint_rates"])  # the base rests
-    assert (found - true)[moves].square().sum(-1).mean() < 0.2 * true[moves].square().sum(-1).mean()
-    learned, plain = (each.square().sum(-1).mean().sqrt() for each in velocity)
-    assert learned < 0.5 * plain
-
-
 def test_a_filter_moves_a_foot_that_slides(model):
     """All feet slide alike: threshold contacts take that for the base's motion, known slides do not."""
     rest = standing(model, 1)[0][:, :1].expand(1, 30).clone()

@@ -9,7 +9,6 @@ import torch
 from torch_denkf.applications.legged import QUADRUPED, LeggedNoises, legged_filter, quadruped_env
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, LeggedSpace
-from torch_denkf.applications.legged.readings import FeetInBody, FeetRates
 from torch_denkf.functional.manifolds import SO3, rotation_matrix, skew, whole_parts
 from torch_denkf.metrics.state import rotation_error
 
@@ -39,15 +38,6 @@ def test_it_is_a_group_and_its_jacobian_that_of_autodiff():
     basis = torch.func.jacrev(lambda more: space.plus(one, more))(torch.zeros_like(step))
     torch.testing.assert_close(space.basis(one), basis)
     torch.testing.assert_close(space.dual_basis(one) @ basis, torch.eye(space.tangent_dim))
-
-
-def test_a_step_turns_the_world():
-    space = LeggedSpace(1)
-    point = torch.cat([torch.tensor([1.0, 0, 0, 0]), torch.arange(1.0, 16.0)])
-    turn = torch.tensor([0.0, 0.0, math.pi / 2])
-    moved = space.plus(point, torch.cat([turn, torch.zeros(15)]))
-    expected = [-2.0, 1, 3, -5, 4, 6, 7, 8, 9, 10, 11, 12, -14, 13, 15]
-    torch.testing.assert_close(moved[4:], torch.tensor(expected))
 
 
 def test_labels_may_be_of_some_vectors_alone():
@@ -109,16 +99,6 @@ def test_the_jacobian_of_members_is_that_of_each(contact):
     each = [motion.jacobian(member.unsqueeze(-2), *read) for member in state.unbind(-2)]
     torch.testing.assert_close(moved, torch.cat([one for one, _ in each], -2))
     torch.testing.assert_close(jacobian, torch.cat([one for _, one in each], -3))
-
-
-def test_a_turn_of_the_world_is_not_seen_in_what_feet_say():
-    """Scales by any size: so no update is mistaken about where up is."""
-    space = LeggedSpace(2)
-    torch.manual_seed(0)
-    state = space.exp(torch.randn(space.tangent_dim))
-    turned = space.plus(state, torch.cat([torch.randn(3), torch.zeros(18)]))
-    for reading in (FeetInBody(space).compute, lambda states: FeetRates(space).compute(states, torch.arange(6.0))):
-        torch.testing.assert_close(reading(turned.unsqueeze(0)), reading(state.unsqueeze(0)))
 
 
 class Hartley:

@@ -11,7 +11,6 @@ from torch_denkf.applications.robot import robot_model
 from torch_denkf.applications.robot.config import read_config
 from torch_denkf.applications.robot.learning import learn_noises, scale_of
 from torch_denkf.applications.robot.log import (
-    RobotLog,
     default_settings,
     drift_settings,
     log_streams,
@@ -19,12 +18,10 @@ from torch_denkf.applications.robot.log import (
     rows_of_log,
     start_of,
 )
-from torch_denkf.applications.robot.readings import Seen, seen_by
-from torch_denkf.applications.robot.report import gap_errors, sensor_lines, write_path
+from torch_denkf.applications.robot.readings import seen_by
 from torch_denkf.cli.main import main
 from torch_denkf.data.earth import to_degrees
 from torch_denkf.data.recordings.tables import Readings
-from torch_denkf.smoothers import RTSSmoother
 
 ORIGIN = (51.04, 13.79)
 
@@ -157,57 +154,6 @@ def test_what_was_learned_is_kept_when_it_is_interrupted(tmp_path, monkeypatch):
     assert learned.interrupted
     assert (learned.before, learned.after) == (0.0, pytest.approx(0.3 - 0.3**2))  # a step of Adam
     assert scale_of(model, "imu0_twist").item() == pytest.approx(0.3)
-
-
-def drifting(seconds=150.0):
-    """A log whose fixes, gyro and wheels have errors that last, and the settings that say so."""
-    rng = np.random.default_rng(4)
-    time, place, _, speed, turn = drive(seconds)
-    fixes, gyro, slow = slice(0, None, 20), slice(None), np.zeros((len(time[::20]), 2))
-    for k in range(1, len(slow)):
-        slow[k] = slow[k - 1] * np.exp(-1 / 30) + 2.0 * (1 - np.exp(-2 / 30)) ** 0.5 * rng.normal(size=2)
-    seen = {
-        "pose0_pose": (time[fixes], place[fixes] + slow + 0.1 * rng.normal(size=slow.shape), np.eye(2) * 0.01),
-        "twist0_twist": (time, np.c_[speed * 1.06 + 0.05 * rng.normal(size=len(time)), 0 * speed], np.eye(2) * 0.0025),
-        "imu0_twist": (time[gyro], (turn + 0.02 + 0.01 * rng.normal(size=len(time)))[:, None], np.eye(1) * 1e-4),
-    }
-    log = {}
-    for name, (times, values, noise) in seen.items():
-        size, plane = values.shape[1], np.zeros((len(times), 7))
-        cov = np.diag(np.append(np.diag(noise), np.full(7, 1e-6)))
-        log[name] = Seen(times, np.c_[values, plane], np.broadcast_to(cov, (len(times), size + 7, size + 7)), True)
-    settings = {"two_d_mode": True, "frequency": 2.0, "initial_estimate_covariance": [1.0] * 15, "pose0": "gps"}
-    settings |= {"pose0_config": flags(0, 1), "imu0": "imu", "imu0_config": flags(11), "twist0": "speed"}
-    settings |= {"twist0_config": flags(6, 7), "held_velocities": True}
-    walks = [1e-3, 1e-3, *[1e-4] * 4, 0.5, 1e-3, *[1e-2] * 3, 0.04, *[1e-4] * 3]
-    settings["process_noise_covariance"] = walks
-    drifts = {"pose0_drifts": [2.0, 2.0] + [0.0] * 13, "pose0_drift_time": 30.0, "twist0_drift_time": 1e4}
-    drifts |= {"twist0_drifts": [0.0] * 6 + [0.06] + [0.0] * 8, "imu0_drifts": [0.0] * 11 + [0.02] + [0.0] * 3}
-    return RobotLog(log, {}, None), settings, drifts | {"imu0_drift_time": 1e4}
-
-
-def test_errors_that_last_widen_the_intervals_of_gaps(tmp_path):
-    """Without drifts the intervals of fixes that are hidden for 15 s hold less than a half, with them 95 %."""
-    log, settings, drifts = drifting()
-    held = []
-    for given in (settings, settings | drifts):
-        model = start_of(log, robot_model(given))
-        full, rows = (rows_of_log(log, model, hidden) for hidden in (None, np.array([[30, 45], [70, 85], [110, 125]])))
-        with torch.no_grad():
-            out = RTSSmoother(model.filter)(rows.clone())
-        error, share, count = gap_errors(out, full, model)
-        held.append(share)
-        assert count > 40
-    assert held[0] < 0.5
-    assert held[1] > 0.9
-    assert error < 2.5
-    write_path(tmp_path, model, log, out)
-    path = np.genfromtxt(tmp_path / "path.csv", delimiter=",", names=True)
-    np.testing.assert_allclose(path["yaw"], out["smoothed", "mean"][-len(path) :, 5], atol=1e-6)
-    np.testing.assert_allclose(path["std_x"], out["smoothed", "var"][-len(path) :, 0].sqrt(), atol=1e-6)
-    again = robot_model(tmp_path / "ekf.yaml")  # what was learned is read back
-    torch.testing.assert_close(again.drifts.state_dict(), model.drifts.state_dict(), rtol=1e-5, atol=1e-5)
-    assert any("2 for 30 s; 2 for 30 s" in line for line in sensor_lines(model, log, out))
 
 
 def test_two_files_of_a_boat(tmp_path):

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from tests.envs.opengl import mujoco
 from torch_denkf.applications.ur5.simulation.kinematics import (
     READY,
     Unreachable,
@@ -60,16 +59,6 @@ def test_forward_kinematics_is_that_of_the_makers_parameters(scene):
         np.testing.assert_allclose(rotation, expected[:3, :3], atol=1e-6)
         np.testing.assert_allclose(position, expected[:3, 3] + PINCH * expected[:3, 2], atol=1e-6)
         np.testing.assert_allclose(scene.state(data)[7:], position, atol=1e-12)  # the centre is the origin
-
-
-def test_the_jacobian_that_inverse_kinematics_uses(scene):
-    joints, step = READY + 0.2, 1e-6
-    _, _, data = tool(scene, joints)
-    mujoco.mj_comPos(scene.model, data)
-    jacobian = np.zeros((3, scene.model.nv))
-    mujoco.mj_jacSite(scene.model, data, jacobian, None, scene.pinch)
-    numeric = [(tool(scene, joints + step * e)[0] - tool(scene, joints - step * e)[0]) / (2 * step) for e in np.eye(6)]
-    np.testing.assert_allclose(jacobian[:, scene.arm_dofs], np.stack(numeric, -1), atol=1e-8)
 
 
 def test_inverse_kinematics(scene):

@@ -1,24 +1,12 @@
 """Mirrored drives: against mirrored poses, mirrored points and the flow of mirrored images."""
 
 import numpy as np
-import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.applications.car import dead_reckoning, read_kitti_drive, with_motion, write_drives
+from torch_denkf.applications.car import dead_reckoning
 from torch_denkf.applications.car.kitti.mirror import mirror_drive
 from torch_denkf.applications.car.kitti.render import random_drive
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    return tmp_path_factory.mktemp("drives")
-
-
-@pytest.fixture(scope="module")
-def town(root):
-    write_drives(root, ["town"], frames=20)
-    return read_kitti_drive(root, "town", cache=None)
 
 
 def test_the_path_is_the_mirror_image():
@@ -46,14 +34,3 @@ def test_a_mirrored_point_is_seen_in_the_mirrored_column():
     assert mirrored["image"][0, 0, 0].nonzero().item() == fx * 3.0 / depth + cx == 24
     assert calibration[0, 2] == 11  # the drive itself is as it was
     assert mirrored["calibration"][0, [0, 1, 3]].tolist() == [16, 18, 4]
-
-
-def test_twice_mirrored_is_the_drive(town):
-    town = with_motion(town, cache=None)
-    once = mirror_drive(town)
-    assert (once["image"] != town["image"]).any()
-    assert set(once.keys()) == set(town.keys())
-    for key, value in mirror_drive(once).items():
-        torch.testing.assert_close(value, town[key], msg=key)
-    for key in ("time", "dt", "frame", "frame_valid", "road"):
-        assert once[key] is town[key], key

@@ -83,13 +83,6 @@ def test_drives_move_like_a_car():
     assert abs(np.sign(many[:, 4]).mean()) < 0.2  # to both sides
 
 
-def bare(seed=0, frames=120):
-    """A drive's state and scene without anything on the ground."""
-    rng = np.random.default_rng(seed)
-    state = random_drive(frames, rng)
-    return state, dataclasses.replace(roadside_scene(state, rng), objects=[], light=np.ones(3))
-
-
 def test_the_homography_is_the_pinhole_projection():
     camera, rng = Camera.kitti((50, 150)), np.random.default_rng(0)
     for _ in range(20):
@@ -112,51 +105,12 @@ def test_the_homography_is_the_pinhole_projection():
         np.testing.assert_allclose(spot[:2] / spot[2], [camera.cx - camera.fx / 5, camera.cy + camera.fy * 0.165])
 
 
-def correlation(a, b, where):
-    """Compares the fine structure only: flat parts agree under any motion."""
-    a, b = (image - cv2.blur(image, (19, 7)) for image in (a, b))
-    return np.corrcoef(a[where], b[where])[0, 1]
-
-
-def step(state, factor=1.0, turn=0.0):
-    """Pose before and after a step of the state, with another speed or turn rate."""
-    v, omega = factor * state[3], state[4] + turn
-    middle = -omega * KITTI_DT / 2  # ends at the origin, straight ahead
-    start = [-v * KITTI_DT * np.cos(middle), -v * KITTI_DT * np.sin(middle), 2 * middle]
-    return state_to_poses(np.array([start, [0.0, 0.0, 0.0]]))
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_ground_moves_as_the_motion_says(seed):
-    state, scene = bare(seed)
-    camera = Camera.kitti((100, 300))
-    renderer, poses = Renderer(scene, camera), state_to_poses(state)
-    rows = slice(round(camera.cy) + 12, None)  # up to 13 m ahead
-    scores = []
-    for t in range(6, 120, 12):
-        pair = [cv2.cvtColor(renderer.render(poses[k]), cv2.COLOR_BGR2GRAY).astype(np.float32) for k in (t - 1, t)]
-        row = []
-        for factor, turn in ((1.0, 0.0), (0.8, 0.0), (1.2, 0.0), (1.0, -0.15), (1.0, 0.15), (0.0, 0.0), (-1.0, 0.0)):
-            before, after = (ground_homography(camera, pose) for pose in step(state[t], factor, turn))
-            flow = after @ np.linalg.inv(before)
-            moved = cv2.warpPerspective(pair[0], flow, camera.size[::-1])[rows]
-            there = cv2.warpPerspective(np.ones(camera.size, np.float32), flow, camera.size[::-1])[rows] > 0.99
-            there = cv2.erode(there.astype(np.uint8), np.ones((7, 19), np.uint8)) > 0
-            row.append(correlation(moved, pair[1][rows], there))
-        scores.append(row)
-    scores = np.array(scores)
-    # Measured: 0.93 to 0.98 with the true motion; 0.75 to 0.92 with a speed 20 % off, about 0.5 with a turn rate
-    # 0.15 rad/s off, at most 0.76 without motion.
-    assert (scores[:, 0] > 0.92).all()
-    assert (scores[:, 1:] < scores[:, :1] - 0.01).all()
-    assert (scores[:, 3:] < 0.8).all()
-
-
 def test_a_box_appears_where_its_corners_project():
-    _, scene = bare()
+    rng = np.random.default_rng(0)
+    scene = roadside_scene(random_drive(120, rng), rng)
     corners = np.array([[2.0, 14.0], [4.0, 14.0], [4.0, 18.0], [2.0, 18.0]])  # x to the right, z ahead
     red = [np.full((32, 32, 3), (0, 0, 255), np.uint8)]
-    scene = dataclasses.replace(scene, objects=[Box(corners, 1.2, [red] * 4)])
+    scene = dataclasses.replace(scene, light=np.ones(3), objects=[Box(corners, 1.2, [red] * 4)])
     camera = Camera.kitti((100, 300))
     for x, theta in ((0.0, 0.0), (4.0, 0.1), (8.0, -0.1)):
         pose = state_to_poses(np.array([[x, 0.0, theta]]))[0]

@@ -1,4 +1,4 @@
-"""Checks which drives and cameras a data set consists of: made by hand, and real frames where they are."""
+"""A data set of folders: which drives and cameras it consists of; what lacks something is named."""
 
 from functools import partial
 
@@ -34,3 +34,28 @@ def test_cameras(tmp_path):
             open_dataset(tmp_path, cameras=wrong)
     with pytest.raises(FileNotFoundError, match=r"no folder .*sequences/01/image_2"):
         open_dataset(tmp_path, cameras=["image_2"], drives="01")
+
+
+def fails(error, match, root, **options):
+    with pytest.raises(error, match=match):
+        open_dataset(root, **options)
+
+
+def test_folders_that_lack_something(tmp_path):
+    fails(FileNotFoundError, r"no folder .*sequences; pass the folder that holds 'sequences' and 'poses'", tmp_path)
+    (tmp_path / "sequences").mkdir()
+    fails(FileNotFoundError, r"no drive below .* has both images and poses: it is empty; download KITTI", tmp_path)
+    make(tmp_path, sequence="05", images=[])
+    make(tmp_path, sequence="07")
+    (tmp_path / "poses/07.txt").unlink()
+    message = r"no poses/07.txt; no images sequences/NAME/image_\*/FFFFFF.png for \['05'\]"
+    fails(FileNotFoundError, message, tmp_path)
+    make(tmp_path, sequence="02")
+    assert [e.drive for e in open_dataset(tmp_path).episodes] == ["02"]
+    # Asked for by name, they are errors.
+    fails(FileNotFoundError, r"no images in .*sequences/05; expected FFFFFF.png", tmp_path, drives=["02", "05"])
+    fails(FileNotFoundError, r"no images in .*sequences/05", tmp_path, drives=["05"], cameras="both")
+    fails(FileNotFoundError, r"no poses at .*poses/07.txt; download", tmp_path, drives=["07"])
+    fails(FileNotFoundError, r"no folder .*sequences/03; .* has \['02', '05', '07'\]", tmp_path, drives=[3])
+    for wrong in ([], ["02", 2]):
+        fails(ValueError, r"drives are names, each once, or None for all", tmp_path, drives=wrong)

@@ -19,21 +19,6 @@ from torch_denkf.cli.main import main
 from torch_denkf.pretrained import from_pretrained
 
 
-def test_black_frames_are_missing_frames(checkpoint, drive):
-    car, images, calibration = from_pretrained(checkpoint), frames_of(drive), calibration_of(drive)
-    lost = list(track(car, fail_frames(images, [CameraFailure("missing", 5, 6)]), calibration))
-    black = [*fail_frames(images, [CameraFailure("black", 5, 6)])]
-    black[5][0, 0] = 255  # a hot pixel
-    known = list(track(car, black, calibration))
-    assert [belief.observed for belief in known] == [n not in (0, 5, 6) for n in range(16)]
-    for one, other in zip(lost, known, strict=True):
-        assert torch.equal(one.ensemble, other.ensemble)
-    unknown = list(track(car, black, calibration, black_level=None))
-    assert all(belief.observed for belief in unknown[1:])
-    with pytest.raises(ValueError, match="black_level must be finite, at least 0 and at most 255; got 300"):
-        track(car, black, calibration, black_level=300)
-
-
 def test_what_stands_still_before_the_camera_is_told_and_looked_past(tmp_path, capsys):
     """The share that is told is the box's; pairs without it are read as ever."""
     write_drives(tmp_path, ["town"], frames=14, size=(100, 300))

@@ -1,11 +1,6 @@
 """Demos are the expert's episodes; kills, processes and damage leave a collection byte for byte as it would be."""
 
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -109,54 +104,6 @@ def test_pictures_are_of_their_steps(tmp_path, domain):
     assert (demo.state == demos_of(tmp_path)[0].state[:5]).all()
     data = UR5ExperienceReplay(tmp_path, split="all", frames_only=True, cache=None)
     assert (data[:]["pixels"].numpy()[:4] == demos_of(tmp_path)[0].pixels.astype(np.float32) / 255).all()
-
-
-@pytest.mark.slow
-def test_a_killed_run_goes_on_with_other_processes(unbroken, tmp_path):
-    """SIGKILL in the middle of a run with two workers, then one process: the same bytes as one process alone."""
-    root = tmp_path / "killed"
-    command = [sys.executable, "-m", "torch_denkf.cli.main", "collect-ur5", "--out", str(root), "--demos", "40"]
-    command += ["--no-pixels", "--seed", "3", "--processes", "2"]
-    with subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}) as run:
-        deadline = time.monotonic() + 120
-        while len(read_manifest(root)) < 3:
-            assert run.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        with pytest.raises(OSError, match="another process is collecting into it"):
-            collect_ur5_demos(root, DEMOS, **BLIND)
-        children = [int(pid) for pid in _read(f"/proc/{run.pid}/task/{run.pid}/children").split()]
-        run.send_signal(signal.SIGKILL)
-    made = read_manifest(root)
-    assert 3 <= len(made) < 40
-    # Workers do not outlive their parent: they would go on writing, and wait for work for ever.
-    deadline = time.monotonic() + 20
-    assert len(children) >= 2
-    while any("spawn_main" in _read(f"/proc/{pid}/cmdline") for pid in children):  # a zombie has no command line
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-    with (root / MANIFEST).open("a") as file:
-        file.write('{"demo": 39, "file": "demo-0000')  # killed while writing the line
-    stamps = {entry.file: (root / entry.file).stat().st_mtime_ns for entry in made.values()}
-    collect_ur5_demos(root, DEMOS, **BLIND)
-    for name, stamp in stamps.items():
-        assert (root / name).stat().st_mtime_ns == stamp  # not made again
-    resumed, expected = content(root), content(unbroken)
-    for name in expected:
-        if name != MANIFEST:
-            assert resumed[name] == expected[name], name
-    lines = resumed[MANIFEST].decode().splitlines()
-    assert lines[:DEMOS] == expected[MANIFEST].decode().splitlines()
-    assert not [name for name in resumed if name.startswith(".")]
-
-
-def _read(file):
-    try:
-        with open(file) as stream:
-            return stream.read()
-    except OSError:
-        return ""
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "missing"])

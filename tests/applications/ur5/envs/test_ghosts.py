@@ -20,22 +20,6 @@ def changed(picture, other):
     return (picture - other).abs().amax(-3) > 0.02
 
 
-def test_ghosts_spread_with_the_ensemble(env):
-    state = env.reset()["state"]
-    alone = env.render_state(state)
-    draws = torch.randn(8, 10)
-    arm = changed(env.render_state(state, ghosts=state[None]), alone)
-    around = [
-        (changed(env.render_state(state, ghosts=state + std * draws), alone) & ~arm).sum().item()
-        for std in (0.01, 0.04, 0.16)
-    ]
-    assert around[0] > 0
-    assert around[0] * 1.5 < around[1]
-    assert around[1] * 1.5 < around[2]
-    assert env.render_state(state).equal(alone)  # nothing of the ghosts is left
-    assert env.render_state(state, ghosts=state[None][:0]).equal(alone)
-
-
 def test_a_ghost_is_translucent_and_orange(env):
     state = env.reset()["state"]
     aside = state.clone()
