@@ -42,13 +42,6 @@ def test_a_kalman_filters_band_is_its_variances():
     assert [axes.get_ylabel() for axes in panels] == ["x, m", "vy, cm/s"]
     assert panels[1].get_xlabel() == "time, s"
     assert panels[0].get_xlim() == pytest.approx((-0.05, 7.95))
-    # The band is one that holds the truth: 90 % of it over all runs, and so about here.
-    inside = []
-    for row in range(20):
-        _, low, high = band(plot_bands(kalman_runs()[row], dims=[1])[0])
-        truth = kalman_runs()["state"][row, :, 1].numpy()
-        inside.append((low <= truth) & (truth <= high))
-    assert np.mean(inside) == pytest.approx(0.9, abs=0.06)
 
 
 @pytest.mark.parametrize("level", [0.9, 0.5])

@@ -15,7 +15,6 @@ from torch_denkf._registered import weights
 from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
 from torch_denkf.applications.reacher import reacher
 from torch_denkf.applications.ur5.filter import ur5_table
-from torch_denkf.deployment.folder import described
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.modules import (
     ConstantNoise,
@@ -170,20 +169,10 @@ def test_mistakes_are_named(tmp_path):
         from_pretrained(tmp_path)
     folder = copy_of("reacher", tmp_path)
     weights, config = folder / "weights.safetensors", folder / "config.json"
-    good, text = weights.read_bytes(), config.read_text()
-
-    flipped = bytearray(good)
+    flipped = bytearray(weights.read_bytes())
     flipped[-5] ^= 1  # a bit of a number: safetensors itself would not notice
     weights.write_bytes(flipped)
     with pytest.raises(ValueError, match=r"weights\.safetensors is damaged, .*its SHA-256 is [0-9a-f]{64}, expected"):
-        from_pretrained(folder)
-    weights.write_bytes(good)
-    config.write_text(described({**json.loads(text), "sha256": 64 * "0"}))
-    with pytest.raises(ValueError, match=f"expected {64 * '0'}; restore both from a copy"):
-        from_pretrained(folder)
-    weights.write_bytes(b"nothing")
-    config.write_text(described({**json.loads(text), "sha256": hashlib.sha256(b"nothing").hexdigest()}))
-    with pytest.raises(ValueError, match=r"weights\.safetensors cannot be read"):
         from_pretrained(folder)
     weights.unlink()
     with pytest.raises(FileNotFoundError, match="no weights"):

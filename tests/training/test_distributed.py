@@ -2,8 +2,6 @@
 
 import subprocess
 import sys
-from dataclasses import replace
-from itertools import count
 from pathlib import Path
 
 import pytest
@@ -46,27 +44,6 @@ def test_gradient_is_that_of_the_joined_batch(ranks, float64, tmp_path):
         torch.testing.assert_close(one, parameter.grad, rtol=0, atol=1e-13 * float(parameter.grad.abs().max()))
         compared += int(one.abs().sum() > 0)
     assert compared > 10
-
-
-def test_twenty_updates_end_where_one_process_ends_on_the_joined_batches(ranks, float64, tmp_path):
-    trainer = make_trainer(tmp_path, noise_in_batch=True, stages=("end_to_end",), updates=20)
-    trainer.model.unused = torch.nn.Parameter(torch.ones(1))
-    before = {name: value.clone() for name, value in trainer.model.state_dict().items()}
-    (stage,), updates = trainer.stages, count()
-    own = stage.sample
-
-    def joined(_, length):
-        update = next(updates)
-        return torch.cat([own(seed_update(0, 0, update, rank), length) for rank in (0, 1)])
-
-    trainer.stages = [replace(stage, sample=joined)]
-    trainer.fit()
-    after, moved = trainer.model.state_dict(), 0
-    for name, value in ranks[0]["model"].items():
-        # Sums in another order: 1e-16 each, which twenty steps of Adam make larger.
-        torch.testing.assert_close(value, after[name], rtol=0, atol=1e-9, msg=lambda m, name=name: f"{name}: {m}")
-        moved += int((after[name] - before[name]).abs().max() > 1e-3) if value.is_floating_point() else 0
-    assert moved > 10
 
 
 def test_parameters_without_a_gradient(ranks):

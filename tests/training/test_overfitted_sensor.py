@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from torch_denkf import FilterTrainer, FusedFilter, FusedSensor, GaussianLoss, SensorLoss, Stage
+from torch_denkf import FilterTrainer, FusedFilter, FusedSensor, SensorLoss, Stage
 from torch_denkf.modules import ConstantNoise, LinearTransition, MomentPrior, Select
 
 pytestmark = pytest.mark.usefixtures("float64")
@@ -47,12 +47,8 @@ def error(filter, data, camera=True):
     return (mean - data["state"])[:, 10:].square().mean().sqrt().item()
 
 
-@pytest.mark.parametrize("whole", [False, True], ids=["sensor alone", "through the filter"])
-def test_both_are_no_worse_than_one_where_noise_is_learned_on_rows_that_the_head_has_not_seen(tmp_path, whole):
-    """The head is the least squares solution on 40 rows: on these its errors are a seventh of what they are on others.
-
-    Noise that is learned through the filter may be larger than the errors, which last as the state does.
-    """
+def test_both_are_no_worse_than_one_where_noise_is_learned_on_rows_that_the_head_has_not_seen(tmp_path):
+    """The head is the least squares solution on 40 rows: on these its errors are a seventh of what they are on others."""
     seen, held, unseen = record(4, 10, 0), record(8, 40, 1), record(64, 60, 2)
     found = {}
     for name, data in (("seen", seen), ("held", held)):
@@ -60,16 +56,14 @@ def test_both_are_no_worse_than_one_where_noise_is_learned_on_rows_that_the_head
         head.weight.data = torch.linalg.lstsq(seen["picture"].flatten(0, 1), seen["state"].flatten(0, 1)).solution.mT
         before, noise = head.weight.clone(), ConstantNoise([1.0], trainable=True, in_key="encoder")
         filter = make_filter(head, noise)
-        loss = GaussianLoss(filter, score="nll") if whole else SensorLoss(filter, sensor=0.0, noise=1.0)
+        loss = SensorLoss(filter, sensor=0.0, noise=1.0)
         loss.set_keys(sensor="camera")
         settings = {"schedule": "constant", "clip": None, "frozen": ["camera_sensor"]}
-        updates, lr = (25, 0.3) if whole else (80, 0.1)
-        stage = Stage("noise", loss, lambda *_, data=data: data, updates, lr=lr, **settings)
+        stage = Stage("noise", loss, lambda *_, data=data: data, 80, lr=0.1, **settings)
         FilterTrainer(filter, [stage], out=tmp_path / name, device="cpu", progress=False).fit()
         assert head.weight.equal(before)
-        if not whole:
-            variance = (head(data["picture"]) - data["state"]).square().mean().item()
-            assert noise.log_variance.exp().item() == pytest.approx(variance, rel=0.02)
+        variance = (head(data["picture"]) - data["state"]).square().mean().item()
+        assert noise.log_variance.exp().item() == pytest.approx(variance, rel=0.02)
         found[name] = error(filter, unseen)
     alone = error(filter, unseen, camera=False)
     assert alone == pytest.approx(riccati(ENCODER**2), rel=0.03)

@@ -2,15 +2,12 @@
 
 import pytest
 import torch
-from scipy.optimize import minimize_scalar
 from tensordict import TensorDict
 from torch import nn
 from torchrl.record.loggers import CSVLogger
 from torchrl.trainers import ClearCudaCache, CountFramesLog, EarlyStopping, LogScalar
 
 from tests.training.problem import make_trainer
-from torch_denkf.filters import KalmanFilter
-from torch_denkf.objectives import DEnKFLoss
 from torch_denkf.training import FilterTrainer, Stage
 from torch_denkf.training.checkpoint import read_checkpoint
 from torch_denkf.training.update import seed_update
@@ -105,43 +102,6 @@ def test_too_many_that_are_not_finite(tmp_path):
     twin.load_state_dict(state["model"])
     assert all(torch.equal(one, other) for one, other in zip(net.parameters(), twin.parameters(), strict=True))
     assert all(torch.isfinite(p).all() and p.requires_grad for p in net.parameters())
-
-
-def test_the_likelihood_reaches_its_maximum(tmp_path, float64):
-    truth, Q, R, T, rows_ = 0.8, 0.3, 0.2, 12, 64
-    x, readings = torch.randn(rows_), []
-    for _ in range(T):
-        readings.append(x + R**0.5 * torch.randn(rows_))
-        x = truth * x + Q**0.5 * torch.randn(rows_)
-    readings = torch.stack(readings, 1)
-
-    def joint(F):
-        """Mean negative log-likelihood of readings 1 to T - 1, whose covariance is written out."""
-        var = [1.0]
-        for _ in range(T - 1):
-            var.append(F**2 * var[-1] + Q)
-        cov = torch.tensor(
-            [[F ** abs(t - s) * var[min(s, t)] + R * (s == t) for s in range(1, T)] for t in range(1, T)]
-        )
-        density = torch.distributions.MultivariateNormal(torch.zeros(T - 1), cov)
-        return -density.log_prob(readings[:, 1:]).mean().item() / (T - 1)
-
-    best = minimize_scalar(joint, bounds=(0.1, 1.0), method="bounded", options={"xatol": 1e-8})
-    one = torch.eye(1)
-    kalman = KalmanFilter(0.3 * one, one, process_noise_cov=Q * one, noise_cov=R * one, mean=torch.zeros(1), cov=one)
-    del kalman["transition"].matrix
-    kalman["transition"].matrix = nn.Parameter(0.3 * one)
-    nll = DEnKFLoss(kalman, state=0.0, transition=0.0, sensor=0.0, nll=1.0)
-    batch = TensorDict({"observation": readings.unsqueeze(-1)}, [rows_, T])
-    stage = Stage("fit", nll, lambda generator, length: batch.copy(), 150, lr=0.05)
-    trainer = FilterTrainer(
-        kalman, [stage], out=tmp_path, device="cpu", validate=lambda: nll(batch.copy()), validate_every=20
-    )
-    result = trainer.fit()["fit"]
-    fitted = kalman["transition"].matrix.item()
-    assert result["value"] == pytest.approx(best.fun, abs=1e-7)
-    assert fitted == pytest.approx(best.x, abs=1e-3)
-    assert abs(fitted - truth) < 0.1  # three standard errors of 64 x 11 steps are 0.09
 
 
 def test_stages_freeze_and_hand_on(tmp_path):

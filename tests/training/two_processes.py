@@ -15,7 +15,7 @@ from tests.training.problem import make_trainer
 
 def train(out):
     # End to end is not clipped: the gradient after a step is that before.
-    trainer = make_trainer(out, noise_in_batch=True, stages=("end_to_end",), updates=20)
+    trainer = make_trainer(out, noise_in_batch=True, stages=("end_to_end",), updates=3)
     trainer.model.unused = torch.nn.Parameter(torch.ones(1))
     rank, gradients = trainer.processes.rank, []
 

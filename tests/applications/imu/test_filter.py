@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from torch_denkf.applications.imu import imu, imu_rows, orientations
 from torch_denkf.applications.imu.filter import ImuSettings
@@ -51,26 +52,15 @@ def body_log(count=400, rate=100.0, seed=0):
 
 
 def matrix(q):
-    w, x, y, z = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return Rotation.from_quat(q, scalar_first=True).as_matrix()
+
+
+def rotation(v):
+    return Rotation.from_rotvec(v).as_matrix()
 
 
 def skew(v):
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-
-
-def rotation(v):
-    angle = np.linalg.norm(v)
-    if angle < 1e-12:
-        return np.eye(3) + skew(v)
-    k = skew(v / angle)
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
 def left_jacobian(v):
@@ -186,16 +176,6 @@ def test_within_a_block_the_gyro_turns_exactly():
     torch.testing.assert_close(ahead[:, 2], torch.full_like(angle, 0.1), atol=1e-3, rtol=0)
 
 
-@torch.no_grad()
-def test_an_accelerometer_says_nothing_of_the_heading():
-    _, log = body_log(600)
-    del log["magnetometer"]
-    log["gyro"] -= torch.tensor([0.01, -0.02, 0.005])  # its bias
-    model = imu(heading=0.5, gyro_bias=1e-9, gyro_walk=1e-9, gyro_scale=1e-9, gyro_skew=1e-9).double()
-    variance = model.sequence(imu_rows(model.settings, **log, rate=100.0))["belief", "cov"][:, 2, 2]
-    assert variance.min() > 0.97 * 0.5**2  # vectors in the world's axes: 0.21 * 0.5**2
-
-
 def test_a_field_unlike_that_of_the_place_widens_the_heading():
     _, log = body_log(400)
     model = imu().double()
@@ -211,12 +191,8 @@ def test_a_field_unlike_that_of_the_place_widens_the_heading():
 
 def test_a_log_that_is_not_one():
     _, log = body_log(100)
-    with pytest.raises(ValueError, match=r"m/s\^2.*median of its size is 1\."):
-        imu_rows(SETTINGS, log["gyro"], log["acceleration"] / 9.82, rate=100.0)
     with pytest.raises(ValueError, match="at least 5 readings"):
         imu_rows(SETTINGS, log["gyro"][:3], log["acceleration"][:3], rate=100.0)
-    with pytest.raises(ValueError, match="not finite"):
-        imu_rows(SETTINGS, log["gyro"] / 0, log["acceleration"], rate=100.0)
     with pytest.raises(ValueError, match="poles"):
         imu(poles=(1.0, 2.0))
 

@@ -70,7 +70,7 @@ def test_a_start_without_acceleration_is_level(kind):
     torch.testing.assert_close(start[0, :4], sensor[:4])
 
 
-@pytest.mark.parametrize("kind", ["EKF", "UKF", "DEnKF"])
+@pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
 def test_a_run_goes_on_from_what_is_carried(kind):
     """The velocity of the stored belief follows from it and from what the gyro reads then."""
     env = quadruped_env(seed=1)

@@ -9,7 +9,7 @@ import torch
 from torch_denkf.applications.legged import QUADRUPED, LeggedNoises, legged_filter, quadruped_env
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, LeggedSpace
-from torch_denkf.functional.manifolds import SO3, rotation_matrix, skew, whole_parts
+from torch_denkf.functional.manifolds import SO3, rotation_matrix, whole_parts
 from torch_denkf.metrics.state import rotation_error
 
 DT, GRAVITY = 0.01, torch.tensor([0.0, 0.0, -9.81])
@@ -55,26 +55,6 @@ def test_labels_may_be_of_some_vectors_alone():
     assert whole_parts(space, no_turn)[1].nonzero().flatten().tolist() == list(range(9, 15))
     angle = rotation_error(space.plus(truth, 0.5 * torch.eye(21)[1]), truth, space=space)
     torch.testing.assert_close(angle.deg2rad(), torch.tensor([0.5]))
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_errors_move_alike_wherever_the_mean_is(seed):
-    """Without biases the Jacobian is Hartley's, eq. 21: of gravity and the time step alone."""
-    torch.manual_seed(seed)
-    space, motion = LeggedSpace(2), LeggedMotion(2, DT)
-    state = space.exp(torch.randn(space.tangent_dim))
-    imu, feet, stands = 5 * torch.randn(6), torch.randn(6), torch.ones(2)
-
-    def moved(step):
-        points = (space.plus(state, step), state)
-        return space.minus(*(motion.move(point, imu, feet, stands, dt=DT) for point in points))
-
-    found = torch.func.jacrev(moved)(torch.zeros(space.tangent_dim))
-    rows = [*range(9), *range(15, 21)]
-    expected = torch.eye(15)
-    expected[3:6, :3], expected[6:9, :3] = DT * skew(GRAVITY), DT**2 / 2 * skew(GRAVITY)
-    expected[6:9, 3:6] = DT * torch.eye(3)
-    torch.testing.assert_close(found[rows][:, rows], expected, rtol=0, atol=1e-9)
 
 
 def test_noise_is_that_of_steps_in_the_sensors_axes():

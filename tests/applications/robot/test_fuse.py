@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from tests.real_data import SHARED
 from torch_denkf.applications.robot import robot_model
@@ -59,14 +60,7 @@ def write_log(file, seconds=60.0):
 def test_messages_of_ros():
     """Quaternions, covariances, negative ones too, and gravity that leans with the body."""
     roll, pitch, yaw = 0.1, -0.2, 3.0
-    half = np.array([roll, pitch, yaw]) / 2
-    (sr, sp, sy), (cr, cp, cy) = np.sin(half), np.cos(half)
-    quaternion = (
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-        cr * cp * cy + sr * sp * sy,
-    )
+    quaternion = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_quat()
     columns = [f"orientation.{axis}" for axis in "xyzw"]
     columns += [f"angular_velocity.{axis}" for axis in "xyz"] + [f"linear_acceleration.{axis}" for axis in "xyz"]
     columns += [f"angular_velocity_covariance.{k}" for k in range(9)]
@@ -113,14 +107,18 @@ def test_a_state_that_the_log_lacks(tmp_path):
         read_log(tmp_path / "log.csv", config, log_streams(tmp_path / "log.csv"))
 
 
-def test_noises_that_are_learned_are_those_of_the_log(tmp_path):
-    """From a hundred times too large to within a half, of a gyro and of fixes."""
-    write_log(tmp_path / "log.csv", 40.0)
+def planar(folder, seconds, **more):
+    """A log of fixes and a gyro, and the model that reads them."""
+    write_log(folder / "log.csv", seconds)
     settings = {"two_d_mode": True, "frequency": 2.0, "initial_estimate_covariance": [1.0] * 15}
     settings |= {"pose0": "gps", "pose0_config": flags(0, 1), "imu0": "imu", "imu0_config": flags(11)}
-    settings |= {"twist0": "speed", "twist0_config": flags(6, 7)}
-    model = robot_model(settings)
-    log = read_log(tmp_path / "log.csv", model.config, log_streams(tmp_path / "log.csv"))
+    model = robot_model(settings | more)
+    return read_log(folder / "log.csv", model.config, log_streams(folder / "log.csv")), model
+
+
+def test_noises_that_are_learned_are_those_of_the_log(tmp_path):
+    """From a hundred times too large to within a half, of a gyro and of fixes."""
+    log, model = planar(tmp_path, 40.0, twist0="speed", twist0_config=flags(6, 7))
     model = start_of(log, robot_model(drift_settings(log, model)))
     rows = rows_of_log(log, model)
     torch.testing.assert_close(rows["twist0_twist"][5:, 0].mean().item(), 5.0, atol=1.0, rtol=0)
@@ -136,11 +134,7 @@ def test_noises_that_are_learned_are_those_of_the_log(tmp_path):
 
 
 def test_what_was_learned_is_kept_when_it_is_interrupted(tmp_path, monkeypatch):
-    write_log(tmp_path / "log.csv", 20.0)
-    settings = {"two_d_mode": True, "frequency": 2.0, "initial_estimate_covariance": [1.0] * 15}
-    settings |= {"pose0": "gps", "pose0_config": flags(0, 1), "imu0": "imu", "imu0_config": flags(11)}
-    model = robot_model(settings)
-    log = read_log(tmp_path / "log.csv", model.config, log_streams(tmp_path / "log.csv"))
+    log, model = planar(tmp_path, 20.0)
     rows, calls = rows_of_log(log, model), []
 
     def likelihood(model, segments):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from torch_denkf.applications.ur5.simulation.kinematics import (
     READY,
@@ -41,15 +42,6 @@ def tool(scene, joints):
     return data.site("pinch").xpos.copy(), data.site("pinch").xmat.reshape(3, 3).copy(), data
 
 
-def turn(axis, angle):
-    """Rotation matrix about a coordinate axis."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    out = np.eye(3)
-    out[i, i] = out[j, j] = np.cos(angle)
-    out[i, j], out[j, i] = -np.sin(angle), np.sin(angle)
-    return out
-
-
 def test_forward_kinematics_is_that_of_the_makers_parameters(scene):
     rng = np.random.default_rng(0)
     for joints in rng.uniform(-np.pi, np.pi, (50, 6)):
@@ -68,7 +60,7 @@ def test_inverse_kinematics(scene):
         joints = inverse_kinematics(scene, goal, tool_down(yaw, pitch, roll), READY)
         position, rotation, _ = tool(scene, joints)
         np.testing.assert_allclose(position, goal, atol=1.1e-4)
-        expected = turn(2, yaw) @ turn(0, pitch) @ turn(1, roll) @ np.diag([1.0, -1.0, -1.0])
+        expected = Rotation.from_euler("ZXY", [yaw, pitch, roll]).as_matrix() @ np.diag([1.0, -1.0, -1.0])
         np.testing.assert_allclose(rotation, expected, atol=1.1e-4)
     with pytest.raises(Unreachable, match=r"\[2. 0. 0.\] m from the table's centre"):
         inverse_kinematics(scene, np.array([2.0, 0.0, 0.0]), tool_down(0.0), READY)

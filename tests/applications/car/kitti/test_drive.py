@@ -1,7 +1,6 @@
 """The reader, on a layout written by hand with known numbers, and on a few real frames where they are."""
 
 import math
-import shutil
 
 import cv2
 import numpy as np
@@ -146,24 +145,6 @@ def test_errors_name_the_file(case, tmp_path):
 
 
 # Real frames ---------------------------------------------------------------------------------------------------------
-
-
-def real(tmp_path, sequence, camera, frames):
-    """A few frames of a real drive, in a folder of their own."""
-    source = KITTI / "sequences" / sequence
-    if not source.is_dir():
-        pytest.skip(f"no KITTI frames at {source}")
-    target = tmp_path / "sequences" / sequence
-    (target / camera).mkdir(parents=True)
-    (tmp_path / "poses").mkdir()
-    for name in ("calib.txt", "times.txt"):
-        shutil.copy(source / name, target)
-    shutil.copy(KITTI / "poses" / f"{sequence}.txt", tmp_path / "poses")
-    for k in frames:
-        file = source / camera / f"{k:06d}.png"
-        if file.is_file():
-            (target / camera / file.name).symlink_to(file)
-    return tmp_path
 
 
 # The mean step is that of all rows; for 09 the reference code's own statistics say 1.0712 m (full_parameters.pkl).

@@ -8,7 +8,6 @@ from tensordict import TensorDict
 
 from tests.applications.car.vision.drives_for_tests import rendered_motion
 from torch_denkf.applications.car import FlowSensor
-from torch_denkf.applications.car.kitti.mirror import mirror_drive
 from torch_denkf.applications.car.vision.expansion import focus_of_expansion
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS
 
@@ -192,9 +191,3 @@ def test_corners_tell_turn_and_pitch_where_there_are_any(float64):
     out = sensor(frame)
     torch.testing.assert_close(out["sensor", "ensemble"][:, 1], torch.full((5,), 0.03 / DT))
     assert not out["sensor", "encoding"][-5:].any()
-
-
-def test_corners_of_a_mirrored_world_turn_the_other_way(float64):
-    frame = TensorDict({"two_view": torch.tensor([0.05, 0.01, 0.02, 0.03, -0.02, 1e-3, 1e-3, 0.9])})
-    mirrored = mirror_drive(frame)["two_view"]
-    torch.testing.assert_close(mirrored, torch.tensor([-0.05, 0.01, -0.02, -0.03, -0.02, 1e-3, 1e-3, 0.9]))

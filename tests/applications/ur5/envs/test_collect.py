@@ -95,15 +95,27 @@ def test_pictures_are_of_their_steps(tmp_path, domain):
             row = env.step(row.set("action", torch.from_numpy(demo.action[step])))["next"]
         assert (np.stack(pictures) == demo.pixels).all()
         env.close()
-    seen = [tuple(demo.steps) for demo in demos_of(tmp_path)]
-    assert seen[0] != seen[1]
-    every = tmp_path / "every"
-    collect_ur5_demos(every, 1, frames=0, max_steps=5, **options)
-    (demo,) = demos_of(every)
-    assert demo.steps.tolist() == [0, 1, 2, 3, 4]
-    assert (demo.state == demos_of(tmp_path)[0].state[:5]).all()
     data = UR5ExperienceReplay(tmp_path, split="all", frames_only=True, cache=None)
     assert (data[:]["pixels"].numpy()[:4] == demos_of(tmp_path)[0].pixels.astype(np.float32) / 255).all()
+
+
+def test_an_interrupted_run_goes_on(unbroken, tmp_path):
+    """``tests/deployment`` shows that workers end with a killed parent, and that a second process must wait."""
+    made = []
+
+    def stop(count):
+        made.append(count)
+        if sum(made) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        collect_ur5_demos(tmp_path, DEMOS, **BLIND, progress=stop)
+    with (tmp_path / MANIFEST).open("a") as file:
+        file.write('{"demo": 39, "file": "demo-0000')  # killed while writing the line
+    stamp = (tmp_path / "demo-000000.npz").stat().st_mtime_ns
+    collect_ur5_demos(tmp_path, DEMOS, **BLIND)
+    assert (tmp_path / "demo-000000.npz").stat().st_mtime_ns == stamp  # not made again
+    assert content(tmp_path) == content(unbroken)
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "missing"])
