@@ -25,9 +25,6 @@ KILLS = {
     "two_processes": [("sample", 8)],
 }
 
-#: A run without tensorboard, whose files are named after the time: one kill in each run.
-PLAIN_KILLS = [("sample", 2), ("before replace", 2), ("log", 2), ("validate", 2), ("after replace", 1)]
-
 
 def fork(work, environment):
     """Works in a new process; returns its number."""
@@ -56,15 +53,15 @@ def in_processes(*works):
     return codes[0]
 
 
-def train(out, kill=(), loggers=("csv", "tensorboard")):
-    trainer = make_trainer(out, kill=kill, loggers=loggers)
+def train(out, kill=()):
+    trainer = make_trainer(out, kill=kill, loggers=("csv", "tensorboard"))
     trainer.fit()
     torch.save(trainer.model.state_dict(), Path(out) / f"final_{trainer.processes.rank}.pt")
 
 
-def run(out, kill=(), processes=1, **options):
+def run(out, kill=(), processes=1):
     """Trains; only the first process is killed, the others lose their partner and fail."""
-    works = [partial(train, out, kill if rank == 0 else (), **options) for rank in range(processes)]
+    works = [partial(train, out, kill if rank == 0 else ()) for rank in range(processes)]
     return in_processes(*works)
 
 
@@ -78,10 +75,6 @@ def main(folder):
             code = run(folder / name, kill, processes)
             assert code == -9, f"{name}: {kill} ended with {code}"
         assert run(folder / name, processes=processes) == 0, name
-    assert run(folder / "plain", loggers=("csv",)) == 0
-    for kill in PLAIN_KILLS:
-        assert run(folder / "plain_kills", kill, loggers=("csv",)) == -9, kill
-    assert run(folder / "plain_kills", loggers=("csv",)) == 0
 
 
 if __name__ == "__main__":

@@ -22,14 +22,8 @@ def ranks(tmp_path_factory):
     return [torch.load(out / f"rank_{rank}.pt", weights_only=False) for rank in (0, 1)]
 
 
-def test_parameters_end_equal(ranks):
-    first, second = (rank["model"] for rank in ranks)
-    assert all(torch.equal(first[name], second[name]) for name in first)
-    assert ranks[0]["result"] == ranks[1]["result"]
-    assert ranks[0]["result"]["end_to_end"]["value"] > 0
-
-
 def test_gradient_is_that_of_the_joined_batch(ranks, float64, tmp_path):
+    assert ranks[0]["result"] == ranks[1]["result"]
     trainer = make_trainer(tmp_path, noise_in_batch=True, stages=("end_to_end",))
     stage = trainer.stages[0]
     batches = [stage.sample(seed_update(0, 0, 0, rank), stage.length(0)) for rank in (0, 1)]

@@ -1,5 +1,7 @@
 """Oracles: a training loop written out by hand, the maximum of a closed-form likelihood, scripted validations."""
 
+import copy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -184,12 +186,9 @@ def test_a_stage_that_gained_nothing_is_said_and_why_that_is_likely(tmp_path, ca
 
 
 def test_validation_leaves_the_training_alone(tmp_path):
-    finals = []
+    finals, first = [], nn.Linear(2, 1)
     for draws in (0, 5):
-        net = nn.Linear(2, 1)
-        nn.init.ones_(net.weight)
-        nn.init.zeros_(net.bias)
-        seen = []
+        net, seen = copy.deepcopy(first), []
 
         def validate(draws=draws, seen=seen):
             seen.append(torch.rand(draws + 1).sum().item())
@@ -246,15 +245,12 @@ OF_THE_LOSS = {
 
 @pytest.mark.parametrize("what", [*OF_THE_TRAINER, *OF_THE_LOSS])
 def test_mistakes(what, tmp_path):
-    net = nn.Linear(2, 1)
+    net, options = nn.Linear(2, 1), {"out": tmp_path, "device": "cpu", **OF_THE_TRAINER.get(what, ({},))[0]}
+    stages = [line_stage(net)] * options.pop("stages", 1)
+    if what in OF_THE_LOSS:
+        stages = [Stage("fit", lambda batch: OF_THE_LOSS[what][0](net, batch["x"]), stages[0].sample, 1)]
     with pytest.raises(ValueError, match={**OF_THE_TRAINER, **OF_THE_LOSS}[what][1]):
-        if what in OF_THE_TRAINER:
-            options = dict(OF_THE_TRAINER[what][0])
-            stages = [line_stage(net)] * options.pop("stages", 1)
-            FilterTrainer(net, stages, out=tmp_path, device="cpu", **options)
-        else:
-            stage = Stage("fit", lambda batch: OF_THE_LOSS[what][0](net, batch["x"]), line_stage(net).sample, 1)
-            FilterTrainer(net, [stage], out=tmp_path, device="cpu").fit()
+        FilterTrainer(net, stages, **options).fit()
 
 
 def test_a_monitor_that_is_not_validated(tmp_path):

@@ -15,7 +15,7 @@ from torch_denkf.pretrained import from_pretrained
 cv2.setNumThreads(1)
 SIZE = (25, 75)
 #: One training, as words of the command and as arguments of ``train_car_filter``.
-WORDS = "--size 25 75 --seed 3 --sensor-updates 6 --filter-updates 4 --end-to-end-updates 3 --length 6".split()
+WORDS = "--size 25 75 --seed 3 --sensor-updates 6 --filter-updates 4 --end-to-end-updates 3 --length 6"
 OPTIONS = {"size": SIZE, "seed": 3, "updates": Updates(sensor=6, filter=4, end_to_end=3, length=6), "progress": False}
 
 
@@ -32,7 +32,7 @@ def training(root, tmp_path_factory):
     """The folder of a training, and what the command said."""
     folder, said = tmp_path_factory.mktemp("car"), io.StringIO()
     with contextlib.redirect_stdout(said):
-        assert main(["train", "--root", str(root), "--out", str(folder), *WORDS]) == 0
+        assert main(["train", "--root", str(root), "--out", str(folder), *WORDS.split()]) == 0
     return folder, said.getvalue()
 
 

@@ -10,7 +10,7 @@ from torch_denkf.functional.manifolds import SO3
 
 
 def write_csv(file, table):
-    names = "t,gx,gy,gz,ax,ay,az,mx,my,mz".split(",")[: table.shape[1]]
+    names = ["t", "gx", "gy", "gz", "ax", "ay", "az", "mx", "my", "mz"][: table.shape[1]]
     np.savetxt(file, table, delimiter=",", header=",".join(names), comments="", fmt="%.9f")
 
 

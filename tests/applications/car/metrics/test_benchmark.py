@@ -36,22 +36,6 @@ def test_a_window_of_all_steps_fits_and_one_more_does_not():
         metric(torch.zeros(200, 5), torch.zeros(200, 5))
 
 
-def test_pathlength_error_by_hand():
-    truth = straight(201, step=0.5)
-    estimated = truth.clone()
-    estimated[:101, 0] *= 1.2  # 60 m instead of 50 m,
-    estimated[101:, 0] = 60 + 0.4 * torch.arange(1, 101)  # then 40 m instead of 50 m
-    estimated[100, 2] = -0.25
-    estimated[200, 2] = 0.5
-    errors = kitti_pathlength_error(estimated, truth)
-    assert errors.windows == (100, 200)
-    torch.testing.assert_close(errors.window_translation, torch.tensor([0.2, 0.0]).double())
-    expected = torch.tensor([math.degrees(0.25) / 50, math.degrees(0.5) / 100], dtype=torch.float64)
-    torch.testing.assert_close(errors.window_rotation, expected)
-    torch.testing.assert_close(errors.translation.item(), 0.1)
-    torch.testing.assert_close(errors.rotation, expected.mean())
-
-
 def test_what_the_pathlength_error_is_blind_to():
     truth = straight(101)
     backwards = truth * torch.tensor([-1.0, 1.0, 1.0])

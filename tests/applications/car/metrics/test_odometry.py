@@ -27,17 +27,6 @@ def test_speed_bias_of_a_tenth_is_a_tenth_of_a_metre_for_each_metre():
             torch.testing.assert_close(error.window_translation, expected)
 
 
-def test_the_length_is_that_of_the_path_and_not_of_the_chord():
-    # Ten steps out and ten back: the truth ends where it began, after 20 m; the estimate 4 m beside it.
-    x = torch.cat([torch.arange(11.0), torch.arange(9.0, -1.0, -1.0)]).double()
-    truth = torch.stack([x, 0 * x, 0 * x], -1)
-    estimated = truth.clone()
-    estimated[-1, 1] = 4.0
-    error = kitti_endpoint_error(estimated, truth, window=20)
-    assert error.windows == 1
-    torch.testing.assert_close(error.translation.item(), 4 / 20)
-
-
 def test_standing_windows_are_left_out():
     truth = torch.cat([straight(11), straight(11)[-1:].expand(20, 3)])
     estimated = truth * torch.tensor([1.2, 1.0, 1.0])

@@ -153,17 +153,6 @@ def test_a_smoothed_path_is_that_of_a_kalman_filter_of_velocity_and_way(float64)
     torch.testing.assert_close(found[True][:, 3:], found[False][:, 3:], rtol=0, atol=1e-12)  # velocities are the same
 
 
-def test_velocities_go_on_changing_by_a_share_of_their_last_change(float64):
-    transition = UnicycleTransition(torch.zeros_like, DT, history_key=("belief", "history"))
-    with torch.no_grad():
-        transition.raw_trend.copy_(torch.tensor([0.0, -torch.log(torch.tensor(3.0))]))  # a half and a quarter
-    state = torch.tensor([[0.0, 0.0, 0.0, 6.0, 0.4], [0.0, 0.0, 0.0, 7.0, 0.1]])
-    history = torch.tensor([[[6.0, 0.4], [8.0, 0.0]], [[7.0, 0.1], [7.0, 0.1]]])
-    out = transition(TensorDict({"belief": {"ensemble": state, "history": history}}))["forecast", "ensemble"]
-    torch.testing.assert_close(out[:, 3:], torch.tensor([[5.0, 0.5], [7.0, 0.1]]), rtol=0, atol=1e-12)
-    torch.testing.assert_close(out[0, 0], 5.0 * DT * torch.tensor(0.5 * DT / 2).cos(), rtol=0, atol=1e-12)
-
-
 def test_an_ekf_with_clones_is_the_kalman_filter_with_clones(float64):
     """Without turning all is linear: the EKF on the cloned state must be exact, the trend included."""
     steps = [0, 1, 0, 2, 1, 0, 0, 3, 1]

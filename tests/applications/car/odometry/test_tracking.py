@@ -148,10 +148,6 @@ def test_a_camera_that_does_not_fit_is_noticed(moving):
     suggested = float(message.split("Pass pitch=")[1].split(",")[0])
     assert abs(suggested) < 0.03, "the camera is level"
     assert messages(moving, pitch=suggested) == []
-    strange = moving.clone()
-    strange["image"] = torch.randint(0, 256, strange["image"].shape, dtype=torch.uint8)
-    (message,) = messages(strange)
-    assert "the road does not look like a plane under this camera" in message
     (message,) = messages(moving, height=4.5)
     assert "m between two frames, where the sensor's range ends" in message
 
