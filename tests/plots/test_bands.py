@@ -78,7 +78,7 @@ def test_each_component_is_shaded_by_its_own_sensors_mask():
     np.testing.assert_allclose(spans[2], [(0.45, 0.55)])
     assert line(panels[0], "readings")[1].tolist() == [float(t) for t in range(40) if t not in (30, 31)]
     labels = [text.get_text() for text in panels[0].get_legend().get_texts()]
-    assert labels == ["not observed", "90 % of the belief", "truth", "belief", "readings"]
+    assert labels == ["not observed", "90 % of the belief", "readings", "truth", "belief"]
     assert line(panels[2], "readings")[1].tolist() == [10.0 * t for t in range(40) if t not in (5, 7)]
     with pytest.raises(ValueError, match=r"observed of \[1\] belong to no drawn component"):
         plot_bands(run, dims=[0], observed={1: encoder})

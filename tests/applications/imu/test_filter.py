@@ -177,7 +177,7 @@ def test_within_a_block_the_gyro_turns_exactly():
 
 
 def test_a_field_unlike_that_of_the_place_widens_the_heading():
-    _, log = body_log(400)
+    _, log = body_log(250)
     model = imu().double()
     found = orientations(model, **log, rate=100.0)
     field = found.mean[-1, 28:30]
