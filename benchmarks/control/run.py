@@ -26,7 +26,6 @@ class Budget:
     """What all arms of all tasks may use.
 
     Attributes:
-        rate: factor on the task's learning rate of PPO; ``None`` for what the search chose for the arm.
         env_steps: in the place of the task's; ``None`` for those.
         tests: in a run, evenly spaced.
         episodes: of a test.
@@ -35,7 +34,6 @@ class Budget:
         every: environment steps for each update of SAC, in the place of the task's; ``None`` for those.
     """
 
-    rate: float | None = None
     env_steps: int | None = None
     tests: int = 5
     episodes: int = 100
@@ -58,16 +56,6 @@ def shifted_names(task: Task, cell: tuple[float, float]) -> list[str]:
     if task.shift is None or cell[0] != task.shift_from:
         return []
     return [text.format(cell_name((task.shift, cell[1]))) for text in (SHIFTED, LEFT)]
-
-
-def planned_tests(task_name: str, cell: tuple[float, float], arm_name: str, budget: Budget) -> list[tuple[str, int]]:
-    """Of each row of a run the cell's name, and the environment steps."""
-    task = TASKS[task_name]
-    batches, tested = batches_of(task, budget)
-    rows = [(cell_name(cell), number) for number in tested]
-    after = shifted_names(task, cell)[: 2 if ARMS[arm_name].filter else 1]
-    rows += [(name, batches) for name in after]
-    return [(name, number * task.count * task.steps) for name, number in rows]
 
 
 def rollout(env: EnvBase, policy: TensorDictModuleBase | None, steps: int, kind: ExplorationType) -> TensorDict:
@@ -118,8 +106,7 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
     if isinstance(settings, sac.Settings):
         settings = replace(settings, every=budget.every or settings.every)
     elif isinstance(settings, ppo.Settings):
-        rate = RATES.get((task_name, arm_name), 1.0) if budget.rate is None else budget.rate
-        settings = replace(settings, lr=rate * settings.lr)
+        settings = replace(settings, lr=RATES.get((task_name, arm_name), 1.0) * settings.lr)
     inputs = Inputs(seen, actions, torch.tensor(task.scale), task.limit)
     within = {"filter": filter} if arm.end_to_end else {}
     agent = task.agent(arm, inputs, settings, batches, **within)

@@ -18,8 +18,8 @@ from torch_denkf.data.lerobot.replay import is_for_tests
 from torch_denkf.data.lerobot.rows import recording_from_rows
 
 ARM, HAND = range(7, 14), range(20, 26)  # numbers of the robot's 26: the right arm, rad, and the right hand, 0 to 1
-JOINTS, FINGERS = len(ARM), len(HAND)
-READ = JOINTS + FINGERS  # numbers that a sensor reads: arm, then hand
+FINGERS = len(HAND)
+READ = len(ARM) + FINGERS  # numbers that a sensor reads: arm, then hand
 NAMES = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
 LAGS = range(-8, 11)  # rows that are tried
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +9,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from benchmarks.common.arm import JOINTS
+from benchmarks.common.arm.readings import code_of, read_heads
 from benchmarks.g1.disturbances import MARGIN, before_another, disturb
-from benchmarks.g1.recordings import FINGERS, JOINTS, READ
+from benchmarks.g1.recordings import FINGERS, READ
 from benchmarks.g1.trunk import SecondLookTrunk
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import ImageSensor
@@ -69,36 +70,6 @@ def build_sensor(facts: Statistics) -> ImageSensor:
     return sensor
 
 
-def code_of(sensors: Sequence[ImageSensor], pixels: Tensor) -> Tensor:
-    """Features of the sensors' trunks, one behind the other, ``[N, F]``, of pictures ``[N, 3, H, W]``."""
-    return torch.cat([one._features(pixels, None) for one in sensors], -1)
-
-
-def read_code(
-    sensors: Sequence[ImageSensor], code: Tensor, size: int, generator: torch.Generator | None = None
-) -> tuple[Tensor, Tensor]:
-    """Samples ``[*B, size, 13]`` and encoding ``[*B, F]`` of the sensors' heads, of features ``[*B, F]``.
-
-    The samples are split among the sensors, which were trained from different random numbers: their spread is also that
-    of what training leaves open. The encoding holds its logarithm, behind those of the heads.
-    """
-    parts, hidden = [], []
-    for k, (one, own) in enumerate(zip(sensors, code.chunk(len(sensors), -1), strict=True)):
-        head, count = one.module["head"], size // len(sensors) + (k < size % len(sensors))
-        noise = head.draw_noise(own.shape[:-1], count, dtype=own.dtype, generator=generator)
-        samples, seen = head(own.unsqueeze(-2), noise, with_hidden=True)
-        parts.append(samples.expand(*own.shape[:-1], count, -1))
-        hidden.append(seen.mean(-2))
-    samples = torch.cat(parts, -2)
-    spread = samples.detach().std(-2).clamp_min(1e-4).log()
-    return sensors[0].loc + sensors[0].scale * samples, torch.cat([*hidden, spread], -1)
-
-
-def encoding_size(sensors: Sequence[ImageSensor]) -> int:
-    """F of :func:`read_code`'s encoding."""
-    return sum(one.module["head"].layers[-1].in_features for one in sensors) + READ
-
-
 class FrameLoss(nn.Module):
     """CRPS of a sensor's samples in units of a good sensor's errors; and where it looks closely."""
 
@@ -109,7 +80,7 @@ class FrameLoss(nn.Module):
     def forward(self, frames: TensorDict) -> dict[str, Tensor]:
         """Scores frames ``[N]``."""
         code = code_of([self.sensor], frames["pixels"])
-        score = (crps_ensemble(read_code([self.sensor], code, SAMPLES)[0], frames["target"]) / UNIT).mean(0)
+        score = (crps_ensemble(read_heads([self.sensor], code, SAMPLES)[0], frames["target"]) / UNIT).mean(0)
         return {
             "loss_joints": score[:JOINTS].mean(),
             "loss_hand": 0.3 * score[JOINTS:].mean(),
@@ -162,7 +133,7 @@ def sensor_error(sensor: ImageSensor, pool: FramePool) -> dict[str, float]:
     scores, errors = [], []
     generator = torch.Generator().manual_seed(0)
     for index in torch.arange(len(pool)).split(128):
-        samples, _ = read_code([sensor], code_of([sensor], pool.pixels[index].float() / 255), SAMPLES, generator)
+        samples, _ = read_heads([sensor], code_of([sensor], pool.pixels[index].float() / 255), SAMPLES, generator)
         scores.append(crps_ensemble(samples, pool.target[index]) / UNIT)
         errors.append((samples.mean(-2) - pool.target[index]).abs())
     sensor.train()

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
-from benchmarks.common.close_look import FEATURES, CloseLook
+from benchmarks.common.arm.close_look import FEATURES, CloseLook
 from torch_denkf.modules import KeypointTrunk
 
 REACH = 0.34  # half a patch's side, in half widths of the picture: hand and wrist

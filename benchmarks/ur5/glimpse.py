@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from benchmarks.common.close_look import FEATURES, CloseLook
+from benchmarks.common.arm.close_look import FEATURES, CloseLook
 from torch_denkf.applications.ur5.simulation.domains import SIM, Domain
 from torch_denkf.modules import KeypointTrunk
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from tensordict import NestedKey, TensorDict
@@ -231,57 +230,33 @@ def disturb(frames: TensorDict, generator: torch.Generator, times: int = 1) -> T
 
 @torch.no_grad()
 def sensor_error(sensor: ImageSensor, preset: Preset, pool: FramePool) -> dict[str, float]:
-    """CRPS in the same units, and mean absolute errors in degrees and cm."""
-    scores, joints, places = [], [], []
+    """CRPS in the same units."""
+    scores = []
     for index in torch.arange(len(pool)).split(256):
         frames = pool.rows(index)
         samples = sensor(frames)["sensor", "ensemble"]
-        truth = frames["state"]
-        scores.append(crps_ensemble(samples, preset.observe(truth)) / unit_of(preset.dim))
-        error = (preset.state_of(samples.mean(1), truth[:, WRIST]) - truth).abs()
-        joints.append(error[:, :7].rad2deg())
-        places.append(100 * error[:, 7:])
-    return {
-        "crps": float(torch.cat(scores).mean()),
-        "joint_mae_deg": float(torch.cat(joints).mean()),
-        "ee_mae_cm": float(torch.cat(places).mean()),
-    }
+        scores.append(crps_ensemble(samples, preset.observe(frames["state"])) / unit_of(preset.dim))
+    return {"crps": float(torch.cat(scores).mean())}
 
 
 def train_sensor(
-    sensor: ImageSensor,
-    preset: Preset,
-    train: FramePool,
-    held_out: FramePool,
-    *,
-    out: Path,
-    seed: int,
-    updates: int,
-    lr: float = 2e-3,
-    batch: int = 64,
-    times: int = 1,
+    sensor: ImageSensor, preset: Preset, pools: Sequence[FramePool], updates: int, lr: float, times: int = 1, **settings
 ) -> ImageSensor:
     """Trains a sensor, or goes on where that was broken off, or reads it where it was done.
 
-    ``times`` is that of :func:`disturb`: by how much the frames of both pools were shrunk.
+    Args:
+        sensor: trained in place.
+        preset: what it reads.
+        pools: frames to train on, and to choose by.
+        updates: of 64 frames each.
+        lr: learning rate.
+        times: by how much these frames were shrunk, see :func:`disturb`.
+        **settings: of :func:`~torch_denkf.training.parts.train_part`.
     """
+    train, held_out = pools
     terms = {"loss_joints": slice(-3), "loss_place": slice(-3, None)}
-    stage = Stage(
-        "sensor",
-        SensorLoss(sensor, lambda frames: preset.observe(frames["state"]), unit_of(preset.dim), terms),
-        lambda generator, _: disturb(train.sample(generator, batch), generator, times),
-        updates,
-        lr=lr,
-        weight_decay=0.02,
-    )
-    return train_part(
-        sensor,
-        stage,
-        out=out,
-        validate=lambda: sensor_error(sensor, preset, held_out),
-        monitor="crps",
-        validate_every=max(updates // 8, 1),
-        save_every=200,
-        seed=seed,
-        device="cpu",
-    ).eval()
+    loss = SensorLoss(sensor, lambda frames: preset.observe(frames["state"]), unit_of(preset.dim), terms)
+    sample = lambda generator, _: disturb(train.sample(generator, 64), generator, times)  # noqa: E731
+    settings |= {"monitor": "crps", "validate_every": max(updates // 8, 1), "save_every": 200, "device": "cpu"}
+    stage = Stage("sensor", loss, sample, updates, lr=lr, weight_decay=0.02)
+    return train_part(sensor, stage, validate=lambda: sensor_error(sensor, preset, held_out), **settings).eval()

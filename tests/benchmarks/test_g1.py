@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
+from benchmarks.g1.scores import scores
 from tensordict import TensorDict
 
 from benchmarks.g1.motion import with_rates
 from benchmarks.g1.recordings import JOINTS, Recordings, Roles, drawn_recording
-from benchmarks.g1.scores import scores
 from torch_denkf.data import LeRobotReplay
 
 COUNT, STEPS, MEMBERS, FEATURES = 4, 60, 8, 5

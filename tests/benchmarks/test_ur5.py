@@ -3,9 +3,9 @@
 import math
 
 import pytest
+from benchmarks.ur5.evaluation import errors
 
 from benchmarks.ur5.demos import Roles
-from benchmarks.ur5.evaluation import errors
 from tests.benchmarks.ur5_for_tests import states
 
 
