@@ -74,11 +74,18 @@ def markdown(frame: pd.DataFrame) -> list[str]:
 
 
 def write_table(rows: Iterable[dict], file: Path, order: Sequence[str]) -> pd.DataFrame:
-    """Writes rows as CSV, sorted by some columns, with five digits; returns them as they are there."""
-    frame = pd.DataFrame(rows).convert_dtypes().sort_values(list(order), kind="stable")
+    """Writes rows as CSV with five digits, sorted by some columns if any; returns them as they are there."""
+    frame = pd.DataFrame(rows).convert_dtypes()
+    frame = frame.sort_values(list(order), kind="stable") if order else frame
     with replacing(file) as beside:
         frame.to_csv(beside, index=False, float_format="%.5g")
     return pd.read_csv(file)
+
+
+def records(file: Path) -> list[dict]:
+    """Rows of a CSV, without what is empty; none where there is no file."""
+    rows = pd.read_csv(file).to_dict("records") if file.exists() else []
+    return [{key: value for key, value in row.items() if pd.notna(value)} for row in rows]
 
 
 def write_page(page: str, file: Path | None) -> None:

@@ -42,16 +42,14 @@ def page(frame: pd.DataFrame, methods: Sequence[str], joints: Sequence[str], lin
     over = frame[own].groupby([*methods, "condition"], sort=False)
     mean, std = over.mean(numeric_only=True), over.std(numeric_only=True)
     mean["cell"] = mean.apply(_cell, axis=1)
-    table = mean["cell"].unstack("condition")[list(dict.fromkeys(mean.index.get_level_values("condition")))]
+    others = sorted(set(frame["condition"]) - {CLEAN})
+    table = mean["cell"].unstack("condition")[[CLEAN, *others]]
     clean, spread = (part.xs(CLEAN, level="condition") for part in (mean, std))
-    table["by joint, clean"] = clean.apply(
-        lambda row: ", ".join(f"{row[f'{name}_deg']:.1f}" for name in joints), axis=1
-    )
-    for column, form in (("crps", "{:.3f}"), ("ms_per_step", "{:.2f}")):
-        table[column] = [
-            "" if pd.isna(value) else form.format(value) + (f" ± {form.format(wide)}" if seeds > 2 else "")
-            for value, wide in zip(clean[column], spread[column], strict=True)
-        ]
+    table["by joint, clean"] = clean[[f"{name}_deg" for name in joints]].map("{:.1f}".format).agg(", ".join, axis=1)
+    for column, form in {"crps": "{:.3f}", "ms_per_step": "{:.2f}"}.items():
+        if column in clean:
+            table[column] = clean[column].map(form.format, na_action="ignore")
+            table[column] += " ± " + spread[column].map(form.format) if seeds > 2 else ""
     ranked = clean.reset_index().sort_values([*methods[:-1], "joint_mae_deg"]).set_index(methods).index
     cells = "Cells: joints, deg / end effector, cm / coverage of the joints' 90 % intervals; ±: standard deviation."
     out = [*lines, "", f"Means over {seeds} seed(s). {cells}", "", *markdown(table.loc[ranked])]
