@@ -9,13 +9,15 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from benchmarks.common.arm import Roles
 from benchmarks.common.arm.motion import with_rates
 from benchmarks.common.arm.readings import read_codes
+from benchmarks.common.arm.sensors import Statistics, train_sensor
 from benchmarks.g1.aim import HandPlace
 from benchmarks.g1.disturbances import failing
 from benchmarks.g1.motion import delayed
-from benchmarks.g1.recordings import ARM, Recordings, Roles, bytes_of, rows_of, targets
-from benchmarks.g1.sensors import FramePool, Statistics, build_sensor, train_sensor
+from benchmarks.g1.recordings import ARM, Recordings, bytes_of, rows_of, targets
+from benchmarks.g1.sensors import FrameLoss, FramePool, build_sensor
 from torch_denkf.modules import ImageSensor
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
@@ -81,8 +83,9 @@ class TrainedSensor:
         for k, folder in enumerate(folders):
             seed = self.seed + 1000 * k
             torch.manual_seed(seed)
-            settings = {"seed": seed, "updates": self.budget.updates, "batch": self.budget.frames}
-            sensors.append(train_sensor(build_sensor(facts), train, held_out, out=folder, **settings).eval())
+            sensor, sample = build_sensor(facts), lambda generator: train.sample(generator, self.budget.frames)
+            settings = {"out": folder, "seed": seed, "updates": self.budget.updates, "lr": 2e-3, "weight_decay": 0.05}
+            sensors.append(train_sensor(sensor, FrameLoss(sensor), sample, held_out, **settings))
         write_checkpoint(facts_file, vars(facts))
         return sensors, facts
 

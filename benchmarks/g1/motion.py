@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from benchmarks.common.arm import JOINTS
 from benchmarks.common.arm.motion import ArmMotion
-from benchmarks.g1.sensors import Statistics
+from benchmarks.common.arm.sensors import Statistics
 
 DELAYS = (0, 2)  # rows: the robot follows a command after some
 AHEAD = 8  # rows that the motion runs by itself in training

@@ -247,8 +247,9 @@ def walked(study: Study, kind: str) -> list[dict]:
     noises = chosen(make, f"{kind}, all grounds", feet_grid(study.smoke), study.out)
     training = simulated(kind, study.training_runs, length, study.seed + 1)
     validation = make()
-    contacts = learned_contacts(training, validation, noises, study.updates)
-    lstm = trained_lstm(training, validation, contacts, study.lstm_updates)
+    out = study.out / "trained" / kind
+    contacts = learned_contacts(training, validation, noises, study.updates, out)
+    lstm = trained_lstm(training, validation, contacts, study.lstm_updates, out)
     if kind == "quadruped":
         _save(contacts, noises, study)
     robots = grounds(study, kind)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from benchmarks.common.arm import Roles
 from torch_denkf.applications.ur5 import UR5ExperienceReplay
 from torch_denkf.applications.ur5.envs.collect import collect_ur5_demos
 
@@ -65,7 +67,7 @@ class FramePool:
     state: Tensor
 
     @classmethod
-    def of(cls, data: UR5ExperienceReplay, chosen: set[int]) -> FramePool:
+    def of(cls, data: UR5ExperienceReplay, chosen: Sequence[int]) -> FramePool:
         """Frames with a picture of chosen demos, of a replay with ``frames_only``."""
         wanted = torch.tensor([episode.demo in chosen for episode in data.episodes])
         rows = wanted[data.storage[:]["episode"]].nonzero().squeeze(-1)
@@ -95,25 +97,6 @@ class FramePool:
         return self.rows(torch.randint(len(self), (batch,), generator=generator))
 
 
-@dataclass(frozen=True)
-class Roles:
-    """Numbers of demos by what they are for."""
-
-    sensor: set[int]  # trains the sensor
-    tune: list[int]  # sequences that train the filter, unseen by the sensor
-    validation: list[int]  # sequences to choose by, unseen by both
-    test: list[int]
-
-    def __post_init__(self):
-        tested = set(self.test)
-        for name in ("sensor", "tune", "validation"):
-            leaked = tested & set(getattr(self, name))
-            if leaked:
-                raise ValueError(f"demos {sorted(leaked)} would be tested on and used as {name}")
-        if self.sensor & {*self.tune, *self.validation}:
-            raise ValueError("the filter must learn from demos that its sensor has not seen")
-
-
 def _numbers(collections: Collections, name: str, split: str, end: int) -> list[int]:
     """Returns the demos of one side, numbered below ``end``: the folder may hold more than are asked for."""
     return [episode.demo for episode in collections.replay(name, split).episodes if episode.demo < end]
@@ -125,7 +108,7 @@ def sim_roles(collections: Collections) -> Roles:
     sequences = _numbers(collections, "sim-sequences", "train", collections.sequences)
     test = _numbers(collections, "sim-sequences", "test", collections.sequences)
     held = min(max(len(sequences) // 7, 1), collections.validation)
-    sensor = {e.demo for e in frames.episodes if e.demo >= collections.sequences}
+    sensor = [e.demo for e in frames.episodes if e.demo >= collections.sequences]
     return Roles(sensor, sequences[:-held][: collections.tune], sequences[-held:], test)
 
 
@@ -135,4 +118,4 @@ def real_roles(collections: Collections) -> Roles:
     test = _numbers(collections, "real_like-sequences", "test", collections.real)
     own = max(len(train) * 7 // 10, 1)
     held = max((len(train) - own) // 3, 1)
-    return Roles(set(train[:own]), train[own:-held], train[-held:], test)
+    return Roles(train[:own], train[own:-held], train[-held:], test)

@@ -8,8 +8,9 @@ from torch import Tensor, nn
 
 from benchmarks.common.arm import JOINTS
 from benchmarks.common.arm.motion import ArmMotion
+from benchmarks.common.arm.sensors import Statistics
 from benchmarks.ur5.demos import STATE
-from benchmarks.ur5.sensors import PLACE_UNIT, Statistics
+from benchmarks.ur5.sensors import PLACE_UNIT
 
 SIZE = STATE + 2 * JOINTS  # of the filters' state
 AHEAD = 4  # steps that the motion is trained on

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from benchmarks.common.arm import JOINTS, recipes
 from benchmarks.common.arm.recipes import ArmRecipe
+from benchmarks.common.arm.sensors import Statistics
 from benchmarks.common.recipes import Registry
 from benchmarks.ur5.demos import STATE
 from benchmarks.ur5.motion import ACCELERATIONS, RATES, SIZE, Motion
-from benchmarks.ur5.sensors import MEMBERS, NEAR, NearForecast, Preset, Statistics, unit_of
+from benchmarks.ur5.sensors import MEMBERS, NEAR, NearForecast, Preset, unit_of
 from torch_denkf.filters import Filter
 from torch_denkf.modules import DiagonalNoise, ImageSensor, ScaledNoise, SubModel
 

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 
+from benchmarks.common.arm.sensors import Statistics, camera_sensor, train_sensor
 from benchmarks.common.scores import SensorLoss
 from benchmarks.ur5.demos import STATE, FramePool
-from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
+from benchmarks.ur5.glimpse import aim, glimpse_trunk, keypoint_trunk, project
 from torch_denkf.applications.ur5.simulation.domains import SIM, Domain
 from torch_denkf.envs import Brightness, SaltAndPepper
-from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import ImageSensor, SubModel, convolutional_trunk
-from torch_denkf.training import Stage
-from torch_denkf.training.parts import train_part
 
 SAMPLES = 32  # of a sensor while it is trained
 MEMBERS = 128  # of the ensemble filters, whose states are 34 numbers; they read as many samples
@@ -65,35 +63,6 @@ def wrist_of(reading: Tensor, near: Tensor) -> Tensor:
     return torch.cat([reading[..., :WRIST], angle.unsqueeze(-1), reading[..., WRIST + 4 :]], -1)
 
 
-@dataclass
-class Statistics:
-    """Means and standard deviations of the training demos alone."""
-
-    loc: Tensor  # of the state, [10]
-    scale: Tensor
-    rate: Tensor  # root mean square of a joint's change in a step, [7] rad
-    acceleration: Tensor  # of the change's change
-    jerk: Tensor  # of that one's change
-    pixel_loc: Tensor
-    pixel_scale: Tensor
-    size: int
-
-    @classmethod
-    def of(cls, states: Tensor, pool: FramePool) -> Statistics:
-        """Takes statistics of sequences ``[N, T, 10]`` and of pictures."""
-        flat = states.flatten(0, -2)
-        changes = (states[..., :7].diff(dim=-2, n=order) for order in (1, 2, 3))
-        pixels = pool.pixels[:: max(len(pool) // 500, 1)].float() / 255
-        return cls(
-            flat.mean(0),
-            flat.std(0),
-            *(change.square().mean((0, 1)).sqrt() for change in changes),
-            pixels.mean((0, 2, 3)),
-            pixels.std((0, 2, 3)),
-            pixels.shape[-1],
-        )
-
-
 def _near(reading: Tensor, near: Tensor | None = None) -> Tensor:
     """Encodes what a sensor reads that reads J6 itself."""
     return reading[..., WRIST] if near is None else near
@@ -126,36 +95,24 @@ def _moments(facts: Statistics) -> tuple[Tensor, Tensor]:
     )
 
 
+CELLS = (128, 64)
+
+
 def keypoint_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
     """A better one: places of features beside a coarse view, coordinate channels, J6 by twice its angle."""
-    head = {"num_cells": (128, 64), "layer": "dropout", "rate": 0.05}
-    return _sensor(facts, keypoint_trunk(), samples, *_moments(facts), **head)
+    head = {"num_cells": CELLS, "layer": "dropout", "rate": 0.05}
+    return camera_sensor(facts, keypoint_trunk(), samples, *_moments(facts), **head)
 
 
 def glimpse_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
     """Builds one with a second look at the gripper. Flipout learns how large its noise is; dropout's is what it is."""
-    head = {"num_cells": (128, 64), "layer": "flipout"}
-    return _sensor(facts, GlimpseTrunk(keypoint_trunk(), facts.size), samples, *_moments(facts), **head)
+    head = {"num_cells": CELLS, "layer": "flipout"}
+    return camera_sensor(facts, glimpse_trunk(facts.size[1]), samples, *_moments(facts), **head)
 
 
 def paper_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
     """The paper's: Table I on the frame, which reads all ten numbers of the state."""
-    return _sensor(facts, convolutional_trunk(3), samples, facts.loc, facts.scale)
-
-
-def _sensor(facts: Statistics, trunk: nn.Module, samples: int, loc: Tensor, scale: Tensor, **head) -> ImageSensor:
-    return ImageSensor(
-        len(loc),
-        image_shape=(3, facts.size, facts.size),
-        trunk=trunk,
-        ensemble_size=samples,
-        loc=loc,
-        scale=scale,
-        pixel_loc=facts.pixel_loc,
-        pixel_scale=facts.pixel_scale,
-        encoding_key=("sensor", "encoding"),
-        **head,
-    )
+    return camera_sensor(facts, convolutional_trunk(3), samples, facts.loc, facts.scale)
 
 
 _PRESETS = (
@@ -180,7 +137,7 @@ def adopt(sensor: ImageSensor, coarse: ImageSensor, pool: FramePool, look: Domai
     trunk.coarse.load_state_dict(coarse.module["trunk"].state_dict())
     trunk.coarse.requires_grad_(False)
     rows = pool.rows(torch.arange(0, len(pool), max(len(pool) // count, 1)))
-    trunk.aim(sensor._prepare(rows["pixels"]), project(rows["state"][:, 7:], look))
+    aim(trunk, sensor._prepare(rows["pixels"]), project(rows["state"][:, 7:], look))
 
 
 class NearForecast(SubModel):
@@ -228,35 +185,13 @@ def disturb(frames: TensorDict, generator: torch.Generator, times: int = 1) -> T
     return frames.set("pixels", torch.lerp(frames["pixels"], salted, 1 / area))
 
 
-@torch.no_grad()
-def sensor_error(sensor: ImageSensor, preset: Preset, pool: FramePool) -> dict[str, float]:
-    """CRPS in the same units."""
-    scores = []
-    for index in torch.arange(len(pool)).split(256):
-        frames = pool.rows(index)
-        samples = sensor(frames)["sensor", "ensemble"]
-        scores.append(crps_ensemble(samples, preset.observe(frames["state"])) / unit_of(preset.dim))
-    return {"crps": float(torch.cat(scores).mean())}
-
-
-def train_sensor(
-    sensor: ImageSensor, preset: Preset, pools: Sequence[FramePool], updates: int, lr: float, times: int = 1, **settings
+def train_preset(
+    sensor: ImageSensor, preset: Preset, train: FramePool, held_out: FramePool, times: int = 1, **settings
 ) -> ImageSensor:
-    """Trains a sensor, or goes on where that was broken off, or reads it where it was done.
-
-    Args:
-        sensor: trained in place.
-        preset: what it reads.
-        pools: frames to train on, and to choose by.
-        updates: of 64 frames each.
-        lr: learning rate.
-        times: by how much these frames were shrunk, see :func:`disturb`.
-        **settings: of :func:`~torch_denkf.training.parts.train_part`.
+    """Trains a sensor on frames that were shrunk so many times, see :func:`disturb`, and
+    :func:`~benchmarks.common.arm.sensors.train_sensor`.
     """
-    train, held_out = pools
     terms = {"loss_joints": slice(-3), "loss_place": slice(-3, None)}
     loss = SensorLoss(sensor, lambda frames: preset.observe(frames["state"]), unit_of(preset.dim), terms)
-    sample = lambda generator, _: disturb(train.sample(generator, 64), generator, times)  # noqa: E731
-    settings |= {"monitor": "crps", "validate_every": max(updates // 8, 1), "save_every": 200, "device": "cpu"}
-    stage = Stage("sensor", loss, sample, updates, lr=lr, weight_decay=0.02)
-    return train_part(sensor, stage, validate=lambda: sensor_error(sensor, preset, held_out), **settings).eval()
+    sample = lambda generator: disturb(train.sample(generator, 64), generator, times)  # noqa: E731
+    return train_sensor(sensor, loss, sample, held_out, weight_decay=0.02, **settings)

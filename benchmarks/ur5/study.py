@@ -14,18 +14,19 @@ from torch import Tensor
 from tyro.conf import OmitArgPrefixes, Positional
 
 from benchmarks.common.arguments import some_of
-from benchmarks.common.arm import JOINTS, scores
+from benchmarks.common.arm import JOINTS, Roles, scores
 from benchmarks.common.arm.motion import train_motion, with_rates
 from benchmarks.common.arm.readings import fail, read_all, read_codes
+from benchmarks.common.arm.sensors import Statistics
 from benchmarks.common.jobs import once
 from benchmarks.common.scores import processor_ms
 from benchmarks.common.training import read_filter
-from benchmarks.ur5.demos import STATE, Collections, FramePool, Roles, real_roles, sequences_of, sim_roles
+from benchmarks.ur5.demos import STATE, Collections, FramePool, real_roles, sequences_of, sim_roles
 from benchmarks.ur5.glimpse import COARSE
 from benchmarks.ur5.laboratory import LEVELS, Pasted
 from benchmarks.ur5.motion import AHEAD, Motion
 from benchmarks.ur5.recipes import FILTERS, UR5Recipe
-from benchmarks.ur5.sensors import MEMBERS, SAMPLES, SENSORS, WRIST, Preset, Statistics, adopt, train_sensor, unit_of
+from benchmarks.ur5.sensors import MEMBERS, SAMPLES, SENSORS, WRIST, Preset, adopt, train_preset, unit_of
 from benchmarks.ur5.training import Budget, train_filter, with_missing
 from torch_denkf.applications.ur5.simulation.domains import SIM, Domain
 from torch_denkf.envs import SaltAndPepper
@@ -103,25 +104,27 @@ class Base:
         study, roles, budget = self.study, self.roles, self.study.budget
         name = "sim-frames" if self.training == "sim" else "real_like-sequences"
         data = study.replay(name, "train", frames_only=True)
-        held_out = set(sorted({*roles.tune, *roles.validation})[::2] if self.training == "sim" else roles.validation)
+        held_out = sorted({*roles.tune, *roles.validation})[::2] if self.training == "sim" else roles.validation
         pool, checked = FramePool.of(data, roles.sensor), FramePool.of(data, held_out)
         torch.manual_seed(self.seed)
         if self.parent is not None:
             facts, sensor, updates, lr = self.parent.facts, deepcopy(self.parent.sensor), budget.fine_tuning, 1e-3
             pool, look = self._pasted(pool)
         else:
-            facts, look, updates, lr = Statistics.of(self.states, pool), SIM, budget.sensor, 2e-3
+            facts, look, updates, lr = Statistics.of(list(self.states), pool.pixels), SIM, budget.sensor, 2e-3
             sensor = self.preset.build(facts, SAMPLES)
         if self.preset.coarse is not None:
-            coarse, times = SENSORS[self.preset.coarse], max(facts.size // COARSE, 1)
-            first = coarse.build(replace(facts, size=facts.size // times), SAMPLES)
+            coarse, times = SENSORS[self.preset.coarse], max(facts.size[0] // COARSE, 1)
+            first = coarse.build(replace(facts, size=tuple(side // times for side in facts.size)), SAMPLES)
             if self.parent is not None:
                 first.load_state_dict(read_checkpoint(self.parent.folder(coarse.name) / "sensor.pt")["sensor"])
             small = [one.shrunk(times) for one in (pool, checked)]
-            train_sensor(first, coarse, small, updates, lr, times, out=self.folder(coarse.name), seed=self.seed)
+            settings = {"out": self.folder(coarse.name), "seed": self.seed, "updates": updates, "lr": lr}
+            train_preset(first, coarse, *small, times, **settings)
             adopt(sensor, first, pool, look)
             updates, lr = max(updates // 2, 1), 0.75 * lr
-        return train_sensor(sensor, self.preset, (pool, checked), updates, lr, out=out, seed=self.seed), facts
+        settings = {"out": out, "seed": self.seed, "updates": updates, "lr": lr}
+        return train_preset(sensor, self.preset, pool, checked, **settings), facts
 
     def folder(self, kind: str) -> Path:
         """Returns the folder of the sensor of a kind with this training and seed."""

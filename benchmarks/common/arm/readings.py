@@ -154,6 +154,7 @@ class Windows:
         first = (draw() * (self.lengths[which] - length + 1)).long()
         windows = self.all[which.unsqueeze(-1), first.unsqueeze(-1) + torch.arange(length)]
         lost = draw(length, 1) < draw(1, 1) - 0.5
+        lost[:, 0] = False  # what a window begins around
         begin, step = 1 + (draw(1) * (length - 1)).long(), torch.arange(length)
         end = begin + (draw(1) * (BLACK + 1)).long() * (draw(1) < 0.33)
         return without(windows, lost | ((step >= begin) & (step < end)).unsqueeze(-1))
