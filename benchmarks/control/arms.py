@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tensordict import NestedKey
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.modules import GRUModule, LSTMModule
+from torchrl.modules import LSTMModule
 
-MEMORY = 64  # units of an LSTM or a GRU
+MEMORY = 64  # units of an LSTM
 
 
 @dataclass(frozen=True)
@@ -17,34 +16,31 @@ class Arm:
     """What an arm reads.
 
     Attributes:
-        keys: entries of the environment.
+        key: entry of the environment.
         stack: readings side by side.
-        memory: ``"lstm"`` or ``"gru"``, or nothing.
+        memory: whether an LSTM remembers what was seen.
         filter: ``"learned"`` from readings, ``"taught"`` with the simulator's states, ``"exact"``, or nothing.
         end_to_end: whether the loss of the actor trains the filter, too.
     """
 
-    keys: tuple[NestedKey, ...]
+    key: NestedKey
     stack: int = 1
-    memory: str = ""
+    memory: bool = False
     filter: str = ""
     end_to_end: bool = False
 
 
-MEAN, VAR, ENSEMBLE = ("belief", "mean"), ("belief", "var"), ("belief", "ensemble")
+MEAN = ("belief", "mean")
 ARMS = {
-    "last reading": Arm(("seen",)),
-    "four readings": Arm(("seen",), stack=4),
-    "LSTM": Arm(("seen",), memory="lstm"),
-    "GRU": Arm(("seen",), memory="gru"),
-    "belief mean": Arm((MEAN,), filter="learned"),
-    "belief mean, spread": Arm((MEAN, VAR), filter="learned"),
-    "ensemble": Arm((ENSEMBLE,), filter="learned"),
-    "belief mean, taught": Arm((MEAN,), filter="taught"),
-    "belief mean, end to end": Arm((MEAN,), filter="learned", end_to_end=True),
-    "Kalman": Arm((MEAN,), filter="exact"),
-    "physics": Arm((MEAN,), filter="exact"),
-    "truth": Arm(("state",)),
+    "last reading": Arm("seen"),
+    "four readings": Arm("seen", stack=4),
+    "LSTM": Arm("seen", memory=True),
+    "belief mean": Arm(MEAN, filter="learned"),
+    "belief mean, taught": Arm(MEAN, filter="taught"),
+    "belief mean, end to end": Arm(MEAN, filter="learned", end_to_end=True),
+    "Kalman": Arm(MEAN, filter="exact"),
+    "physics": Arm(MEAN, filter="exact"),
+    "truth": Arm("state"),
 }
 
 
@@ -65,8 +61,17 @@ class Inputs:
     limit: float
 
 
-def memory(kind: str, width: int, name: str) -> TensorDictModuleBase:
-    """An LSTM or a GRU of torchrl's on what is seen."""
-    states = [f"{name}_hidden", f"{name}_cell"][: 2 if kind == "lstm" else 1]
+def memory(width: int, name: str) -> LSTMModule:
+    """An LSTM of torchrl's on what is seen."""
+    states = [f"{name}_hidden", f"{name}_cell"]
     keys = {"in_keys": ["seen", *states], "out_keys": [f"{name}_memory", *(("next", key) for key in states)]}
-    return {"lstm": LSTMModule, "gru": GRUModule}[kind](input_size=width, hidden_size=MEMORY, **keys)
+    return LSTMModule(input_size=width, hidden_size=MEMORY, **keys)
+
+
+def reader(arm: Arm, inputs: Inputs, name: str) -> tuple[list[LSTMModule], NestedKey, int, Tensor | None]:
+    """What stands before the layers of an actor or a critic; the entry that these read, its width, and its units."""
+    if arm.memory:
+        return [memory(inputs.seen, name)], f"{name}_memory", MEMORY, None
+    if arm.key == "seen":
+        return [], "stack" if arm.stack > 1 else "seen", arm.stack * inputs.seen, None
+    return [], arm.key, len(inputs.scale), inputs.scale

@@ -98,7 +98,7 @@ def page(rows: pd.DataFrame, budget: Budget) -> str:
             home = wide.index.get_level_values("cell")[0]
             title = f"Percent of the return with {home} that is lost, with the same seeds. A negative loss is a gain."
             lines += ["", title, "", *by_cell(lost(wide))]
-        others = [arm for arm in ("LSTM", "GRU", "Kalman", "physics") if arm in wide]
+        others = [arm for arm in ("LSTM", "Kalman", "physics") if arm in wide]
         if "belief mean" in wide:
             ahead = inside[others].rsub(inside["belief mean"], axis=0)
             lines += ["", "How much more the belief's mean returns than another arm with the same seed.", ""]

@@ -12,7 +12,7 @@ from torchrl.envs import CatFrames, EnvBase, ExplorationType, InitTracker, Trans
 from torchrl.modules import get_primers_from_module
 
 from benchmarks.control import ppo, sac
-from benchmarks.control.arms import ARMS, ENSEMBLE, Arm, Inputs
+from benchmarks.control.arms import ARMS, Arm, Inputs
 from benchmarks.control.inputs import Seen
 from benchmarks.control.learning import Learner, refiltered
 from benchmarks.control.shift import LEFT, SHIFTED, told
@@ -77,8 +77,8 @@ def make_env(task: Task, arm: Arm, count: int, cell: tuple[float, float], seed: 
     """
     env = TransformedEnv(task.world(count, *cell, seed), InitTracker())
     if filter is not None:
-        env.append_transform(DEnKFTransform(filter, store_ensemble=ENSEMBLE in arm.keys or arm.end_to_end))
-    if "seen" in arm.keys:
+        env.append_transform(DEnKFTransform(filter, store_ensemble=arm.end_to_end))
+    if arm.key == "seen":
         env.append_transform(Seen(torch.tensor(task.scale[: env.observation_spec["observation"].shape[-1]])))
     if arm.stack > 1:
         env.append_transform(CatFrames(arm.stack, dim=-1, in_keys=["seen"], out_keys=["stack"]))
@@ -100,7 +100,7 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
         learner = Learner(filter, task.prior, batches * task.count, task.learning, arm.filter == "taught")
     env = make_env(task, arm, task.count, cell, 2 * seed, filter)
     tests = make_env(task, arm, budget.episodes, cell, 2 * seed + 1, filter)
-    seen = env.observation_spec["seen"].shape[-1] if "seen" in arm.keys else 0
+    seen = env.observation_spec["seen"].shape[-1] if arm.key == "seen" else 0
     actions = env.full_action_spec["action"].shape[-1]
     settings = task.settings
     if isinstance(settings, sac.Settings):

@@ -12,10 +12,9 @@ from torch import Tensor
 from tyro.conf import OmitArgPrefixes, Positional
 
 from benchmarks.common.arguments import some_of
-from benchmarks.common.arm import JOINTS
+from benchmarks.common.arm import JOINTS, scores
 from benchmarks.common.arm.motion import train_motion, with_rates
 from benchmarks.common.arm.readings import Windows, fail, read_all
-from benchmarks.common.arm.scores import filter_error, filter_rows, filter_stage, fit, save_beliefs, score_row
 from benchmarks.common.jobs import once
 from benchmarks.g1.base import SensorBudget, TrainedSensor
 from benchmarks.g1.baselines import SensorSpread, baselines
@@ -28,7 +27,7 @@ from torch_denkf.filters import Filter
 CONDITIONS = ("clean", "black20", "missing", *PICTURES[1:])
 SHARES = (0.5, 0.08, 0.22, 0.12, 0.08)  # of the windows that filters learn from, by PICTURES
 INFLATIONS = (0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1)
-DEGREE = torch.full((JOINTS,), torch.pi / 180)
+score_row = partial(scores.score_row, names=NAMES, unit=torch.full((JOINTS,), torch.pi / 180))
 
 
 @dataclass(frozen=True)
@@ -145,11 +144,11 @@ class Base:
         model = recipe.build()
 
         def stages():
-            return [filter_stage(recipe, model, windows, validation, updates, budget.batch, lr=2e-3)]
+            return [scores.filter_stage(recipe, model, windows, validation, updates, budget.batch, lr=2e-3)]
 
         out = self.study.out / "filters" / f"{name}-{self.name}"
         settings = {"inflations": INFLATIONS, "every": updates // 3, "out": out, "seed": self.trained.seed}
-        return recipe, fit(recipe, model, stages, lambda: validation, **settings)
+        return recipe, scores.fit(recipe, model, stages, lambda: validation, **settings)
 
 
 def joined(readings: dict[str, TensorDict]) -> TensorDict:
@@ -166,14 +165,10 @@ def run_all(study: Study) -> None:
             once(folder / f"{name}-{base.name}.json", partial(_filter, base, {"seed": seed, "filter": name}))
 
 
-def _row(out: TensorDict, condition: str, **names) -> dict:
-    return {**names, **score_row(out, condition, NAMES, DEGREE)}
-
-
 def _baselines(base: Base, names: dict) -> list[dict]:
     states = [state for state, _ in base.sequences]
     return [
-        _row(out, condition, filter=name, **names)
+        {**names, "filter": name, **score_row(out, condition)}
         for condition, readings in base.test.items()
         for name, out in baselines(readings, states, base.spread).items()
     ]
@@ -181,10 +176,10 @@ def _baselines(base: Base, names: dict) -> list[dict]:
 
 def _filter(base: Base, names: dict) -> list[dict]:
     recipe, model = base.train(names["filter"])
-    rows = filter_rows(recipe, model, base.test, partial(_row, **names))
-    rows[0]["validation_crps"] = filter_error(recipe, model, joined(base.validation))["crps"]
+    rows = scores.filter_rows(recipe, model, base.test, lambda out, condition: {**names, **score_row(out, condition)})
+    rows[0]["validation_crps"] = scores.filter_error(recipe, model, joined(base.validation))["crps"]
     if names["filter"] == "denkf":
-        save_beliefs(recipe, model, base.test, f"denkf-{base.name}", base.study.out / "beliefs")
+        scores.save_beliefs(recipe, model, base.test, f"denkf-{base.name}", base.study.out / "beliefs")
     return rows
 
 

@@ -157,7 +157,7 @@ class Laboratory:
         """Who learns; its actions begin small."""
         scale = torch.tensor([*SCALE, *(SPREADS if arm == SPREAD else ())])
         settings = Settings(gamma=0.95, lmbda=0.95, minibatch=480, lr=1e-3)
-        agent = PPO(Arm((INPUT,)), Inputs(0, 3, scale, 1.0), settings, batches)
+        agent = PPO(Arm(INPUT), Inputs(0, 3, scale, 1.0), settings, batches)
         with torch.no_grad():
             for name, value in agent.actor.named_parameters():
                 if name.endswith("log_std"):

@@ -10,7 +10,7 @@ from benchmarks.common.arm import JOINTS, Roles
 from benchmarks.common.arm.readings import BLACK, Windows, fail
 from benchmarks.common.arm.scores import estimated
 from benchmarks.g1.recordings import NAMES, Recordings, drawn_recording
-from benchmarks.g1.study import _row
+from benchmarks.g1.study import score_row
 from torch_denkf.data import LeRobotReplay
 
 
@@ -71,7 +71,7 @@ def test_scores_leave_out_what_does_not_count():
     clean = readings()
     mean = clean["state"] + torch.tensor([0.01] * 6 + [0.08])
     mean[:, 0], mean[2, 40:] = 99.0, 99.0
-    row = _row(estimated(clean, mean, torch.full_like(mean, 0.03**2)), "clean")
+    row = score_row(estimated(clean, mean, torch.full_like(mean, 0.03**2)), "clean")
     assert row["joint_mae_deg"] == pytest.approx(math.degrees(0.02), rel=1e-3)
     assert row[f"{NAMES[-1]}_deg"] == pytest.approx(math.degrees(0.08), rel=1e-3)
     assert row["coverage90"] == pytest.approx(6 / 7)  # 0.08 is outside of 1.645 x 0.03
