@@ -128,7 +128,7 @@ def draw(rows: pd.DataFrame, file: Path) -> None:
     tasks = [task for task in TITLES if whole.loc[whole["task"] == task, "cell"].nunique() > 1]
     if not tasks:
         return
-    figure, axes = plt.subplots(1, len(tasks), figsize=(6.5 * len(tasks), 4.5), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(1, len(tasks), figsize=(3.4 * len(tasks), 3.4), squeeze=False, layout="constrained")
     for axis, task in zip(axes[0], tasks, strict=True):
         wide = ends(whole[whole["task"] == task])
         for arm, returns in wide.dropna(axis=1).items():
@@ -140,6 +140,7 @@ def draw(rows: pd.DataFrame, file: Path) -> None:
             color = f"C{list(ARMS).index('Kalman' if arm == 'physics' else arm)}"  # no task has both
             axis.plot(noise, center, "--" if arm in KNOWING else "-", marker="o", markersize=3, color=color, label=arm)
             axis.fill_between(noise, low, high, color=color, alpha=0.12, linewidth=0)
-        axis.set(title=TITLES[task], xlabel="standard deviation of a reading", ylabel="return of an episode")
-        axis.legend(fontsize=8)
+        axis.set(xlabel="standard deviation of a reading", ylabel="return of an episode")
+        axis.set_title(TITLES[task], fontsize=10)
+        axis.legend(fontsize=7)
     save(figure, file)
