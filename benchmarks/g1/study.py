@@ -177,7 +177,8 @@ def _baselines(base: Base, names: dict) -> list[dict]:
 def _filter(base: Base, names: dict) -> list[dict]:
     recipe, model = base.train(names["filter"])
     rows = scores.filter_rows(recipe, model, base.test, lambda out, condition: {**names, **score_row(out, condition)})
-    rows[0]["validation_crps"] = scores.filter_error(recipe, model, joined(base.validation))["crps"]
+    validation = scores.run_filter(recipe, model, joined(base.validation))
+    rows[0]["validation_crps"] = score_row(validation, "validation")["crps"]
     if names["filter"] == "denkf":
         scores.save_beliefs(recipe, model, base.test, f"denkf-{base.name}", base.study.out / "beliefs")
     return rows
