@@ -45,6 +45,7 @@ def test_no_episode_has_two_roles(tmp_path):
 def test_of_black_frames_nothing_is_left():
     clean = readings()
     dark = fail(clean, "black20")
+    assert fail(clean, "clean")["observed"].equal(clean["observed"])
     lost = (clean["observed"] & ~dark["observed"]).squeeze(-1)
     assert int(lost[0].sum()) == BLACK
     assert (lost[0].nonzero().flatten().diff() == 1).all()  # one after the other

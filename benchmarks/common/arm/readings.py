@@ -104,12 +104,14 @@ def blackouts(lengths: Tensor, seed: int = 0) -> Tensor:
 
 
 def fail(readings: TensorDict, condition: str, seed: int = 0) -> TensorDict:
-    """A copy of readings ``[N, T]`` whose camera fails: 20 frames are black, or frames are ``"missing"``."""
+    """Readings ``[N, T]`` of a camera that fails, ``"black20"`` or ``"missing"``; in other conditions as they are."""
     count, steps = readings.shape
     if condition == "missing":
         return without(readings, torch.rand(count, steps, 1, generator=torch.Generator().manual_seed(seed)) < MISSING)
-    begin, step = blackouts(readings["valid"].sum((1, 2)), seed).unsqueeze(-1), torch.arange(steps)
-    return without(readings, ((step >= begin) & (step < begin + BLACK)).unsqueeze(-1))
+    if condition == "black20":
+        begin, step = blackouts(readings["valid"].sum((1, 2)), seed).unsqueeze(-1), torch.arange(steps)
+        return without(readings, ((step >= begin) & (step < begin + BLACK)).unsqueeze(-1))
+    return readings
 
 
 def without(readings: TensorDict, lost: Tensor) -> TensorDict:
