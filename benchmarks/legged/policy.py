@@ -193,7 +193,7 @@ class Laboratory:
     def lstm(self, agent: PPO) -> LSTM:
         """Trained to tell the velocity on what a policy does that reads the true one."""
         contacts = LearnedContacts(self.model, **QUADRUPED, rows=ROWS)
-        if (file := self.study.out / "lstm.pt").exists():
+        if (file := self.study.out / "lstm" / "lstm.pt").exists():
             network = LSTM(contacts)
             network.load_state_dict(read_checkpoint(file)["lstm"])
             return network

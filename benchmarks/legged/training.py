@@ -43,7 +43,9 @@ def learned_contacts(robot: Robot, validation: Robot, noises: LeggedNoises, upda
         return rows[torch.randint(len(rows), (512,), generator=generator)]
 
     loss = lambda some: {"loss_contacts": contacts.loss(some)}  # noqa: E731
-    train_part(contacts, Stage("contacts", loss, sample, updates, lr=3e-3, schedule="cosine"), out=out, **SETTINGS)
+    train_part(
+        contacts, Stage("contacts", loss, sample, updates, lr=3e-3, schedule="cosine"), out=out / "contacts", **SETTINGS
+    )
     contacts.requires_grad_(False)
     filter = legged_filter(robot.model, **robot.names, dt=robot.dt, kind="EKF", noises=noises, contacts=contacts)
     for lasts in LASTS:
@@ -111,4 +113,4 @@ def trained_lstm(
 
     stage = Stage("lstm", loss, sample, updates, lr=3e-3, weight_decay=1e-5, schedule="cosine")
     check = torch.no_grad()(lambda: {"nll": scores(validation, *network(network.read(validation.log)))["nll"]})
-    return train_part(network, stage, out=out, validate=check, monitor="nll", validate_every=50, **SETTINGS)
+    return train_part(network, stage, out=out / "lstm", validate=check, monitor="nll", validate_every=50, **SETTINGS)
