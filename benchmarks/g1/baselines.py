@@ -11,6 +11,7 @@ from torch import Tensor
 
 from benchmarks.common.arm import JOINTS
 from benchmarks.common.arm.scores import estimated
+from benchmarks.common.training import random_rows
 from benchmarks.g1.recipes import SPREAD_CELLS
 from torch_denkf.functional import crps_gaussian
 from torch_denkf.modules import DiagonalNoise
@@ -49,11 +50,8 @@ class SensorSpread:
             variance = self._variance(some["encoding"])
             return crps_gaussian(torch.zeros_like(variance), variance, some["error"])
 
-        def sample(generator: torch.Generator, length: int | None) -> TensorDict:
-            return pairs[torch.randint(len(pairs), (1024,), generator=generator)]
-
         loss = lambda some: {"loss_crps": (crps(some) / root).mean()}  # noqa: E731
-        stage = Stage("spread", loss, sample, updates, lr=5e-4, weight_decay=0.1, schedule="constant")
+        stage = Stage("spread", loss, random_rows(pairs, 1024), updates, lr=5e-4, weight_decay=0.1, schedule="constant")
         settings = {"monitor": "crps", "validate_every": 20, "loggers": (), "device": "cpu", "seed": 0}
         train_part(self.noise, stage, out=out, validate=lambda: {"crps": float(crps(checked).mean())}, **settings)
         with torch.no_grad():

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from benchmarks.common.training import random_rows
 from benchmarks.legged.task import ROWS, Robot, scores
 from torch_denkf.applications.legged import LearnedContacts, LeggedNoises, legged_filter
 from torch_denkf.training import Stage
@@ -39,13 +40,9 @@ def learned_contacts(robot: Robot, validation: Robot, noises: LeggedNoises, upda
     rows = robot.log.select("last", "true").flatten()
     contacts.standardise(rows[torch.randint(len(rows), (10_000,))])
 
-    def sample(generator: torch.Generator, length: int | None) -> TensorDict:
-        return rows[torch.randint(len(rows), (512,), generator=generator)]
-
     loss = lambda some: {"loss_contacts": contacts.loss(some)}  # noqa: E731
-    train_part(
-        contacts, Stage("contacts", loss, sample, updates, lr=3e-3, schedule="cosine"), out=out / "contacts", **SETTINGS
-    )
+    stage = Stage("contacts", loss, random_rows(rows, 512), updates, lr=3e-3, schedule="cosine")
+    train_part(contacts, stage, out=out / stage.name, **SETTINGS)
     contacts.requires_grad_(False)
     filter = legged_filter(robot.model, **robot.names, dt=robot.dt, kind="EKF", noises=noises, contacts=contacts)
     for lasts in LASTS:
@@ -113,4 +110,6 @@ def trained_lstm(
 
     stage = Stage("lstm", loss, sample, updates, lr=3e-3, weight_decay=1e-5, schedule="cosine")
     check = torch.no_grad()(lambda: {"nll": scores(validation, *network(network.read(validation.log)))["nll"]})
-    return train_part(network, stage, out=out / "lstm", validate=check, monitor="nll", validate_every=50, **SETTINGS)
+    return train_part(
+        network, stage, out=out / stage.name, validate=check, monitor="nll", validate_every=50, **SETTINGS
+    )
