@@ -14,8 +14,7 @@ from benchmarks.common.intervals import bootstrap_interval
 from benchmarks.common.plots import plt, save
 from benchmarks.common.tables import markdown
 from benchmarks.control.arms import ARMS
-from benchmarks.control.run import Budget
-from benchmarks.control.shift import NOT_TRAINED
+from benchmarks.control.run import NOT_TRAINED, Budget
 
 TITLES = {
     "hike": "Mountain hike",

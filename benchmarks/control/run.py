@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,13 +15,32 @@ from torchrl.envs import CatFrames, EnvBase, ExplorationType, InitTracker, Trans
 from torchrl.modules import get_primers_from_module
 
 from benchmarks.control import ppo, sac
-from benchmarks.control.arms import ARMS, Arm, Inputs
-from benchmarks.control.inputs import Seen
+from benchmarks.control.arms import ARMS, Arm, Inputs, Seen
 from benchmarks.control.learning import Learner, refiltered
-from benchmarks.control.shift import LEFT, SHIFTED, told
 from benchmarks.control.tasks import RATES, TASKS, Task
 from torch_denkf.filters import Filter
 from torch_denkf.transforms import DEnKFTransform
+
+NOT_TRAINED = "not trained"
+SHIFTED = f"{{}}, {NOT_TRAINED}"
+LEFT = f"{SHIFTED}, R as learned"
+
+
+@contextmanager
+def told(filter: Filter | None, noise: float) -> Iterator[None]:
+    """Sets R of a filter, which nothing else is told, to the square of ``noise`` for a while."""
+    if filter is None:
+        yield
+        return
+    log_variance = filter["noise"].log_variance
+    learned = log_variance.detach().clone()
+    with torch.no_grad():
+        log_variance.fill_(2 * math.log(noise))
+    try:
+        yield
+    finally:
+        with torch.no_grad():
+            log_variance.copy_(learned)
 
 
 @dataclass(frozen=True)

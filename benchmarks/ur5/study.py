@@ -22,11 +22,10 @@ from benchmarks.common.jobs import once
 from benchmarks.common.scores import processor_ms
 from benchmarks.common.training import read_filter
 from benchmarks.ur5.demos import STATE, Collections, FramePool, real_roles, sequences_of, sim_roles
-from benchmarks.ur5.glimpse import COARSE
 from benchmarks.ur5.laboratory import LEVELS, Pasted
 from benchmarks.ur5.motion import AHEAD, Motion
 from benchmarks.ur5.recipes import FILTERS, UR5Recipe
-from benchmarks.ur5.sensors import MEMBERS, SAMPLES, SENSORS, WRIST, Preset, adopt, train_preset, unit_of
+from benchmarks.ur5.sensors import COARSE, MEMBERS, SAMPLES, SENSORS, WRIST, Preset, adopt, train_preset, unit_of
 from benchmarks.ur5.training import Budget, train_filter, with_missing
 from torch_denkf.applications.ur5.simulation.domains import SIM, Domain
 from torch_denkf.envs import SaltAndPepper

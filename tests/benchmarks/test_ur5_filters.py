@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 
-from benchmarks.ur5.glimpse import project
 from benchmarks.ur5.motion import Motion
-from benchmarks.ur5.sensors import TurnedWrist, side_of, wrist_of
+from benchmarks.ur5.sensors import TurnedWrist, project, side_of, wrist_of
 from tests.benchmarks.ur5_for_tests import FACTS, states
 from torch_denkf.applications.ur5.simulation.domains import Domain
 
