@@ -7,6 +7,8 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 
+import pandas as pd
+
 from benchmarks.common.arm.readings import read_all
 from benchmarks.common.arm.scores import coverage, filter_error, run_filter
 from benchmarks.common.jobs import once, read_rows
@@ -80,18 +82,22 @@ def members(study: Study) -> list[Path]:
     rows = read_rows(sorted((study.out / "members").glob("*.json")))
     files = [study.out / f"members.{kind}" for kind in ("csv", "md")]
     frame = write_table(rows, files[0], ("sensor", "trained", "members"))
-    cells = [_cell(row) for row in frame.to_dict("records")]
-    table = frame.assign(cell=cells).set_index(["sensor", "trained", "members", "localisation"])["cell"]
-    text = "Clean test demos. Cells: joints, deg / end effector, cm / coverage of 90 %, and the threshold, if any."
-    table = table.unstack("localisation")[list(KINDS)]
-    write_page("\n".join(["# How many members?", "", text, "", *markdown(table)]) + "\n", files[1])
+    write_page(members_page(frame), files[1])
     return files
+
+
+def members_page(frame: pd.DataFrame) -> str:
+    """A table of the rows, with a column for each localisation."""
+    frame = frame.assign(cell=[_cell(row) for row in frame.to_dict("records")])
+    table = frame.set_index(["sensor", "trained", "members", "localisation"])["cell"].unstack("localisation")
+    text = "Clean test demos. Cells: joints, deg / end effector, cm / coverage of 90 %, and the threshold, if any."
+    return "\n".join(["# How many members?", "", text, "", *markdown(table[list(KINDS)])]) + "\n"
 
 
 def _cell(row: dict) -> str:
     if row["joint_mae_deg"] > 180:
         return "diverges"
-    threshold = f" ({row['threshold']:g})" if row["threshold"] else ""
+    threshold = f" ({row['threshold']:g})" if row["threshold"] > 0 else ""
     return f"{row['joint_mae_deg']:.2f} / {row['ee_mae_cm']:.2f} / {row['coverage90']:.0%}{threshold}"
 
 
