@@ -188,6 +188,7 @@ def page(frame: pd.DataFrame, study: Study) -> str:
         "squared error of the velocity in units of the variance, over its expectation: above 1 a filter is too sure. "
         f"Held is the share of true velocities within the {LEVEL:.0%} intervals.",
     ]
+    frame = frame.reindex(columns=["data", "filter", "draws", *SCORES, *NOISES])
     shown = frame[["filter", "draws"]].assign(
         **{title: frame[key].map(f"{{:.{digits}f}}".format, "ignore") for key, (title, digits) in SCORES.items()}
     )
