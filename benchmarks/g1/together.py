@@ -62,7 +62,6 @@ class Arm:
         self.known = self.sensor.sequences()  # of the episodes that are not tested on
         self.begin = torch.stack([state[0] for state, _ in self.known])
 
-    @torch.no_grad()
     def readings(self, role: str) -> TensorDict:
         """Camera, encoders that are read once a second, and commands of a role's episodes ``[N, T]``."""
         read = read_all(self.sensor.trained[0], self.sensor.codes(role), 64)
@@ -91,9 +90,9 @@ class Arm:
     @cached_property
     def noise(self) -> MappedNoise:
         """Returns the noise of the motion in a row: of the rates, and through them of the joints."""
-        pairs = [with_rates(state, 1) for state, _ in self.known]
+        motion, pairs = self.motion, [with_rates(state, 1) for state, _ in self.known]
         with torch.no_grad():
-            missed = torch.cat([one[1:, JOINTS:] - self.motion(one[:-1])[:, JOINTS:] for one in pairs])
+            missed = torch.cat([one[1:, JOINTS:] - motion(one[:-1])[:, JOINTS:] for one in pairs])
         root = SURPRISE * torch.linalg.cholesky(missed.mT @ missed / len(missed))
         unit = ConstantNoise([1.0] * JOINTS, in_key=("belief", "mean"), out_key=("forecast", "noise"))
         return MappedNoise(unit, torch.cat([root, root]))
@@ -118,7 +117,6 @@ class Arm:
             return None, every.square().nanmean((0, 1)).sqrt()
         return FadingBias.from_residuals(every, per_run=kind == "episodes", trainable=False)
 
-    @torch.no_grad()
     def run(self, *names: str, data: TensorDict, begins: bool = True, kind: str = "episodes") -> Estimate:
         """Estimates by a filter of some sensors; for the kind see :meth:`errors`. Encoders have no bias."""
         sensors, read = {}, Select(list(range(JOINTS)))
@@ -127,7 +125,8 @@ class Arm:
             sensors[name] = FusedSensor(read, noise, sensor_error=error)
         motion = LearnedTransition(self.motion, residual=False)
         filter = FusedFilter(motion, sensors, initial=self.start(begins), process_noise=self.noise)
-        belief = filter.sequence(data.exclude("state", "valid", "arrived", "observed").copy())["belief"]
+        with torch.no_grad():
+            belief = filter.sequence(data.exclude("state", "valid", "arrived", "observed").copy())["belief"]
         return belief["mean"][..., :JOINTS], belief["var"][..., :JOINTS].sqrt()
 
     def held(self, data: TensorDict, name: str) -> Tensor:
