@@ -59,9 +59,7 @@ class _InitialEnsemble(Initial):
         """Returns ensemble, mean and variance."""
         if noise is None:
             noise = self.draw_noise(batch_size, device=center.device, dtype=center.dtype)
-        check_shape(
-            "the initial belief's noise", noise, (*batch_size, self.ensemble_size, self.state_dim), "[*B, E, S]"
-        )
+        check_shape("the initial noise", noise, (*batch_size, self.ensemble_size or 0, std.shape[-1]), "[*B, E, S]")
         noise = noise.to(center.dtype)
         away = std.unsqueeze(-2) * (exact_draws(noise) if self.exact else noise)
         center = center.unsqueeze(-2)
