@@ -327,7 +327,7 @@ def test_random_draws_stay_what_they_were():
 @pytest.mark.parametrize("place", ["initial", "transition"])
 def test_noise_of_another_ensemble_raises(place):
     """It was recorded with more members: the belief would have as many."""
-    filter, data = denkf(), frames()
+    filter, data = denkf(Q), frames()
     data = filter.draw_noise(data)
     data["noise", place] = torch.randn(4, T, E + 1, S)
     with pytest.raises(ValueError, match=rf"{place}.* must be .* = \[4, {'12, ' * (place == 'initial')}16, 3\], got"):
