@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
+from benchmarks.common.descent import minimise
 from benchmarks.common.lorenz96 import lorenz96_step
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional.localisation import gaspari_cohn
@@ -143,10 +146,9 @@ def learn(
     of the windows is ``rng``'s, the noise of the filter torch's own.
     """
     loss = DEnKFLoss.ad_enkf(denkf, detach_every=detach_every)
-    optimiser = torch.optim.Adam(denkf.parameters(), lr=rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates, 0.01 * rate)
     path = [forcing_of(denkf).item()]
-    for _ in range(updates):
+
+    def batch_loss() -> torch.Tensor:
         rows = torch.randint(record.shape[0], (batch,), generator=rng).tolist()
         starts = torch.randint(record.shape[1] - warm_up - window, (batch,), generator=rng).tolist()
         places = zip(rows, starts, strict=True)
@@ -156,13 +158,13 @@ def learn(
         frames = frames[:, warm_up:].copy()
         # A stored belief needs an entry for every time; only the first is read, as nothing starts anew in between.
         frames.update(warm[:, -1:].expand(batch, window + 1))
-        total = loss(frames)["loss_nll"]
-        optimiser.zero_grad()
-        total.backward()
-        nn.utils.clip_grad_norm_(denkf.parameters(), 10.0)
-        optimiser.step()
-        schedule.step()
+        return loss(frames)["loss_nll"]
+
+    def note(_: int) -> None:
         path.append(forcing_of(denkf).item())
+
+    cosine = partial(CosineAnnealingLR, T_max=updates, eta_min=0.01 * rate)
+    minimise(denkf.parameters(), batch_loss, updates, rate, schedule=cosine, clip=10.0, after=note)
     return path
 
 

@@ -19,10 +19,12 @@ from torch_denkf.applications.car.kitti.drive import choose_camera, list_kitti_d
 from torch_denkf.applications.car.kitti.files import read_poses
 from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
 from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
+from torch_denkf.applications.car.odometry.images import read_frames
 from torch_denkf.applications.car.odometry.paths import read_path
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
 from torch_denkf.applications.car.vision.poses import poses_to_state
 from torch_denkf.cli.main import main as denkf
+from torch_denkf.deployment.files import write_text
 
 WINDOW = 100  # steps of an end point error; half of a shorter drive
 COLUMNS = Columns(
@@ -60,9 +62,13 @@ def track(study: Study, root: Path, drive: str, height: float) -> dict:
     """One run of the command, and its errors."""
     folder = root / "sequences" / drive
     camera = choose_camera(folder, None)
-    out = study.out / f"{drive}-{height:g}"
+    out, images = study.out / f"{drive}-{height:g}", read_frames(folder / camera)
+    poses = read_poses(root / "poses" / f"{drive}.txt")
+    clock = read_times(folder / "times.txt", len(poses))  # of the whole sequence, of which a part may have images
+    stamps = study.out / f"{drive}.txt"
+    write_text(stamps, "".join(f"{time}\n" for time in clock.times[images.first : images.first + images.count]))
     words: list[str] = [str(folder / camera), "--calibration", str(folder / "calib.txt"), "--camera", camera]
-    words += ["--times", str(folder / "times.txt"), "--height", f"{height:g}", "--out", str(out), "--no-pictures"]
+    words += ["--times", str(stamps), "--height", f"{height:g}", "--out", str(out), "--no-pictures"]
     if study.checkpoint is not None:
         words += ["--checkpoint", str(study.checkpoint)]
     begun = time.time()
@@ -70,9 +76,7 @@ def track(study: Study, root: Path, drive: str, height: float) -> dict:
         raise SystemExit(f"denkf odometry {' '.join(words)} failed")
     seconds = time.time() - begun
     path = read_path(out / "path.csv")
-    poses = read_poses(root / "poses" / f"{drive}.txt")
-    dt = read_times(folder / "times.txt", len(poses)).dt
-    truth = torch.from_numpy(poses_to_state(poses, dt[1:]))[path["frame"].squeeze(-1)][:, :3]
+    truth = torch.from_numpy(poses_to_state(poses, clock.dt[1:]))[path["frame"].squeeze(-1)][:, :3]
     believed = path["belief", "mean"][:, :3]
     window = WINDOW if len(truth) > WINDOW else (len(truth) - 1) // 2
     error = kitti_endpoint_error(believed, truth, window=window)
