@@ -68,8 +68,8 @@ setup(
         # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
         "bench": [
             "matplotlib",
-            "vqf==2.1.2",  # the peers of benchmarks/broad
-            "ahrs==0.4.0",
+            "pandas",  # tables of studies
+            "vqf==2.1.2",  # the peer of benchmarks/broad
             "filterpy==2.0.0",
             "dapper==1.7.1",
             "cuthbert==0.1.1",
@@ -88,6 +88,7 @@ setup(
         ],
         "test": [
             "evo",
+            "pandas",
             "rosbags>=0.11",
             "pyyaml",
             "pyarrow>=15",
