@@ -135,11 +135,11 @@ def linear(size: int, read: int, runs: int) -> tuple[Score, Callable[[int, float
             process_noise=[0.1] * size,
             initial=GaussianPrior([0.0] * size, [1.0] * size, ensemble_size=members),
         )
-        return filtered(filter, data, 20)
+        return filtered(filter, 0, data, 20)
 
     noises = {"process_noise": [0.1] * size, "noise": [0.2] * read}
     exact = KalmanFilter(f, h, **noises, mean=torch.zeros(size), cov=torch.eye(size), observation_key="reading")
-    return filtered(exact, data, 20), score
+    return filtered(exact, 0, data, 20), score
 
 
 def main() -> None:

@@ -105,7 +105,7 @@ def planned(study: Study, test: TensorDict) -> dict[tuple, Callable[[], dict]]:
     told = test.clone().set("sound", torch.full((*test.shape, 1), 1 - SHARE))
     training = recordings(study.training, 100), recordings(study.training // 2, 101)
     jobs: dict[tuple, Callable[[], dict]] = {
-        ("", "truth", "", 0): lambda: scores(*best(test, study.particles).values()),
+        ("", "truth", "", 0): lambda: scores(*best(test, study.particles).values())
     }
     for kind in ("EKF", "UKF", "DEnKF"):
         for update, around in UPDATES.items():

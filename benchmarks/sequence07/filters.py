@@ -13,14 +13,7 @@ from torch import Tensor, nn
 from benchmarks.sequence07.chosen import FILTER, HALVES, LENS, SLIP_KEPT
 from torch_denkf import Filter, FusedFilter, FusedSensor
 from torch_denkf.functional.manifolds import SE3, Euclidean, Product
-from torch_denkf.modules import (
-    AroundState,
-    EnsembleAnalysis,
-    GaussianAround,
-    MappedNoise,
-    SubModel,
-    UKFTransition,
-)
+from torch_denkf.modules import AroundState, EnsembleAnalysis, GaussianAround, MappedNoise, SubModel, UKFTransition
 from torch_denkf.monitoring import Gated
 from torch_denkf.motions.motion import Motion
 from torch_denkf.submodel import Sensor
