@@ -121,18 +121,9 @@ class Calibration:
         for loss, length in (("crps", 16), ("energy", 16), ("mse", 16), ("crps", 2), ("mse", 2)):
             for seed in range(self.seeds):
                 scores = evaluate(train(loss, training, self.updates, length, seed), unseen, seed)
-                lines.append(
-                    line(
-                        "mse (the paper's)" if loss == "mse" else loss,
-                        length - 1,
-                        seed,
-                        f"{scores['sensor']:.3f}",
-                        f"{scores['filter']:.3f}",
-                        f"{scores['spread/skill']:.2f}",
-                        f"{scores['lowest']:.2f} to {scores['highest']:.2f}",
-                        f"{100 * scores['coverage90']:.0f} %",
-                    )
-                )
+                name, worst = loss.replace("mse", "mse (the paper's)"), "{lowest:.2f} to {highest:.2f}".format(**scores)
+                cells = [f"{scores['sensor']:.3f}", f"{scores['filter']:.3f}", f"{scores['spread/skill']:.2f}", worst]
+                lines.append(line(name, length - 1, seed, *cells, f"{100 * scores['coverage90']:.0f} %"))
                 print(lines[-1], flush=True)
         header = (
             f"`{command('lorenz96')}`: {time.perf_counter() - began:.0f} s on one core ({platform.machine()}). 400 "

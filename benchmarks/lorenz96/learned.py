@@ -138,15 +138,14 @@ def learn(
     window: int = 40,
     detach_every: int = 10,
     rate: float = 0.1,
-) -> list[float]:
-    """Maximises the likelihood on windows of the ``record`` ``[records, steps]``; returns F before and after updates.
+) -> None:
+    """Maximises the likelihood on windows of the ``record`` ``[records, steps]``, in place.
 
     A window begins with the belief that the present filter has after ``warm_up`` steps from the window's first
     observation: the start knows less than the filter does later, and its likelihood says little about F. The choice
     of the windows is ``rng``'s, the noise of the filter torch's own.
     """
     loss = DEnKFLoss.ad_enkf(denkf, detach_every=detach_every)
-    path = [forcing_of(denkf).item()]
 
     def batch_loss() -> torch.Tensor:
         rows = torch.randint(record.shape[0], (batch,), generator=rng).tolist()
@@ -160,12 +159,8 @@ def learn(
         frames.update(warm[:, -1:].expand(batch, window + 1))
         return loss(frames)["loss_nll"]
 
-    def note(_: int) -> None:
-        path.append(forcing_of(denkf).item())
-
     cosine = partial(CosineAnnealingLR, T_max=updates, eta_min=0.01 * rate)
-    minimise(denkf.parameters(), batch_loss, updates, rate, schedule=cosine, clip=10.0, after=note)
-    return path
+    minimise(denkf.parameters(), batch_loss, updates, rate, schedule=cosine, clip=10.0)
 
 
 @torch.no_grad()

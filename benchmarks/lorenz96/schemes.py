@@ -19,7 +19,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.common.arguments import command, processor
+from benchmarks.common.arguments import made_by
 from benchmarks.common.lorenz96 import lorenz96_step
 from benchmarks.common.tables import head, line, write_page
 from torch_denkf.functional import analyse
@@ -114,26 +114,16 @@ def assimilate(
     for state, observation in zip(truth[1:], observations[1:], strict=True):
         ensemble = lorenz96_step(ensemble)
         if case.scheme == "letkf":
-            frame = TensorDict(
-                {
-                    "forecast": {"ensemble": ensemble, "observation": ensemble},
-                    "sensor": {"ensemble": observation, "noise": noise},
-                },
-                [seeds],
-            )
+            forecast = {"ensemble": ensemble, "observation": ensemble}
+            sensor = {"ensemble": observation, "noise": noise}
+            frame = TensorDict({"forecast": forecast, "sensor": sensor}, [seeds])
             if case.rotate:
                 frame["noise", "self"] = random.rotation(case.ensemble_size)
             ensemble = local(frame)["belief", "ensemble"]
         else:
-            ensemble = analyse(
-                ensemble,
-                ensemble,
-                observation,
-                noise,
-                scheme=case.scheme,
-                perturbation=draw(ensemble) if case.scheme == "perturbed" else None,
-                rotation=random.rotation(case.ensemble_size) if case.rotate else None,
-            ).ensemble
+            options = {"perturbation": draw(ensemble)} if case.scheme == "perturbed" else {}
+            options |= {"rotation": random.rotation(case.ensemble_size)} if case.rotate else {}
+            ensemble = analyse(ensemble, ensemble, observation, noise, scheme=case.scheme, **options).ensemble
         ensemble = inflate(ensemble, case.inflation)
         errors.append((ensemble.mean(1) - state).square().mean(-1).sqrt())
         spreads.append(ensemble.var(1).mean(-1).sqrt())
@@ -164,26 +154,15 @@ def report(study: Schemes) -> str:
         errors, spreads = assimilate(case, truth, observations, study.first, study.draws == "exact")
         elapsed = 1e3 * (time.perf_counter() - began) / len(errors)
         scores = errors[burn_in:].mean(0)
-        cells = [
-            case.name,
-            str(case.ensemble_size),
-            f"{case.inflation}",
-            f"{scores.mean():.3f}",
-            ", ".join(f"{score:.3f}" for score in scores),
-            f"{spreads[burn_in:].mean():.3f}",
-            f"{case.published}",
-            f"{case.target}",
-            "yes" if scores.mean() <= case.target else "no",
-            f"{elapsed:.2f}",
-        ]
-        lines.append(line(*cells))
+        each, met = ", ".join(f"{score:.3f}" for score in scores), "yes" if scores.mean() <= case.target else "no"
+        cells = f"{scores.mean():.3f}", each, f"{spreads[burn_in:].mean():.3f}", case.published, case.target, met
+        lines.append(line(case.name, case.ensemble_size, case.inflation, *cells, f"{elapsed:.2f}"))
         print(lines[-1], flush=True)
     lines += [
         "",
-        f"* Command: `{command('lorenz96')}`",
         f"* Seeds: {study.first} to {study.first + seeds - 1}, all run as one batch, none left out; double precision.",
-        f"* Hardware: {processor()}, {torch.get_num_threads()} thread(s); torch {torch.__version__}; "
-        f"{time.perf_counter() - start:.0f} s in all. A cycle: {seeds} filters' forecast, analysis, score.",
+        f"* A cycle: {seeds} filters' forecast, analysis, score.",
+        *made_by("lorenz96", f", {time.perf_counter() - start:.0f} s"),
     ]
     return "\n".join(lines) + "\n"
 
