@@ -12,7 +12,6 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from benchmarks.broad.pictures import draw
 from benchmarks.broad.task import Trial, read_trials, scores, simulated_trial
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import Columns, head, line, report
@@ -40,7 +39,7 @@ class Study:
     """Compares orientation filters on the trials of BROAD."""
 
     data: Path = Path("../shared/data/broad")  # folder with .npz files of BROAD
-    out: Path | None = None  # folder for broad.csv, broad.md and broad.png
+    out: Path | None = None  # folder for broad.csv and broad.md
     smoke: bool = False  # ten simulated seconds: does it run?
 
 
@@ -150,7 +149,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         name, settings = settings_for(trial.kind, numbers)
         groups.setdefault(settings, []).append((trial, f"without {name}" if name == trial.kind else name))
     rows: list[dict] = []
-    beliefs: dict[str, tuple[Trial, Orientations]] = {}
     for settings, group in groups.items():
         for some in [group[first : first + TOGETHER] for first in range(0, len(group), TOGETHER)]:
             for (trial, name), own in zip(some, run(settings, [trial for trial, _ in some]), strict=True):
@@ -158,10 +156,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     rows.append(row)
                     found = {score: round(row[score], 2) for score in SCORES if score in row}
                     print(trial.name, row["method"], found, flush=True)
-                beliefs[trial.name] = trial, own[OWN]
     rows.sort(key=COLUMNS.order)
     report(study.out, COLUMNS, rows, page(rows, study.smoke), "broad")
-    if study.out is not None:
-        worst = max((row for row in rows if row["method"] == OWN + MOVED), key=lambda row: row["total"])
-        trial, own = beliefs[worst["trial"]]
-        draw(trial, own, vqf(trial)[0] if find_spec("vqf") else None, study.out / "broad.png")
