@@ -72,7 +72,7 @@ def run(case: Case, seed: int, variables: int, steps: int, updates: int, ensembl
     unseen_record, scores = observe(unseen, case.every, rng), []
     scores.append(evaluate(denkf, unseen, unseen_record, 50))
     began = time.perf_counter()
-    learn(denkf, record, updates=updates, rng=rng)
+    learn(denkf, record, updates, rng)
     elapsed, forcing = time.perf_counter() - began, forcing_of(denkf).item()
     scores.append(evaluate(denkf, unseen, unseen_record, 50))
     noise = noise_of(denkf)

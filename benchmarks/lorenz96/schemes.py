@@ -39,7 +39,6 @@ class Case:
     ensemble_size: int
     inflation: float  # factor on the analysis anomalies, DAPPER's convention
     published: float  # DAPPER's table, which cites the papers
-    target: float
     rotate: bool = False
 
     @property
@@ -49,13 +48,13 @@ class Case:
 
 
 CASES = [
-    Case("perturbed", 40, 1.06, published=0.22, target=0.24),
-    Case("sakov", 40, 1.01, published=0.18, target=0.20),
+    Case("perturbed", 40, 1.06, published=0.22),
+    Case("sakov", 40, 1.01, published=0.18),
     # Published at 1.013, with which 24 members lose the state in some seeds; 1.02 is chosen on seeds 100 to 107.
-    Case("etkf", 24, 1.02, published=0.18, target=0.21, rotate=True),
-    Case("letkf", 7, 1.04, published=0.22, target=0.25, rotate=True),
+    Case("etkf", 24, 1.02, published=0.18, rotate=True),
+    Case("letkf", 7, 1.04, published=0.22, rotate=True),
 ]
-TITLES = ("scheme", "E", "inflation", "RMSE", "each seed", "spread", "published", "target", "met", "ms a cycle")
+TITLES = ("scheme", "E", "inflation", "RMSE", "each seed", "spread", "published", "ms a cycle")
 RADIUS = 4.0  # of the localisation, in variables
 
 
@@ -141,7 +140,7 @@ def report(study: Schemes) -> str:
         "40 variables, forcing 8, all observed with unit variance every 0.05 time units. RMSE: time mean",
         f"over {cycles:,} cycles after {burn_in:,} of burn-in of the root mean square error of the analysis mean;",
         f"mean over {seeds} seeds, then each seed. Spread: the same of the ensemble's standard deviation.",
-        "Published: DAPPER's table, which reproduces the papers. Met: the mean does not exceed the target.",
+        "Published: DAPPER's table, which reproduces the papers.",
         f"The start and perturbations are {study.draws} draws.",
         "",
         *head(*TITLES),
@@ -154,8 +153,8 @@ def report(study: Schemes) -> str:
         errors, spreads = assimilate(case, truth, observations, study.first, study.draws == "exact")
         elapsed = 1e3 * (time.perf_counter() - began) / len(errors)
         scores = errors[burn_in:].mean(0)
-        each, met = ", ".join(f"{score:.3f}" for score in scores), "yes" if scores.mean() <= case.target else "no"
-        cells = f"{scores.mean():.3f}", each, f"{spreads[burn_in:].mean():.3f}", case.published, case.target, met
+        each = ", ".join(f"{score:.3f}" for score in scores)
+        cells = f"{scores.mean():.3f}", each, f"{spreads[burn_in:].mean():.3f}", case.published
         lines.append(line(case.name, case.ensemble_size, case.inflation, *cells, f"{elapsed:.2f}"))
         print(lines[-1], flush=True)
     lines += [

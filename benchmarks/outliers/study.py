@@ -66,7 +66,7 @@ def score(filter: Filter, data: TensorDict, draw: int) -> dict[str, float]:
     return {**scores(error, crps, error.abs() < HALF * belief["var"].sqrt()), "ms": 1e3 * took / data.shape[1]}
 
 
-def fit(filter: Filter, loss: nn.Module, study: Study, updates: int, rate: float, data: tuple) -> Filter:
+def fit(filter: Filter, loss: nn.Module, updates: int, rate: float, data: tuple) -> Filter:
     """Trains on windows of whole runs; validation data choose the update that is kept."""
     train, validation = data
     least, kept, every = float("inf"), filter.state_dict(), max(1, updates // 7)
@@ -97,7 +97,7 @@ def trained(kind: str, study: Study, draw: int, data: tuple) -> Filter:
     else:
         filter, loss = learned(), partial(DEnKFLoss, sensor=0.0)
     objective = loss(filter, transition=0.0, state_scale=SCALE)
-    return fit(filter, objective, study, study.updates[kind == "LSTM"], 3e-3 if kind == "LSTM" else 1e-2, data)
+    return fit(filter, objective, study.updates[kind == "LSTM"], 3e-3 if kind == "LSTM" else 1e-2, data)
 
 
 def planned(study: Study, test: TensorDict) -> dict[tuple, Callable[[], dict]]:
