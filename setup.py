@@ -28,7 +28,7 @@ setup(
         "Topic :: Scientific/Engineering :: Artificial Intelligence",
         "Typing :: Typed",
     ],
-    python_requires=">=3.11",  # labmaze, which dm-control needs, has no wheel for 3.13
+    python_requires=">=3.11,<3.13",  # labmaze, which dm-control needs, has no wheel for 3.13
     packages=find_packages(include=["torch_denkf", "torch_denkf.*"]),
     package_data={
         "torch_denkf": ["py.typed", "**/*.pyi"],
@@ -68,7 +68,7 @@ setup(
         # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
         "bench": [
             "matplotlib",
-            "pandas",  # tables of studies
+            "pandas>=3.0",  # tables of the studies
             "vqf==2.1.2",  # the peer of benchmarks/broad
             "filterpy==2.0.0",
             "dapper==1.7.1",
@@ -88,7 +88,6 @@ setup(
         ],
         "test": [
             "evo",
-            "pandas",
             "rosbags>=0.11",
             "pyyaml",
             "pyarrow>=15",
@@ -97,6 +96,7 @@ setup(
             "onnxscript>=0.7.2",
             "onnxruntime>=1.32",
             "hypothesis",
+            "pandas>=3.0",  # tables of the studies
             "pytest",
             "pytest-xdist",
             "ruff",
