@@ -1,1 +1,0 @@
-"""Which way is up, by a gyro and an accelerometer?"""
