@@ -69,7 +69,8 @@ setup(
         "bench": [
             "matplotlib",
             "pandas>=3.0",  # tables of the studies
-            "vqf==2.1.2",  # the peer of benchmarks/broad
+            "vqf==2.1.2",  # the peers of benchmarks/broad
+            "ahrs==0.4.0",
             "filterpy==2.0.0",
             "dapper==1.7.1",
             "cuthbert==0.1.1",

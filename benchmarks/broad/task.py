@@ -13,9 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_denkf.applications.imu.filter import ImuSettings
+from torch_denkf.applications.imu.log import imu_rows
 from torch_denkf.functional.manifolds import SO3, quaternion_product
 
-__all__ = ["LEVEL", "Trial", "kind_of", "read_trials", "scores", "simulated_trial"]
+__all__ = ["LEVEL", "Trial", "first_orientation", "kind_of", "read_trials", "scores", "simulated_trial"]
 
 LEVEL = 0.9  # of the intervals
 _ONE, _TWO = 1.6449, 2.1460  # radii that hold LEVEL of a normal error with one and with two components
@@ -103,6 +105,12 @@ def simulated_trial(seconds: float = 10.0, rate: float = 100.0, seed: int = 0) -
     field = seen(torch.tensor([0.0, 16.0, -41.0], dtype=torch.float64).expand(count, 3)) + noise(0.5)
     gyro = turn + noise(0.003) + torch.tensor([0.004, -0.002, 0.003])
     return Trial("simulated", "simulated", gyro, force, field, truth, moves.squeeze(-1), rate)
+
+
+def first_orientation(trial: Trial) -> Tensor:
+    """Returns the orientation ``[4]`` that the first readings of accelerometer and magnetometer say."""
+    readings = (each[:100] for each in (trial.gyro, trial.acceleration, trial.magnetometer))
+    return imu_rows(ImuSettings(), *readings, rate=trial.rate)["start"][0, :4]
 
 
 def scores(trial: Trial, quaternion: Tensor, std: Tensor | None = None) -> dict[str, float]:

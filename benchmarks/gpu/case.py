@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from statistics import median
 from typing import Any
 
@@ -55,6 +56,7 @@ class Found:
     ms: float | None = None
     first_s: float | None = None
     note: str = ""
+    more: dict[str, float] = field(default_factory=dict)
 
     @property
     def rate(self) -> float | None:
@@ -72,27 +74,36 @@ def wait(device: str) -> None:
         torch.cuda.synchronize()
 
 
+@contextmanager
+def only_this(device: str) -> Iterator[None]:
+    """Leaves no memory of a case to the next one."""
+    try:
+        yield
+    finally:
+        if device == "cuda":
+            torch.cuda.empty_cache()
+
+
 def measure(part: str, case: Case, device: str, seconds: float) -> Found:
     """Times a case for about so many seconds; an error becomes the row's note."""
     found = Found(part, case.name, case.way, case.batch, case.steps, case.gradients, case.dims)
     try:
-        call = case.make()
-        began = time.perf_counter()
-        call(), wait(device)
-        found.first_s = time.perf_counter() - began
-        times: list[float] = []
-        for _ in range(2):
-            call()
-        wait(device)
-        until = time.perf_counter() + seconds
-        while len(times) < 3 or (time.perf_counter() < until and len(times) < 200):
+        with only_this(device):
+            call = case.make()
             began = time.perf_counter()
             call(), wait(device)
-            times.append(1e3 * (time.perf_counter() - began))
-        found.ms = median(times)
-        del call
+            found.first_s = time.perf_counter() - began
+            times: list[float] = []
+            for _ in range(2):
+                call()
+            wait(device)
+            until = time.perf_counter() + seconds
+            while len(times) < 3 or (time.perf_counter() < until and len(times) < 200):
+                began = time.perf_counter()
+                call(), wait(device)
+                times.append(1e3 * (time.perf_counter() - began))
+            found.ms = median(times)
+            del call
     except Exception as error:
         found.note = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
-    if device == "cuda":
-        torch.cuda.empty_cache()  # leaves no memory of this case to the next one
     return found

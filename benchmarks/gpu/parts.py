@@ -94,6 +94,14 @@ def of_peers(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
                 return cuthbert_sequence(batch, gradients)
 
             yield Case("cuthbert, EnKF, Table I: a sequence", cuthbert, "cuthbert", batch, workload.STEPS, gradients)
+        for kind in ("EKF", "UKF"):
+
+            def dynamax(batch=batch, kind=kind):
+                from benchmarks.speed.against_dynamax import dynamax_sequence
+
+                return dynamax_sequence(kind, batch)
+
+            yield Case(f"dynamax, {kind}: a sequence", dynamax, "dynamax", batch, workload.STEPS + 1)
 
         def torch_kf(batch=batch):
             from torch_kf import GaussianState
@@ -227,13 +235,63 @@ def of_analysis(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Cas
         yield Case(f"analysis, {scheme}", call, "eager", 1, 1, False, size)
 
 
-#: By name what makes the cases, and the seconds that they may take, of six minutes in all.
-PARTS: dict[str, tuple[Callable[[str, tuple[str, ...], bool], Iterator[Case]], int]] = {
-    "paper": (of_paper, 45),
-    "training": (of_training, 30),
-    "robots": (of_robots, 30),
-    "peers": (of_peers, 60),
-    "environments": (of_environments, 60),
-    "analysis": (of_analysis, 20),
-    "filters": (of_filters, 115),
+def of_equality(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
+    """Not times: a difference raises, and its row says so."""
+
+    def eager_of(name: str, data: TensorDict):
+        torch.manual_seed(0)
+        filter = MODELS[name](5).double()
+        data = filter.draw_noise(data.double())
+        filter.to(device)
+        return filter, data.to(device)
+
+    for name in MODELS:
+        for way in (way for way in ways if way != "eager"):
+
+            def same(name=name, way=way):
+                filter, data = eager_of(name, frames(5, 3, 6, "cpu"))
+                data["reading"].requires_grad_()
+                out = []
+                for options in (WAYS["eager"], WAYS[way]):
+                    mean = filter.compile(**options).sequence(data.copy())["belief", "mean"]
+                    out.append((mean.detach(), *torch.autograd.grad(mean.square().sum(), data["reading"])))
+                for ours, theirs in zip(*out, strict=True):
+                    torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
+                return lambda: None
+
+            yield Case(f"equals eager: {name}", same, way, 3, 6, True)
+
+    for way in ways:
+
+        def again(way=way):
+            filter = MODELS["DEnKF, perturbed"](5).to(device).compile(**WAYS[way])
+            data = frames(5, 3, 6, device)
+            first, second = (filter.sequence(data.copy())["belief", "ensemble"].detach() for _ in range(2))
+            if bool(torch.isclose(first, second).all(-1).any()):
+                raise AssertionError("two runs drew the same members")
+            return lambda: None
+
+        yield Case("two runs draw different members", again, way, 3, 6)
+
+
+PARTS: dict[str, Callable[[str, tuple[str, ...], bool], Iterator[Case]]] = {
+    "equality": of_equality,
+    "paper": of_paper,
+    "training": of_training,
+    "robots": of_robots,
+    "peers": of_peers,
+    "environments": of_environments,
+    "analysis": of_analysis,
+    "filters": of_filters,
+}
+#: Seconds that a part may take, of six minutes in all.
+LIMITS: dict[str, int] = {
+    "equality": 45,
+    "paper": 45,
+    "training": 30,
+    "robots": 30,
+    "peers": 60,
+    "environments": 60,
+    "analysis": 20,
+    "filters": 85,
 }

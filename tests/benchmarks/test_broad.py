@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from benchmarks.broad.learning import Equations, beliefs, factor, minimised
-from benchmarks.broad.study import OWN, SIX, run, settings_for
+from benchmarks.broad.study import OWN, SIX, Runner, settings_for
 from benchmarks.broad.task import kind_of, read_trials, scores, simulated_trial
 from torch_denkf.applications.imu.filter import ImuSettings
 from torch_denkf.applications.imu.log import imu_rows
@@ -60,7 +60,7 @@ def test_the_equations_in_c_are_the_filter():
     trial, settings = simulated_trial(seconds=8.0), replace(ImuSettings(), lag=0.01, lag_std=0.01, magnetometer=0.5)
     assert imu_rows(settings, trial.gyro, trial.acceleration, rate=trial.rate)["rest_observed"].sum() > 3
     shorter = replace(trial, **{name: getattr(trial, name)[:500] for name in SENSORS})
-    found = run(settings, [shorter, trial])  # in one batch
+    found = Runner(smoother=False)(settings, [shorter, trial])  # in one batch
     for each, own in zip([shorter, trial], found, strict=True):
         for method, six in ((OWN, False), (SIX, True)):
             mean, cov = beliefs(Equations(), each, settings, six=six)
