@@ -111,7 +111,7 @@ def vector(size: int, *, positive: bool = False, negative: bool = True, length: 
         out[place] = last
         return out
 
-    bad, named = st.sampled_from([NAN, -INF]), {"nan": of(NAN), "inf": of(INF), "text": "much"}
+    bad, named = st.sampled_from([NAN, -INF]), {"nan": of(NAN), "inf": of(INF), "complex": of(1 + 0.5j), **TEXT}
     if length:
         named |= {"too long": [1.0] * (size + 1), "a matrix": torch.ones(size, size + 1)}
     if not negative or positive:
@@ -137,10 +137,9 @@ def spoiled(place: Any, value: Any) -> Change:
 
 
 def broken(*at: int, places: st.SearchStrategy[tuple[int, ...]]) -> Wrong:
-    """NaN and infinity in an element ``at`` of an array, and in drawn places."""
-    others = st.tuples(places, st.sampled_from([NAN, INF, -INF]))
-    named = {"a NaN": ((*at, 0), NAN), "all NaN": (at, NAN), "inf": ((*at, -1), INF), "-inf": ((*at, -1), -INF)}
-    return Wrong(named, drawn(others)).each(lambda one: spoiled(*one))
+    """NaN and infinity in an element ``at`` of an array, in all of it, and in drawn places."""
+    others = st.tuples(places | st.just(at), st.sampled_from([NAN, INF, -INF]))
+    return Wrong({"a NaN": ((*at, 0), NAN), "inf": ((*at, -1), INF)}, drawn(others)).each(lambda one: spoiled(*one))
 
 
 MISSING = object()
@@ -160,10 +159,10 @@ def matrix(rows: int, columns: int) -> Wrong:
     """Matrices that are none of ``rows`` by ``columns`` finite numbers."""
     eye = torch.eye(rows, columns)
     places = st.tuples(st.integers(0, rows - 1), st.integers(0, columns - 1))
-    numbers = broken(0, places=places).without("-inf").each(lambda change: change(eye))
+    numbers = broken(0, places=places).each(lambda change: change(eye))
     sizes = {"a row more": (rows + 1, columns), "a column more": (rows, columns + 1), "a vector": (columns + 1,)}
     sizes["three dimensions"] = (2, rows, columns)
-    return numbers | {what: torch.ones(size) for what, size in sizes.items()} | TEXT
+    return numbers | {what: torch.ones(size) for what, size in sizes.items()} | {"complex": (1 + 0.5j) * eye, **TEXT}
 
 
 def covariance(size: int) -> Wrong:

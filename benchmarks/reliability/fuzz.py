@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -139,21 +140,14 @@ def table(found: dict[str, Any]) -> str:
 
 
 def sampled(targets: Sequence[Target], count: int, seed: int) -> list[Callable[[], list[Row]]]:
-    """Works that draw so many cases, of each border its share, at least one; none that takes long to prepare."""
-    borders: dict[str, list[Target]] = {}
-    for target in targets:
-        if not target.slow:
-            borders.setdefault(target.border, []).append(target)
-    sizes = {border: sum(len(target.wrong.named) for target in some) for border, some in borders.items()}
-    return [
-        lambda some=some, border=border: search(
-            st.sampled_from(some).flatmap(Target.some),
-            max(1, round(count * sizes[border] / sum(sizes.values()))),
-            seed,
-            f"--sample {count} --seed {seed} --match {border!r}",
-        )
-        for border, some in borders.items()
-    ]
+    """Works that draw so many cases, of each border its share, at least one."""
+
+    def work(border: str) -> list[Row]:
+        some = [target for target in targets if target.border == border]
+        share, words = max(1, round(count * len(some) / len(targets))), f"--sample {count} --seed {seed}"
+        return search(st.sampled_from(some).flatmap(Target.some), share, seed, f"{words} --match {border!r}")
+
+    return [partial(work, border) for border in dict.fromkeys(target.border for target in targets)]
 
 
 @dataclass(frozen=True)
@@ -173,16 +167,13 @@ class Fuzz:
     def __call__(self) -> None:
         """Runs the suite."""
         began = time.time()
-        targets = [target.matching(self.match) for target in all_targets(self.borders)]
-        targets = [target for target in targets if target.wrong.named]
         sample = self.sample or (20 if self.smoke else 0)
-        slow = {target.needs for target in targets if target.needs and not (sample and target.slow)}
-        for needs in slow:
+        targets = [target.matching(self.match) for target in all_targets(self.borders)]
+        targets = [target for target in targets if target.wrong.named and not (sample and target.slow)]
+        for needs in {target.needs for target in targets if target.needs}:
             needs()  # once for all
-        if sample:
-            works = sampled(targets, sample, self.seed)
-        else:
-            works = [lambda target=target: attacked(target, self.drawn, self.seed) for target in targets]
+        whole = [partial(attacked, target, self.drawn, self.seed) for target in targets]
+        works = sampled(targets, sample, self.seed) if sample else whole
         found = summary(side_by_side(works, self.processes))
         found["seconds"] = round(time.time() - began)
         print(table(found))

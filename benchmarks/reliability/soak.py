@@ -28,8 +28,7 @@ TITLES = {
 PARTS = tuple(TITLES)
 RESULTS = Path(__file__).parent / "results"
 #: What stays in the JSON file.
-NOT_SHOWN = ("name", "right", "seconds", "message", "us a step", "runs to the end between them")
-NOT_SHOWN += ("mean variance, first chunk", "mean variance, last chunk")
+NOT_SHOWN = ("name", "right", "seconds", "message")
 Row = dict[str, Any]
 
 

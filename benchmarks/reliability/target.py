@@ -193,7 +193,7 @@ def _reference(source: Source, options: tuple[tuple[str, Any], ...]) -> Any:
 #: Wrong values of arguments, by their annotation.
 OF_KINDS: dict[str, d.Wrong] = {
     "NestedKey": d.Wrong(
-        {"a number": 5, "empty": "", "an empty tuple": (), "numbers": ("info", 3), "a list": ["info"]},
+        {"a number": 5, "empty": "", "an empty tuple": (), "numbers": ("info", 3), "a list": ["info"]}
     ),
     "Sequence[NestedKey]": d.Wrong({"one key": "action", "a number": 5, "numbers": [1, 2]}),
     "bool": d.Wrong({"text": "yes", "a number": 2, "nothing": None}),

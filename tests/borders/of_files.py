@@ -36,7 +36,6 @@ from torch_denkf.pretrained import from_pretrained, save_pretrained
 from torch_denkf.training import FilterTrainer, Stage
 
 DRIVE, SIZE = recorded.DRIVE, d.SIZE | d.of((1.5, 2.5))
-COUNT_OF = d.COUNT.without("fraction") | {"a fraction": 2.5}
 
 
 def _drive() -> TensorDict:
@@ -87,7 +86,7 @@ def _drives() -> Iterator[Subject]:
 
 # --------------------------------------------------------------------------------------------------------------- car
 
-CALIBRATION = d.of((1.0, 1.0, 1.0), (0.0, 40.0, 35.0, 11.0), (NAN, 40.0, 35.0, 11.0), "ab")
+CALIBRATION = d.of((1.0, 1.0, 1.0), (0.0, 40.0, 35.0, 11.0), (NAN, 40.0, 35.0, 11.0), (-4.0, 40.0, 35.0, 11.0), "ab")
 
 
 def _tracked(**given: Any) -> Any:
@@ -140,11 +139,10 @@ def _car() -> Iterator[Subject]:
     flow = lambda transform: transform(TensorDict({"pixels": torch.rand(6, 24, 72)}))  # noqa: E731
     camera = lambda: {"calibration": (40.0, 40.0, 35.0, 11.0)}  # noqa: E731
     batch = lambda: {"mean": torch.zeros(2, 2), "cov": eye.expand(2, 2, 2)}  # noqa: E731
-    negative = CALIBRATION | {"negative": (-4.0, 40.0, 35.0, 11.0)}
     yield Subject(car_filter, wrong=models.CAR)
     yield Subject(_tracked, wrong=tracked, also={"frames": ("frame",), "times": ("time",)}, name="track")
     yield Subject(CanonicalCamera, lambda: {"focal": 40.0})
-    yield Subject(OpticalFlow, camera, flow, {"calibration": negative})
+    yield Subject(OpticalFlow, camera, flow, {"calibration": CALIBRATION})
     yield Subject(Updates, wrong=updates, also=dict.fromkeys(updates, ("Updates",)))
     yield Subject(bridge_gaps, lambda: {"drive": _drive()})
     yield Subject(sigma_points, batch, wrong=points, right={"cov": _no_moments})

@@ -104,10 +104,10 @@ def words(name: str, changes: dict[str, Any]) -> list[str]:
     return [name, *(word for option, parts in used.items() for word in ([option] if option else []) + parts)]
 
 
-def called(root: Path, name: str, **changes: Any) -> str:
+def called(folder: Path, /, name: str, **changes: Any) -> str:
     """Returns what a command says in a folder; changes are named as its fields."""
     changes = {"" if option == "first" else f"--{option.replace('_', '-')}": value for option, value in changes.items()}
-    with contextlib.chdir(root):
+    with contextlib.chdir(folder):
         return run(words(name, changes))
 
 
@@ -235,7 +235,7 @@ PATH: dict[str, d.Change] = {
 #: What each of three poses may be: three of them are a drive.
 POSES: dict[str, d.Change] = {
     **{f"{value} in place {place}": put((1, place), value) for value in WORDS.named.values() for place in (0, 3)},
-    **{f"pose 1 {what}": put(1, change) for what, change in recorded.POSES.without("an empty line").named.items()},
+    **{f"pose 1 {what}": put(1, change) for what, change in recorded.POSES.items() if what != "an empty line"},
     "eleven numbers": put((1, 11), d.MISSING),
     "three poses 1e7 m apart": lambda rows: [[*row[:11], str(1e7 * number)] for number, row in enumerate(rows)],
 }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-import zipfile
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,7 @@ from benchmarks.reliability import damage as d
 from benchmarks.reliability.borders.recorded import made
 from benchmarks.reliability.damage import MISSING, NAN, put, same, written
 from benchmarks.reliability.documents import edited
-from benchmarks.reliability.hostile import PICKLES, npz_of_zeros
+from benchmarks.reliability.hostile import PICKLES, archive, members_of, npz_of_zeros
 from benchmarks.reliability.target import Source, Target
 from tests.filters.factories import linear_kalman
 from tests.training.problem import make_trainer
@@ -224,16 +223,14 @@ def redescribed(change: Callable[[str], str]) -> d.Change:
     """Changes the description in a package."""
 
     def act(file: Path) -> None:
-        with zipfile.ZipFile(file) as archive:
-            content = {name: archive.read(name) for name in archive.namelist()}
-        with zipfile.ZipFile(file, "w") as out:
-            for name, data in content.items():
-                out.writestr(name, change(data.decode()).encode() if name.endswith("torch_denkf") else data)
+        members = members_of(file)
+        texts = {name: change(data.decode()) for name, data in members.items() if name.endswith("torch_denkf")}
+        archive(members | texts)(file)
 
     return act
 
 
-def _less(part: str, **only: str) -> Callable[[str], str]:
+def _less(part: str) -> Callable[[str], str]:
     """Takes an entry out of a list of the description."""
     return lambda text: text.replace(f"{part}, ", "").replace(f", {part}", "")
 
@@ -247,21 +244,10 @@ DESCRIPTIONS = d.of("", "x", "{", "[]", "{}", '{"inputs": [], "outputs": []}', '
 }
 
 
-def _archive(**members: str) -> d.Change:
-    """Puts an archive of these members in a file's place."""
-
-    def act(file: Path) -> None:
-        with zipfile.ZipFile(file, "w") as archive:
-            for name, text in members.items():
-                archive.writestr(name.replace("__", "/"), text)
-
-    return act
-
-
 ARCHIVES = {
-    "an empty archive": _archive(),
-    "a name of a compiled one": _archive(data__aotinductor__model="nothing"),
-    "an archive's version alone": _archive(archive__version="0", archive__models__model="x"),
+    "an empty archive": archive({}),
+    "a name of a compiled one": archive({"data/aotinductor/model": "nothing"}),
+    "an archive's version alone": archive({"archive/version": "0", "archive/models/model": "x"}),
 }
 
 

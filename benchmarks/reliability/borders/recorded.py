@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import shutil
 import struct
 import warnings
-import zipfile
 from collections.abc import Callable, Iterator
 from functools import cache, partial
 from pathlib import Path
@@ -25,7 +23,7 @@ from benchmarks.reliability import damage as d
 from benchmarks.reliability.case import apart, workshop
 from benchmarks.reliability.damage import NAN, gone, instead, kept, put, renamed, same, spoiled, written
 from benchmarks.reliability.documents import edited
-from benchmarks.reliability.hostile import MARK, Bomb, npz_of_zeros
+from benchmarks.reliability.hostile import MARK, Bomb, archive, npz_of_zeros
 from benchmarks.reliability.target import Source, Target
 from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
 from tests.data.lerobot.lerobot_folder import SIZE as SMALL
@@ -120,18 +118,16 @@ NO_PICTURES = {
     "another size": _picture((10, 10), ".png"),
     "the same number twice": lambda file: shutil.copy(file.with_name("000003.png"), file.with_name("4.png")),
 }
-POSES = d.Wrong(
-    {
-        "a comment": lambda line: ["#", *line],
-        "thirteen numbers": lambda line: [*line, "1"],
-        "an empty line": lambda line: [],
-        "no rotation": lambda line: ["0"] * 11 + line[11:],
-        "mirrored": lambda line: ["-1", *line[1:]],
-        "sheared": lambda line: [line[0], "0.2", *line[2:]],
-        "1e200": lambda line: [*line[:11], "1e200"],
-        "a jump of 1e9 m": lambda line: [*line[:3], "1e9", *line[4:]],
-    }
-)
+POSES: dict[str, d.Change] = {
+    "a comment": lambda line: ["#", *line],
+    "thirteen numbers": lambda line: [*line, "1"],
+    "an empty line": lambda line: [],
+    "no rotation": lambda line: ["0"] * 11 + line[11:],
+    "mirrored": lambda line: ["-1", *line[1:]],
+    "sheared": lambda line: [line[0], "0.2", *line[2:]],
+    "1e200": lambda line: [*line[:11], "1e200"],
+    "a jump of 1e9 m": lambda line: [*line[:3], "1e9", *line[4:]],
+}
 CALIBRATION = d.of((1, "0"), (1, "-700"), (6, "0"), (1, "1e300"), (0, "Q2:")).each(
     lambda one: edited(put((2, one[0]), one[1]))
 )
@@ -146,7 +142,7 @@ def _of_kitti() -> Iterator[Target]:
     yield from KITTI.document(POSE_FILE, skip=one_row)
     yield from KITTI.document(TIME_FILE, skip=one_row)
     yield from KITTI.document(CALIBRATION_FILE, KITTI.like(), skip=one_row, loose=lambda place: place[0] != 2)
-    pose = POSES.each(lambda change: edited(put(4, change)))
+    pose = d.Wrong(POSES).each(lambda change: edited(put(4, change)))
     time = d.of(["1e300"], ["-1e300"], [], ["0.1", "0.2"]).each(lambda line: edited(put(4, line)))
     yield KITTI.target("pose 4", pose, None, f"{DRIVE}.txt:5", POSE_FILE)
     yield KITTI.target("time 4", time, _times_masked, "times.txt:5", TIME_FILE)
@@ -207,16 +203,15 @@ def _planted(file: Path) -> None:
 
 
 #: Columns of vectors, and of numbers.
-VECTORS = d.Wrong({"all nan": lambda column: [[NAN] * len(cell) for cell in column], "text": lambda column: ["x"] * 5})
-SCALARS = d.Wrong(
-    {
-        "text": lambda column: ["x"] * len(column),
-        "backwards": lambda column: column[::-1],
-        "all zero": lambda column: [0] * len(column),
-        "a repeated value": lambda column: [*column[:2], column[1], *column[3:]],
-        "far on from the third on": lambda column: [*column[:2], *(value - 86400 for value in column[2:])],
-    }
-)
+VECTORS = {"all nan": lambda column: [[NAN] * len(cell) for cell in column], "text": lambda column: ["x"] * 5}
+SCALARS = {
+    "text": lambda column: ["x"] * len(column),
+    "backwards": lambda column: column[::-1],
+    "all zero": lambda column: [0] * len(column),
+    "all nan": lambda column: [NAN] * len(column),
+    "a repeated value": lambda column: [*column[:2], column[1], *column[3:]],
+    "far on from the third on": lambda column: [*column[:2], *(value - 86400 for value in column[2:])],
+}
 ROWS = {
     "a row less": lambda columns: {name: column[:-1] for name, column in columns.items()},
     "a row more": lambda columns: {name: [*column, column[-1]] for name, column in columns.items()},
@@ -241,7 +236,7 @@ def _of_lerobot() -> Iterator[Target]:
     yield from V2.document(DATA, _rows_kept, words, loose=counts)
     columns = {**dict.fromkeys(("observation.state", "action"), VECTORS), "timestamp": SCALARS}
     for key, wrong in {**columns, "frame_index": SCALARS, "episode_index": SCALARS}.items():
-        changes = wrong.each(lambda change, key=key: edited(put(key, change)))
+        changes = d.Wrong(wrong).each(lambda change, key=key: edited(put(key, change)))
         right = _rows_kept if key != "frame_index" else None
         yield V2.target(f"column {key}", changes, right, (*words, key), DATA)
     elsewhere = ("/etc/passwd", "../../etc/passwd", "no.png", "/dev/zero")
@@ -322,15 +317,6 @@ ARRAYS = {
 }
 
 
-def _many(data: bytes) -> bytes:
-    """An archive of 20,000 arrays."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for number in range(20000):
-            archive.writestr(f"{number}.npy", b"")
-    return buffer.getvalue()
-
-
 def _of_ur5() -> Iterator[Target]:
     npz_of_zeros(1 << 30)  # here, not in each case's process
     words, lost = (MANIFEST, DEMO, "demo-000000.npz", "demo-000002.npz"), lambda place: place[-1] == "failures"
@@ -339,14 +325,16 @@ def _of_ur5() -> Iterator[Target]:
     lines = d.Wrong(TEXTS).each(edited)
     yield DEMOS.target("manifest's lines", lines, None, words, MANIFEST, rights={"a line twice": DEMOS.like()})
     yield DEMOS.target("demo", d.SEALED | d.PLACES, file=DEMO)
-    yield DEMOS.target(
-        "demo, checksum adapted", d.BYTES.but().each(signed), DEMOS.like(), file=DEMO
-    )  # its date is not read
+    dated = d.BYTES.but().each(signed)  # nobody reads the date of an archive
+    yield DEMOS.target("demo, checksum adapted", dated, DEMOS.like(), file=DEMO)
     yield from DEMOS.document(DEMO, then=signed)
     yield DEMOS.target("demo's arrays", d.Wrong(ARRAYS).each(edited).each(signed), file=DEMO)
-    hostile = {"with a pickle that runs code": lambda data: Bomb.npz("state"), "of 20,000 arrays": _many}
-    hostile["that unpacks to a gigabyte"] = lambda data: npz_of_zeros(1 << 30)
-    yield DEMOS.target("hostile demo", d.Wrong(hostile).each(written).each(signed), file=DEMO, within=4)
+    hostile = {
+        "with a pickle that runs code": written(lambda data: Bomb.npz("state")),
+        "of 20,000 arrays": archive({f"{number}.npy": b"" for number in range(20000)}),
+        "that unpacks to a gigabyte": written(lambda data: npz_of_zeros(1 << 30)),
+    }
+    yield DEMOS.target("hostile demo", d.Wrong(hostile).each(signed), file=DEMO, within=4)
     yield DEMOS.target("no root", gone, None, "ur5")
 
 

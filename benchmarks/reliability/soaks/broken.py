@@ -126,16 +126,14 @@ def _render(folder: Path, processes: int = 1) -> None:
 def _export(folder: Path, compiled: bool = False) -> None:
     with tempfile.TemporaryDirectory() as cache:  # of what inductor compiles
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache
-        export_step(
-            linear_denkf("etkf"), TensorDict({"observation": torch.zeros(2)}), folder / "step.pt2", compiled=compiled
-        )
+        frame = TensorDict({"observation": torch.zeros(2)})
+        export_step(linear_denkf("etkf"), frame, folder / "step.pt2", compiled=compiled)
 
 
 def _stepped(folder: Path) -> Any:
     step = load_step(folder / "step.pt2")
-    return step(
-        {name: torch.arange(1.0, 1.0 + math.prod(shape)).view(shape) for name, (shape, _) in step.inputs.items()}
-    )
+    sizes = {name: size for name, (size, _) in step.inputs.items()}
+    return step({name: torch.arange(1.0, 1.0 + math.prod(size)).view(size) for name, size in sizes.items()})
 
 
 def _save(folder: Path) -> None:
@@ -189,15 +187,20 @@ def two_folders() -> Iterator[tuple[Path, Path, Path]]:
         yield broken, sound, Path(root, "log.txt")
 
 
-def ends_equal(work: Work, broken: Path, sound: Path) -> str:
-    """Returns the verdict on what work left in two folders."""
-    alike = lambda folder: equal(work.result(broken), work.result(sound))  # noqa: E731
+def ends_equal(work: Work, broken: Path, sound: Path, *again: Path) -> str:
+    """Does the work in some folders, and returns the verdict on what it left in two."""
+
+    def alike(folder: Path) -> bool:
+        for place in again:
+            work.do(place)
+        return equal(work.result(broken), work.result(sound))
+
     return judge(Case("soak", "result", (), alike, bool, within=240)).kind
 
 
 def killed(name: str, kills: int, seed: int) -> dict[str, Any]:
     """Kills work at random moments, and starts it again."""
-    work, chance, count, lingering, endings = WORKS[name], random.Random(f"{name} {seed}"), 0, 0, 0
+    work, chance, count, lingering = WORKS[name], random.Random(f"{name} {seed}"), 0, 0
     with two_folders() as (broken, sound, log):
         began = time.monotonic()
         apart(lambda: work.do(sound))
@@ -209,7 +212,6 @@ def killed(name: str, kills: int, seed: int) -> dict[str, Any]:
             if done:  # it came to its end: once more from the start
                 if status:
                     raise RuntimeError(f"the work failed after {count} kills: {log.read_text()[-2000:]}")
-                endings += 1
                 subprocess.run(["find", broken, "-mindepth", "1", "-delete"], check=True)
                 continue
             os.kill(child, signal.SIGKILL)
@@ -220,11 +222,9 @@ def killed(name: str, kills: int, seed: int) -> dict[str, Any]:
             for worker in workers(child):
                 lingering += 1
                 os.kill(worker, signal.SIGKILL)
-        apart(lambda: work.do(broken))
-        left, equal_ends = left_behind(broken), ends_equal(work, broken, sound) == "right"
+        equal_ends, left = ends_equal(work, broken, sound, broken) == "right", left_behind(broken)
     return {
         "kills": count,
-        "runs to the end between them": endings,
         "equal to an unbroken run": equal_ends,
         "left behind": left,
         "workers that stayed": lingering,
@@ -253,9 +253,7 @@ def on_disk(name: str, full: bool) -> dict[str, Any]:
         case = Case("disk", name, (*work.words, str(broken)), lambda folder: work.do(broken), within=120)
         said, left = judge(case), left_behind(broken)
         subprocess.run(["mount", "-o", f"remount,rw,{LARGE}", broken], check=True)
-        for folder in (broken, sound):
-            apart(lambda folder=folder: work.do(folder))
-        after, left_then = ends_equal(work, broken, sound), left_behind(broken)
+        after, left_then = ends_equal(work, broken, sound, broken, sound), left_behind(broken)
     return {
         "said": said.kind,
         "message": said.text.replace(str(broken), "DISK"),
@@ -274,8 +272,7 @@ def two(name: str) -> dict[str, Any]:
         children = [forked(lambda: work.do(broken), one) for one in logs]
         statuses = [os.waitpid(child, 0)[1] for child in children]
         said = [one.read_text().strip().splitlines()[-1] for one, status in zip(logs, statuses, strict=True) if status]
-        apart(lambda: work.do(sound))
-        result, left = ends_equal(work, broken, sound), left_behind(broken)
+        result, left = ends_equal(work, broken, sound, sound), left_behind(broken)
     refused = not said or (work.alone and len(said) == 1 and str(broken) in said[0])
     return {
         "refused": len(said),
