@@ -379,8 +379,8 @@ def _on_space(kind: str, name: str) -> Iterator[Target]:
         **({"of a point's numbers": lambda value: torch.ones(3, space.point_dim) > 0} if rotations else {}),
     }
     for source in (checked, fed("spaces", f"{kind}, {name}", build, frames, "step")):
-        numbers = broken | zeros | {"1e25": spoiled((STEP, -1), 1e25)} if source is checked else d.Wrong(zeros)
-        yield source.target("reading", (shapes | numbers).each(pose), None, "pose")
+        far = {"1e25": spoiled((STEP, -1), 1e25)} if source is checked else {}
+        yield source.target("reading", (shapes | broken | zeros | far).each(pose), None, "pose")
         if rotations:
             yield source.target("same reading", {"longer": pose(_longer(name))}, source.like(near=1e-5), "pose")
         for what, hidden, numbers in (("a part", first.tangent, first.point), ("all", ALL, ALL)):
