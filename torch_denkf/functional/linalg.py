@@ -7,7 +7,14 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from torch_denkf.functional.kernels.resolvents import sum_of_resolvents
-from torch_denkf.functional.kernels.small_system import LARGEST_FACTOR, WrittenOut, inverse_of, is_written_out, on_gpu
+from torch_denkf.functional.kernels.small_system import (
+    LARGEST_ELIMINATED,
+    LARGEST_FACTOR,
+    WrittenOut,
+    inverse_of,
+    is_written_out,
+    on_gpu,
+)
 
 
 def cholesky(matrix: Tensor) -> Tensor:
@@ -115,8 +122,9 @@ def solve(matrix: Tensor, right: Tensor) -> Tensor:
 class Solver:
     """Solves several systems of one symmetric positive definite matrix, NaN where it is not.
 
-    A processor solves with the Cholesky factor. On a GPU the inverse multiplies: torch solves batches with MAGMA there,
-    which cannot be captured into a CUDA graph, and the inverse's backward pass is of products alone.
+    A processor solves with the Cholesky factor. On a GPU, and for compilers up to :data:`LARGEST_ELIMINATED` unknowns,
+    the inverse multiplies: torch solves batches with MAGMA there, which cannot be captured into a CUDA graph, and the
+    inverse's backward pass is of products alone.
 
     Args:
         matrix: M, ``[*B, N, N]``.
@@ -124,7 +132,7 @@ class Solver:
     """
 
     def __init__(self, matrix: Tensor, ridge: float = 0):
-        self.direct = on_gpu(matrix)
+        self.direct = on_gpu(matrix) or is_written_out(matrix, LARGEST_ELIMINATED)
         if self.direct:
             found: tuple[Tensor, Tensor] = (_Inverse.apply if _differentiated() else inverse_of)(matrix, ridge)
             self.inverse, self.log = found

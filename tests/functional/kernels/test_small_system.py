@@ -5,11 +5,12 @@ import torch
 
 from torch_denkf.functional.kernels.small_system import (
     LARGEST,
+    LARGEST_ELIMINATED,
     LARGEST_FACTOR,
     WrittenOut,
     made_once,
 )
-from torch_denkf.functional.linalg import cholesky
+from torch_denkf.functional.linalg import Solver, cholesky
 
 
 def solutions(gram, cross, shift, mean_shift):
@@ -59,6 +60,23 @@ def test_the_factor_and_its_gradient_are_those_of_linalg(float64, size):
     seed = torch.randn_like(ours).tril()
     gradients = [torch.autograd.grad(value, matrix, seed)[0] for value in (ours, theirs)]
     torch.testing.assert_close(*(x + x.mT for x in gradients), rtol=1e-10, atol=1e-10)  # see above
+
+
+@pytest.mark.parametrize("size", [LARGEST_FACTOR + 1, LARGEST_ELIMINATED, LARGEST_ELIMINATED + 1])
+def test_a_compiler_sees_a_system_eliminated_with_the_values_and_gradients_of_linalg(float64, monkeypatch, size):
+    gram, cross, shift, _ = systems(size)
+    matrix = (gram + torch.eye(size)).requires_grad_()
+    expected = [shift @ torch.linalg.solve(matrix, cross), matrix.logdet().unsqueeze(-1)]
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    monkeypatch.setattr(torch.linalg, "cholesky_ex", None if size <= LARGEST_ELIMINATED else torch.linalg.cholesky_ex)
+    solver = Solver(matrix)
+    ours = [solver.between(shift, cross), solver.log_det()]
+    for value, wanted in zip(ours, expected, strict=True):
+        torch.testing.assert_close(value, wanted, rtol=1e-10, atol=1e-10)
+    gradients = [torch.autograd.grad(sum(value.sum() for value in found), matrix)[0] for found in (ours, expected)]
+    torch.testing.assert_close(*(x + x.mT for x in gradients), rtol=1e-8, atol=1e-8)  # see above
+    matrix.data[1] *= -1
+    assert Solver(matrix).log_det()[:, 0].isnan().tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize("place", range(3))

@@ -18,6 +18,8 @@ from torch import Tensor
 LARGEST = 4
 #: The largest matrix whose factor alone is written out, of a state's covariance, say.
 LARGEST_FACTOR = 6
+#: The largest system whose rows a compiler is to see eliminated, one after the other.
+LARGEST_ELIMINATED = 12
 #: Kinds of devices on which a call costs a launch, and a look at a result waits for all launches before it.
 GPUS = ("cuda",)
 
@@ -58,7 +60,8 @@ def identity_of(matrix: Tensor, dtype: torch.dtype | None = None) -> Tensor:
 def inverse_of(matrix: Tensor, ridge: float = 0) -> tuple[Tensor, Tensor]:
     """Returns the inverse of a symmetric M, N x N, and log det M, in few launches and without a look at the numbers.
 
-    Up to :data:`LARGEST` rows of M and of the identity are eliminated one after the other; larger ones are factored.
+    Up to :data:`LARGEST` rows of M and of the identity are eliminated one after the other, for a compiler up to
+    :data:`LARGEST_ELIMINATED`; larger matrices are factored.
 
     Args:
         matrix: M, ``[*B, N, N]``, with both triangles.
@@ -76,7 +79,7 @@ def inverse_of(matrix: Tensor, ridge: float = 0) -> tuple[Tensor, Tensor]:
     size = matrix.shape[-1]
     identity = identity_of(matrix).expand_as(matrix)
     matrix = torch.add(matrix, identity, alpha=ridge) if ridge else matrix
-    if not 0 < size <= LARGEST:
+    if not 0 < size <= (LARGEST_ELIMINATED if torch.compiler.is_compiling() else LARGEST):
         factor, info = torch.linalg.cholesky_ex(matrix)
         factor = torch.where((info == 0)[..., None, None], factor, torch.nan)
         root = torch.linalg.solve_triangular(factor, identity, upper=False)

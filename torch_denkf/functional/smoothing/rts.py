@@ -66,7 +66,7 @@ def rts_step(
     mean: Tensor,
     cov: Tensor,
     forecast_mean: Tensor,
-    forecast_cov: Tensor,
+    gain: Tensor,
     cross: Tensor,
     smoothed_mean: Tensor,
     smoothed_cov: Tensor,
@@ -82,36 +82,26 @@ def rts_step(
         mean: of the filter's belief at t, ``[*B, S]``.
         cov: P, its covariance, ``[*B, S, S]``.
         forecast_mean: of t + 1, ``[*B, S]``.
-        forecast_cov: P_f, ``[*B, S, S]``.
+        gain: G, see :func:`smoothing_gain`, ``[*B, S, S]``.
         cross: C, the covariance of the states at t and t + 1 in that forecast, ``[*B, S, S]``, rows at t.
         smoothed_mean: of t + 1, ``[*B, S]``.
         smoothed_cov: P_s of t + 1, ``[*B, S, S]``.
-        open_cov: P − G P_f Gᵀ, see :func:`left_open`; ``None`` for the difference itself.
+        open_cov: P − G P_f Gᵀ, see :func:`left_open`; ``None`` for the difference itself, P − G Cᵀ.
         space: in which the state lives: means are points, and each covariance is of the tangents at its mean. ``None``
             for plain numbers.
 
     Returns:
         The smoothed mean ``[*B, S]`` and covariance ``[*B, S, S]`` of t.
 
-    Raises:
-        ValueError: if the shapes do not fit.
-
     Examples:
         A random walk with P = Q = 1, whose next state turns out to be 2, exactly:
 
         >>> import torch
         >>> zero, one = torch.zeros(1), torch.ones(1, 1)
-        >>> mean, cov = rts_step(zero, one, zero, 2 * one, one, 2 * torch.ones(1), 0 * one)
+        >>> mean, cov = rts_step(zero, one, zero, smoothing_gain(one, 2 * one), one, 2 * torch.ones(1), 0 * one)
         >>> mean.round(decimals=4), cov.round(decimals=4)
         (tensor([1.]), tensor([[0.5000]]))
     """
-    size = mean.shape[-1] if space is None else space.tangent_dim
-    square = (*mean.shape[:-1], size, size)
-    for name, value in (("forecast_mean", forecast_mean), ("smoothed_mean", smoothed_mean)):
-        check_shape(name, value, mean.shape, "[*B, S]")
-    for name, value in (("cov", cov), ("forecast_cov", forecast_cov), ("cross", cross), ("smoothed_cov", smoothed_cov)):
-        check_shape(name, value, square, "[*B, S, S]")
-    gain = smoothing_gain(cross, forecast_cov)
     rest = cov - gain @ cross.mT if open_cov is None else open_cov
     if space is None:
         shift = gain @ (smoothed_mean - forecast_mean).unsqueeze(-1)
@@ -164,7 +154,14 @@ def rts_smooth(
         >>> smoothed.flatten().round(decimals=4)
         tensor([1., 2.])
     """
-    links = (forecast_mean, forecast_cov, cross, *(() if open_cov is None else (open_cov,)))
+    size = mean.shape[-1] if space is None else space.tangent_dim
+    check_shape("forecast_mean", forecast_mean, mean.shape, "[*B, T, S]")
+    for name, value in (("cov", cov), ("forecast_cov", forecast_cov), ("cross", cross)):
+        check_shape(name, value, (*mean.shape[:-1], size, size), "[*B, T, S, S]")
+    # Those of all times in one call; there is none to the first.
+    gains = smoothing_gain(cross[..., 1:, :, :], forecast_cov[..., 1:, :, :])
+    gain = torch.cat([torch.zeros_like(cross[..., :1, :, :]), gains], -3)
+    links = (forecast_mean, gain, cross, *(() if open_cov is None else (open_cov,)))
 
     def step(own, link, later):
         return rts_step(*own, *link[:3], *later, open_cov=(*link, None)[3], space=space)
