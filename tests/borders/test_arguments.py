@@ -11,7 +11,7 @@ ARGUMENTS = [target for target in all_targets(TESTED) if target.name.endswith(")
 #: Texts of which the letters are checked one by one, and differences of two arguments.
 OTHERS = ("num_cells", "channels", "hidden", "taper", "floor", "resampling")
 #: Files whose lines and descriptions are checked here, too.
-FILES = ("pose 4", "calibration", "lerobot2/meta", "manifest", "demo's arrays", "its description")
+FILES = ("pose 4", "calibration", "meta/episodes.jsonl", "json, data_path", "manifest", "its description")
 
 
 def judged(targets, root, monkeypatch):

@@ -24,12 +24,12 @@ def test_a_sample_is_refused_clearly_or_right(tmp_path):
     The sample is the same each time. It has cases with names, and others.
     """
     file = tmp_path / "fuzz.json"
-    command = [sys.executable, "-m", "benchmarks.reliability", "fuzz", "--sample", "80"]
+    command = [sys.executable, "-m", "benchmarks.reliability", "fuzz", "--sample", "60"]
     command += ["--processes", "1", "--out", str(file)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     found = json.loads(file.read_text())
-    assert found["records"] >= 70
+    assert found["records"] >= 55
     wrong = json.dumps(found["wrong"], indent=1)
     assert (found["hang"], found["crash"]) == (0, 0), wrong
     assert found["silent"] + found["unclear"] == 0, wrong

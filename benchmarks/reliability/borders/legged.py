@@ -157,12 +157,11 @@ def _subjects() -> Iterator[Subject]:
 def _robots() -> Iterator[Subject]:
     """Simulated ones of dm_control, which take seconds to make."""
     made = {**MADE, "friction": d.POSITIVE, "softness": d.POSITIVE, "speed": d.FINITE, "turn": d.FINITE}
-    settings = {"rows": d.COUNT, "kind": d.CHOICE, "slip": d.NOT_NEGATIVE}
+    yield Subject(quadruped.quadruped, wrong={"rows": d.COUNT, "kind": d.CHOICE, "slip": d.NOT_NEGATIVE})
     steps = dict.fromkeys(("time", "pace", "stride", "height", "lift"), d.FINITE)
     for make, wrong, sound in (
         (quadruped.quadruped_env, made, {}),
         (humanoid.humanoid_env, made, {}),
-        (quadruped.quadruped, settings, {}),
         (quadruped.trot, steps, {"time": 0.1}),
         (humanoid.stroll, steps, {"time": 0.1}),
     ):
