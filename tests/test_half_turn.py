@@ -34,14 +34,7 @@ from torch_denkf.modules import (
     UKFTransition,
 )
 from torch_denkf.monitoring import Gated, GatedAnalysis
-from torch_denkf.objectives import (
-    DEnKFLoss,
-    GaussianLoss,
-    MixtureLoss,
-    ObservationLoss,
-    SensorLoss,
-    TransitionLoss,
-)
+from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from torch_denkf.smoothers import FixedLag
 
 B, T, E = 3, 14, 12
@@ -51,9 +44,7 @@ Q, R = torch.tensor([0.05, 0.1], dtype=torch.float64), torch.tensor([0.3, 0.4], 
 NEAR = Neighbours(torch.arange(2).expand(2, 2), torch.tensor([[1.0, 0.5], [0.5, 1.0]], dtype=torch.float64))
 
 
-@pytest.fixture(autouse=True)
-def _double(float64):
-    return
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def folded(value):

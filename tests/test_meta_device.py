@@ -16,14 +16,7 @@ from torch_denkf import KalmanFilter, LinearGaussianEnv
 from torch_denkf.applications.legged import QUADRUPED, legged_filter, quadruped_env
 from torch_denkf.functional.kernels import small_system
 from torch_denkf.imperfect import RejectReadings
-from torch_denkf.objectives import (
-    DEnKFLoss,
-    GaussianLoss,
-    MixtureLoss,
-    ObservationLoss,
-    SensorLoss,
-    TransitionLoss,
-)
+from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
 from torch_denkf.transforms import DEnKFTransform
 

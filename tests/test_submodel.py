@@ -35,43 +35,31 @@ from torch_denkf.modules import (
 E, S, OBS = 4, 5, 2
 EYE, H = torch.eye(S), torch.eye(OBS, S)
 
+
+def moments():
+    return [torch.zeros(S), torch.ones(S)]
+
+
+ACTION, MEMBERS = {"action_key": "action"}, {"ensemble_size": E}
+CLONES = {"clone_key": "clone", "history_key": ("forecast", "history")}
+IMAGES = {"image_shape": (1, 8, 8), "ensemble_size": E, "encoding_key": "code"}
 #: name: (class, arguments, further options, the shapes of what it reads)
 CASES = {
-    "learned transition": (
-        LearnedTransition,
-        lambda: [StochasticMLP(S + 2, S, (8,))],
-        {"action_key": "action"},
-        [(E, S), (2,)],
-    ),
+    "learned transition": (LearnedTransition, lambda: [StochasticMLP(S + 2, S, (8,))], ACTION, [(E, S), (2,)]),
     "flipout transition": (LearnedTransition, lambda: [StochasticMLP(S, S, (8,), layer="flipout")], {}, [(E, S)]),
     "unicycle": (UnicycleTransition, lambda: [StochasticMLP(2, 2, (8,)), 0.1], {}, [(E, S)]),
     "unicycle motion": (UnicycleMotion, lambda: [0.1], {}, [(E, S), (E, S)]),
-    "pair observation": (
-        PairObservation,
-        lambda: [[50.0, 1.0]],
-        {"clone_key": "clone", "history_key": ("forecast", "history")},
-        [(E, S), (E, 2, 2)],
-    ),
+    "pair observation": (PairObservation, lambda: [[50.0, 1.0]], CLONES, [(E, S), (E, 2, 2)]),
     "select": (Select, lambda: [[3, 4]], {}, [(E, S)]),
     "linear observation": (LinearObservation, lambda: [H], {}, [(E, S)]),
     "learned observation": (LearnedObservation, lambda: [nn.Linear(S, OBS)], {}, [(E, S)]),
     "diagonal noise": (DiagonalNoise, lambda: [OBS], {}, [(E, OBS)]),
     "constant noise": (ConstantNoise, lambda: [[0.1, 0.2]], {}, [(OBS,)]),
-    "image sensor": (
-        ImageSensor,
-        lambda: [OBS],
-        {"image_shape": (1, 8, 8), "ensemble_size": E, "encoding_key": "code"},
-        [(1, 8, 8)],
-    ),
-    "vector sensor": (VectorSensor, lambda: [3, OBS], {"ensemble_size": E}, [(3,)]),
-    "gaussian prior": (GaussianPrior, lambda: [torch.zeros(S), torch.ones(S)], {"ensemble_size": E}, []),
-    "around state": (AroundState, lambda: [torch.ones(S)], {"ensemble_size": E}, [(S,)]),
-    "from sensor": (
-        FromSensor,
-        lambda: [[3, 4], torch.zeros(S), torch.ones(S)],
-        {"ensemble_size": E},
-        [(E, OBS), (OBS,)],
-    ),
+    "image sensor": (ImageSensor, lambda: [OBS], IMAGES, [(1, 8, 8)]),
+    "vector sensor": (VectorSensor, lambda: [3, OBS], MEMBERS, [(3,)]),
+    "gaussian prior": (GaussianPrior, moments, MEMBERS, []),
+    "around state": (AroundState, lambda: [torch.ones(S)], MEMBERS, [(S,)]),
+    "from sensor": (FromSensor, lambda: [[3, 4], *moments()], MEMBERS, [(E, OBS), (OBS,)]),
     "analysis": (EnsembleAnalysis, lambda: ["perturbed"], {}, [(E, S), (E, OBS), (E, OBS), (OBS,)]),
     "moment prior": (MomentPrior, lambda: [torch.zeros(S), EYE], {}, []),
     "linear transition": (LinearTransition, lambda: [2 * EYE, EYE], {}, [(S,), (S, S)]),

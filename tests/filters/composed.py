@@ -68,39 +68,24 @@ def compose(features, *, frozen_start=True):
     names = ["belief"] + ["first"] * ("two sensors" in features) + ["second"] * ("two analyses" in features)
     observed = "seen" if "mask on one" in features else "observed"
     modules["analysis"] = EnsembleAnalysis("perturbed", observed_key=observed, belief_prefix=names[-1])
+
+    def take_in(name, dim, reading):
+        """Noise, observation and analysis of a further reading, which starts where the analysis before it ended."""
+        before = names.pop()
+        noise, predicted = f"{name}_noise", f"{name}_predicted"
+        modules[f"noise_{name}"] = ConstantNoise([0.4] * dim, in_key=reading, out_key=noise)
+        members = {"in_key": (before, "ensemble"), "out_key": predicted}
+        modules[f"observation_{name}"] = LearnedObservation(nn.Linear(S, dim), **members)
+        keys = {"observation_key": reading, "predicted_key": predicted, "noise_variance_key": noise}
+        keys |= {"forecast_key": (before, "ensemble"), "belief_prefix": names[-1]}
+        modules[f"analysis_{name}"] = EnsembleAnalysis("perturbed", **keys)
+
     if "two sensors" in features:
-        modules["sensor_b"] = VectorSensor(
-            4, 3, ensemble_size=E, num_cells=(8,), layer=layer, rate=0.3, in_key="b", out_key=("other", "ensemble")
-        )
-        modules["noise_b"] = ConstantNoise([0.3] * 3, in_key=("other", "ensemble"), out_key=("other", "noise"))
-        before = names[-1]
-        names.pop()
-        modules["observation_b"] = LearnedObservation(
-            nn.Linear(S, 3), in_key=(before, "ensemble"), out_key=("other", "predicted")
-        )
-        modules["analysis_b"] = EnsembleAnalysis(
-            "perturbed",
-            forecast_key=(before, "ensemble"),
-            predicted_key=("other", "predicted"),
-            observation_key=("other", "ensemble"),
-            noise_variance_key=("other", "noise"),
-            belief_prefix=names[-1],
-        )
+        options = {"ensemble_size": E, "num_cells": (8,), "layer": layer, "rate": 0.3}
+        modules["sensor_b"] = VectorSensor(4, 3, in_key="b", out_key=("other", "ensemble"), **options)
+        take_in("b", 3, ("other", "ensemble"))
     if "two analyses" in features:
-        before = names[-1]
-        names.pop()
-        modules["noise_c"] = ConstantNoise([0.5, 0.5], in_key="c", out_key=("c_noise"))
-        modules["observation_c"] = LearnedObservation(
-            nn.Linear(S, 2), in_key=(before, "ensemble"), out_key=("c_predicted")
-        )
-        modules["analysis_c"] = EnsembleAnalysis(
-            "perturbed",
-            forecast_key=(before, "ensemble"),
-            predicted_key="c_predicted",
-            observation_key="c",
-            noise_variance_key="c_noise",
-            belief_prefix=names[-1],
-        )
+        take_in("c", 2, "c")
     assert names == ["belief"]
     return Filter(modules, initial=FixedEnsemble(torch.randn(E, S)))
 
@@ -125,16 +110,13 @@ class ReplayedFrames(EnvBase):
     def __init__(self, frames):
         super().__init__(batch_size=frames.batch_size[:-1])
         self.frames, self.keys = frames, sorted(set(frames.keys()) - {"is_init", "action", "noise"})
-        self.observation_spec = Composite(
-            {
-                key: (Binary if frames[key].dtype == torch.bool else Unbounded)(
-                    shape=frames[key][:, 0].shape, dtype=frames[key].dtype
-                )
-                for key in self.keys
-            },
-            index=Unbounded(shape=(*self.batch_size, 1), dtype=torch.int64),
-            shape=self.batch_size,
-        )
+        keys = {key: frames[key][:, 0] for key in self.keys}
+        specs = {
+            key: (Binary if v.dtype == torch.bool else Unbounded)(shape=v.shape, dtype=v.dtype)
+            for key, v in keys.items()
+        }
+        specs["index"] = Unbounded(shape=(*self.batch_size, 1), dtype=torch.int64)
+        self.observation_spec = Composite(specs, shape=self.batch_size)
         self.state_spec = Composite(shape=self.batch_size)
         self.action_spec = Unbounded(shape=frames["action"][:, 0].shape, dtype=frames["action"].dtype)
         self.reward_spec = Unbounded(shape=(*self.batch_size, 1))

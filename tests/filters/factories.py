@@ -178,6 +178,24 @@ def linear_with(modules, *, analysis=None, initial=None, **options):
     return Filter(parts, initial=plain.initial if initial is None else initial, **options)
 
 
+def parts_of_reading(index, before, after, scheme="etkf", **kwargs):
+    """Noise ``r``, observation ``h`` and analysis ``a`` of reading ``y``, 0 or 1, between two prefixes of ensembles."""
+    _, _, H, R = linear_system()
+    return {
+        f"r{index}": ConstantNoise(R[[index]].sqrt(), in_key=f"y{index}", out_key=f"r{index}"),
+        f"h{index}": LinearObservation(H[[index]], in_key=(before, "ensemble"), out_key=f"p{index}"),
+        f"a{index}": EnsembleAnalysis(
+            scheme,
+            forecast_key=(before, "ensemble"),
+            predicted_key=f"p{index}",
+            observation_key=f"y{index}",
+            noise_variance_key=f"r{index}",
+            belief_prefix=after,
+            **kwargs,
+        ),
+    }
+
+
 def random_walk(**kwargs):
     """x' = x + N(0, .25), read with N(0, 1) noise, from N(0, 1)."""
     one = torch.eye(1)

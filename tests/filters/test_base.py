@@ -24,12 +24,11 @@ from tests.filters.factories import (
 from tests.filters.gaussian_for_tests import CONTROL, linear_filter
 from tests.filters.gaussian_for_tests import FILTERS as GAUSSIAN_FILTERS
 from tests.filters.particle_for_tests import bootstrap
-from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
 from torch_denkf.baselines import LSTMFilter
 from torch_denkf.envs.linear import LinearGaussianEnv
-from torch_denkf.filters import DEnKF, Filter
+from torch_denkf.filters import Filter
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis
-from torch_denkf.modules.observation import LinearObservation, Select
+from torch_denkf.modules.observation import LinearObservation
 from torch_denkf.transforms import DEnKFTransform
 
 BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
@@ -64,46 +63,14 @@ def test_nested_sequences_are_the_flat_filter(float64):
     assert_equal(stepwise(nested, frames), nested.sequence(frames.copy()), BELIEF, atol=1e-12)
 
 
-def test_motion_behind_the_analysis(float64):
-    # The velocities of every step are those of the analysis, and the pose is their sum from the start.
-    members = torch.randn(6, 5)
-    filter = DEnKF(
-        UnicycleTransition(torch.nn.Linear(2, 2), 0.1),
-        None,
-        Select([3, 4]),
-        ConstantNoise([0.5, 0.5], in_key="y"),
-        TensorDictSequential(
-            EnsembleAnalysis("etkf", observation_key="y", belief_prefix="analysis"), UnicycleMotion(0.1)
-        ),
-        initial=FixedEnsemble(members),
-    )
-    frames = TensorDict({"y": torch.randn(3, 9, 2), "is_init": torch.zeros(3, 9, 1, dtype=torch.bool)}, [3, 9])
-    frames["is_init"][:, 0] = frames["is_init"][1, 4] = True
-    out = filter.sequence(frames.copy())
-    assert_equal(stepwise(filter, frames), out, BELIEF)
-    belief, velocity = out["belief", "ensemble"], out["analysis", "ensemble"][..., 3:]
-    going = ~frames["is_init"].squeeze(-1)
-    assert belief[..., 3:][going].equal(velocity[going])
-    heading = members[:, 2] + 0.1 * velocity[0, 1:, :, 1].sum(0)
-    torch.testing.assert_close(belief[0, -1, :, 2], heading, rtol=0, atol=1e-13)
-    assert belief[1, 4].equal(members)
-
-
 def test_a_filter_with_other_keys(float64):
     # A second filter on the same tensordict, in its own name space.
     plain = linear_denkf()
     F, _, H, R = linear_system()
 
-    class Renamed(NoisyLinear):
-        def __init__(self):
-            super().__init__(F)
-            self.in_keys, self.out_keys = [("two", "ensemble")], [("two_forecast", "ensemble")]
-
-    class RenamedStart(FixedEnsemble):
-        def __init__(self, members):
-            super().__init__(members)
-            self.out_keys = [("two", name) for name in ("ensemble", "mean", "var")]
-
+    motion, start = NoisyLinear(F), FixedEnsemble(plain.initial.members)
+    motion.in_keys, motion.out_keys = [("two", "ensemble")], [("two_forecast", "ensemble")]
+    start.out_keys = [("two", name) for name in ("ensemble", "mean", "var")]
     names = {
         "predicted_key": ("two_forecast", "y"),
         "noise_variance_key": "r",
@@ -111,13 +78,13 @@ def test_a_filter_with_other_keys(float64):
         "info_prefix": "i",
     }
     other = Filter(
-        Renamed(),
+        motion,
         LinearObservation(H, in_key=("two_forecast", "ensemble"), out_key=("two_forecast", "y")),
         ConstantNoise(R.sqrt(), in_key="y", out_key="r"),
         EnsembleAnalysis(
             "etkf", forecast_key=("two_forecast", "ensemble"), observation_key="y", observed_key="seen", **names
         ),
-        initial=RenamedStart(plain.initial.members),
+        initial=start,
         init_key="first",
     )
     y, seen, first = torch.randn(2, 7, 2), torch.rand(2, 7, 1) < 0.7, torch.rand(2, 7, 1) < 0.3
@@ -136,7 +103,17 @@ def test_a_state_dict_is_all_that_is_learned(float64):
     assert_equal(fresh.sequence(frames.copy()), expected, filter.out_keys)
 
 
-# ------------------------------------------------------------------------------------------------ compilation
+def test_keep_returns_what_is_asked_for(float64):
+    filter, frames = toy_denkf(), toy_frames((2, 3))
+    filter.draw_noise(frames)
+    expected = filter.sequence(frames.copy())
+    some, moments = [BELIEF[1], ("sensor", "ensemble"), ("info", "nis")], [BELIEF[2], BELIEF[1]]
+    for chunk, keep in ((0, some), (0, moments), (1, moments)):
+        out = filter.compile(chunk=chunk, backend="eager").sequence(frames.copy(), keep=keep)
+        assert set(out.exclude(*frames.keys()).keys(True, True)) == set(keep)
+        assert_equal(out, expected, keep, atol=1e-12)
+    with pytest.raises(ValueError, match=r"keep names \['nothing'\]"):
+        filter.sequence(frames, keep=["nothing"])
 
 
 # ----------------------------------------------------------------------------------------------- in a policy

@@ -1,16 +1,14 @@
 """Oracle: Table I of the paper, worked out by hand."""
 
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
-from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
+from tests.filters.factories import linear_denkf, linear_kalman
 from torch_denkf.filters import DEnKF
-from torch_denkf.modules import (
-    ConstantNoise,
-    LinearObservation,
-)
 from torch_denkf.modules.stochastic import FlipoutLinear
 
 
@@ -33,13 +31,9 @@ def test_paper_is_table_one():
     assert widths(noise) == [(2, 16), (16, 16), (16, 2)]
     # 50 x 150 halves (rounded up) to 25 x 75, 13 x 38, 7 x 19; 16 channels: 2128 features.
     assert widths(sensor["head"]) == [(2128, 64), (64, 64), (64, 32), (32, 32), (32, 2)]
-    assert [net.layer for net in (transition, observation, noise, sensor["head"])] == [
-        "dropout",
-        "none",
-        "none",
-        "dropout",
-    ]
-    assert all(isinstance(net.activation, nn.ReLU) for net in (transition, observation, noise, sensor["head"]))
+    networks = (transition, observation, noise, sensor["head"])
+    assert [net.layer for net in networks] == ["dropout", "none", "none", "dropout"]
+    assert all(isinstance(net.activation, nn.ReLU) for net in networks)
     trunk = [(c.in_channels, c.out_channels, c.kernel_size, c.stride) for c in sensor["trunk"] if hasattr(c, "stride")]
     assert trunk == [(6, 64, (7, 7), (2, 2)), (64, 32, (3, 3), (2, 2)), (32, 16, (3, 3), (2, 2))]
     # f: 192 + 1056 + 2112 + 4160 + 325; h: the same but 130 at the end; r: 48 + 272 + 34.
@@ -81,27 +75,14 @@ def test_reference_is_the_authors_code():
 
 def test_the_mask_of_a_filters_default_analysis_can_be_named(float64):
     """Oracle: the mask under its usual name."""
-    F, Q, H, R = linear_system()
     frames = TensorDict({"observation": torch.randn(3, 6, 2), "gps_observed": torch.rand(3, 6, 2) < 0.5}, [3, 6])
-    renamed = frames.clone().rename_key_("gps_observed", "observed")
-    noise = ConstantNoise(R.sqrt(), in_key="observation")
-    initial = linear_denkf().initial
-    for make in (
-        lambda **keys: linear_kalman(**keys),
-        lambda **keys: DEnKF(
-            NoisyLinear(F, torch.linalg.cholesky(Q)),
-            None,
-            LinearObservation(H),
-            noise,
-            initial=initial,
-            observation_key="observation",
-            **keys,
-        ),
-    ):
+    usual, plain = frames.clone().rename_key_("gps_observed", "observed"), linear_denkf()
+    noise, options = plain["noise"], {"initial": plain.initial, "observation_key": "observation"}
+    for make in (linear_kalman, partial(DEnKF, plain["transition"], None, plain["observation"], noise, **options)):
         outs = []
-        for filter, given in ((make(), renamed), (make(observed_key="gps_observed"), frames)):
+        for filter, given in ((make(), usual), (make(observed_key="gps_observed"), frames)):
             torch.manual_seed(1)
             outs.append(filter.sequence(given.copy())["belief", "mean"])
         assert outs[0].equal(outs[1])
     with pytest.raises(ValueError, match="observed_key are for the default analysis"):
-        DEnKF(noise, None, noise, noise, linear_denkf()["analysis"], initial=initial, observed_key="gps_observed")
+        DEnKF(noise, None, noise, noise, plain["analysis"], initial=plain.initial, observed_key="gps_observed")

@@ -18,10 +18,7 @@ from tests.filters.gaussian_for_tests import (
     minimise,
     prior,
 )
-from torch_denkf.modules import (
-    CholeskyNoise,
-    ConstantNoise,
-)
+from torch_denkf.modules import CholeskyNoise, ConstantNoise
 from torch_denkf.objectives import GaussianLoss
 
 ALL = pytest.mark.parametrize("name", FILTERS)
@@ -63,27 +60,6 @@ def test_stochastic_networks_run_deterministically(name, layer):
 
 
 @ALL
-def test_gradcheck_through_two_steps(float64, name):
-    filter = learned_filter(name).requires_grad_(False)
-    frames = learned_frames(1, 3).exclude("is_init")
-    frames["observed"][0, 1:] = torch.tensor([[True, True], [True, False]])
-
-    def belief(mean, root, measurement):
-        td = frames.copy().set("measurement", measurement)
-        td["belief", "mean"] = mean.expand(1, 3, 3)
-        td["belief", "cov"] = (root @ root.mT).expand(1, 3, 3, 3)
-        td["belief", "var"] = td["belief", "mean"]
-        out = filter.sequence(td)
-        return [out[key][:, 1:] for key in (*BELIEF, *INFO)]
-
-    inputs = [torch.randn(3), torch.randn(3, 3), torch.randn(1, 3, 4)]
-    start = belief(*inputs)
-    moved = belief(inputs[0] + 1, *inputs[1:])
-    assert not start[0].equal(moved[0]), "the sequence starts from the stored belief"
-    assert torch.autograd.gradcheck(belief, [value.requires_grad_() for value in inputs])
-
-
-@ALL
 def test_all_parameters_have_the_gradient_of_a_difference(float64, name):
     filter, frames = learned_filter(name), learned_frames(2, 6)
     target = torch.randn(2, 6, 3)
@@ -98,8 +74,7 @@ def test_all_parameters_have_the_gradient_of_a_difference(float64, name):
 # ------------------------------------------------------------------------------------------------------- training
 
 
-@pytest.mark.parametrize("name", ["EKF", "UKF", "BackpropKF"])
-def test_the_likelihood_finds_the_true_noise(name):
+def test_the_likelihood_finds_the_true_noise():
     F, Q, H, R = linear_system()
     generator, rows, steps = torch.Generator().manual_seed(0), 4000, 10
     initial, readings = prior(), []
@@ -110,7 +85,7 @@ def test_the_likelihood_finds_the_true_noise(name):
     frames = TensorDict({"observation": torch.stack(readings, 1)}, [rows, steps])
     q = CholeskyNoise(2, r=0.5)
     r = ConstantNoise([1.0, 0.4], trainable=True, in_key="observation")
-    filter = linear_filter(name, process_noise=q, noise=r)
+    filter = linear_filter("EKF", process_noise=q, noise=r)
     loss = GaussianLoss(filter, state=0.0, transition=0.0, sensor=0.0, nll=1.0)
     before, after = minimise(loss, frames, filter.parameters(), 20)
     assert after < before

@@ -35,20 +35,7 @@ R = torch.tensor([0.5, 0.2], dtype=torch.float64)
 FORECAST = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}
 
 
-@pytest.fixture(params=["of all dimensions", "two noises through a matrix"])
-def process_noise(request):
-    """Q, as it is and as the two noises that it has."""
-    two = Q[[0, 2]]
-    return (
-        Q
-        if request.param == "of all dimensions"
-        else MappedNoise(ConstantNoise(two, **FORECAST), torch.eye(S)[:, [0, 2]])
-    )
-
-
-@pytest.fixture(autouse=True)
-def double(float64):
-    """All in double precision: then the two are equal to rounding."""
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def system():
@@ -62,15 +49,6 @@ def linear(matrix):
     return layer
 
 
-def parts(members=E):
-    f, h = system()
-    return {
-        "transition": LearnedTransition(linear(f - torch.eye(S))),
-        "observation": LearnedObservation(linear(h)),
-        "initial": GaussianPrior(torch.ones(S), torch.tensor([1.0, 2.0, 0.5]), ensemble_size=members),
-    }
-
-
 def kalman(**kwargs):
     f, h = system()
     prior = {"mean": torch.ones(S), "cov": torch.tensor([1.0, 2.0, 0.5]).square().diag()}
@@ -82,88 +60,68 @@ def frames():
     data["observed"] = torch.rand(4, T, 2) < 0.7
     data["is_init"] = torch.zeros(4, T, 1, dtype=torch.bool)
     data["is_init"][1, 5] = True
+    data["a"], data["b"] = data["reading"].split(1, -1)
+    data["a_observed"], data["b_observed"] = data["observed"].split(1, -1)
     return data
 
 
-def denkf(scheme, process_noise=Q, **kwargs):
-    made = parts()
-    return DEnKF(
-        made["transition"],
-        None,
-        made["observation"],
-        ConstantNoise(R, in_key="reading"),
-        EnsembleAnalysis(scheme, observation_key="reading"),
-        initial=made["initial"],
-        process_noise=process_noise,
-        **kwargs,
-    )
+def parts(members=E):
+    f, h = system()
+    transition, observation = LearnedTransition(linear(f - torch.eye(S))), LearnedObservation(linear(h))
+    initial = GaussianPrior(torch.ones(S), torch.tensor([1.0, 2.0, 0.5]), ensemble_size=members)
+    return (transition, None, observation, ConstantNoise(R, in_key="reading")), {"initial": initial}
 
 
-def assert_is_kalman(out, oracle, atol):
-    torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=atol)
-    torch.testing.assert_close(ensemble_cov(out["belief", "ensemble"]), oracle["belief", "cov"], rtol=0, atol=atol)
-    for name in ("nis", "log_likelihood"):
-        torch.testing.assert_close(out["info", name], oracle["info", name], rtol=0, atol=10 * atol)
+def denkf(process_noise, scheme="etkf", **kwargs):
+    modules, options = parts()
+    analysis = EnsembleAnalysis(scheme, observation_key="reading")
+    return DEnKF(*modules, analysis, process_noise=process_noise, **options, **kwargs)
 
 
-@pytest.mark.parametrize("scheme", ["etkf", "perturbed"])
-def test_is_the_kalman_filter(scheme, process_noise):
-    data = frames()
-    assert_is_kalman(denkf(scheme, process_noise).sequence(data.copy()), kalman().sequence(data), 1e-9)
+def bias():
+    return FadingBias([0.4, 0.7], time=5.0, trainable=False)
 
 
-@pytest.mark.parametrize("scheme", ["etkf", "perturbed"])
-def test_steps_are_the_kalman_filter(scheme):
-    data, filter = frames()[:, :4], denkf(scheme)
-    row = filter.initialise(data[:, 0].copy())
-    expected = kalman().initialise(data[:, 0].copy())
-    for t in range(4):
-        row = filter.step(row.update(data[:, t].select("reading", "observed")))
-        expected = kalman().step(expected.update(data[:, t].select("reading", "observed")))
-        torch.testing.assert_close(row["belief", "mean"], expected["belief", "mean"], rtol=0, atol=1e-9)
-
-
-def test_with_errors_of_the_sensor(process_noise):
-    data = frames()
-
-    def bias():
-        return FadingBias([0.4, 0.7], time=5.0, trainable=False)
-
-    oracle = kalman(sensor_error=bias()).sequence(data.copy())
-    out = denkf("etkf", process_noise, sensor_error=bias()).sequence(data)
-    torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-8)
-    torch.testing.assert_close(ensemble_cov(out["belief", "ensemble"]), oracle["belief", "cov"], rtol=0, atol=1e-8)
-
-
-def test_of_several_sensors(process_noise):
-    data, made = frames().exclude("observed"), parts(members=24)
-    rows = system()[1]
+def of_two_sensors(process_noise):
+    (transition, *_), options = parts(members=24)
     sensors = {
         name: FusedSensor(LearnedObservation(linear(row[None])), r[None], observation_key=name)
-        for name, row, r in zip("ab", rows, R, strict=True)
+        for name, row, r in zip("ab", system()[1], R, strict=True)
     }
-    data["a"], data["b"] = data["reading"].split(1, -1)
-    fused = FusedFilter(made["transition"], sensors, initial=made["initial"], process_noise=process_noise)
-    out, oracle = fused.sequence(data.copy()), kalman().sequence(data)
-    torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
+    return FusedFilter(transition, sensors, process_noise=process_noise, **options)
 
 
-def test_a_lag_leaves_the_belief_exact(process_noise):
-    data = frames()
-    out, oracle = FixedLag(denkf("perturbed", process_noise), 2).sequence(data.copy()), kalman().sequence(data)
-    torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("iterations", [1, 3])
-def test_an_iterated_smoother_keeps_what_it_found_of_the_noise(iterations, process_noise):
+def iterated(process_noise, iterations):
     """Each iteration moves the noise, which is then exact no more: its mean is not zero."""
-    made, data = parts(), frames()
-    options = {"observation_key": "reading", "process_noise": process_noise, "iterations": iterations}
-    sensor = ConstantNoise(R, in_key="reading")
-    filter = IEnKS(made["transition"], None, made["observation"], sensor, initial=made["initial"], **options)
-    oracle, out = kalman().sequence(data.copy()), filter.sequence(data)
-    torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=1e-9)
-    torch.testing.assert_close(ensemble_cov(out["belief", "ensemble"]), oracle["belief", "cov"], rtol=0, atol=1e-9)
+    modules, options = parts()
+    return IEnKS(*modules, observation_key="reading", process_noise=process_noise, iterations=iterations, **options)
+
+
+MADE = {
+    "etkf": denkf,
+    "perturbed": lambda q: denkf(q, "perturbed"),
+    "errors of the sensor": lambda q: denkf(q, sensor_error=bias()),
+    "two sensors": of_two_sensors,
+    "lag": lambda q: FixedLag(denkf(q, "perturbed"), 2),
+    "one iteration": lambda q: iterated(q, 1),
+    "iterated": lambda q: iterated(q, 3),
+}
+
+
+@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("noises", ["of all dimensions", "two noises through a matrix"])
+def test_is_the_kalman_filter(name, noises):
+    two, data = ConstantNoise(Q[[0, 2]], **FORECAST), frames()
+    process_noise = Q if noises == "of all dimensions" else MappedNoise(two, torch.eye(S)[:, [0, 2]])
+    out = MADE[name](process_noise).sequence(data.copy())
+    oracle = kalman(sensor_error=bias()) if name == "errors of the sensor" else kalman()
+    oracle = oracle.sequence(data)
+    atol = 1e-8 if name == "errors of the sensor" else 1e-9
+    torch.testing.assert_close(out["belief", "mean"], oracle["belief", "mean"], rtol=0, atol=atol)
+    torch.testing.assert_close(ensemble_cov(out["belief", "ensemble"]), oracle["belief", "cov"], rtol=0, atol=atol)
+    if name in ("etkf", "perturbed"):
+        for key in ("nis", "log_likelihood"):
+            torch.testing.assert_close(out["info", key], oracle["info", key], rtol=0, atol=10 * atol)
 
 
 def test_perturbed_members_have_the_covariance_of_the_square_root_filter():
@@ -310,16 +268,7 @@ def test_noise_that_is_more_than_a_matrix_is_drawn_whole(kind):
 
 def test_a_new_noise_module_gets_the_mean():
     """The old one did not read it, so that it was not worked out."""
-    f, h = system()
-    filter = DEnKF(
-        LearnedTransition(linear(f)),
-        None,
-        LearnedObservation(linear(h)),
-        ConstantNoise(R, in_key="reading"),
-        EnsembleAnalysis("etkf", observation_key="reading"),
-        initial=GaussianPrior([0.0] * S, [1.0] * S, ensemble_size=E),
-        process_noise=Q,
-    )
+    filter = denkf(Q)
     seen = []
     means = TensorDictModule(
         lambda mean: seen.append(mean) or mean.square(), [FORECAST["in_key"]], [FORECAST["out_key"]]

@@ -5,16 +5,8 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.beliefs_for_tests import BELIEF, ENSEMBLE, close
-from tests.filters.factories import (
-    NoisyLinear,
-    linear_denkf,
-    linear_system,
-    linear_with,
-)
-from torch_denkf.modules import (
-    ConstantNoise,
-    EnsembleAnalysis,
-)
+from tests.filters.factories import NoisyLinear, linear_denkf, linear_system, linear_with
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis
 
 
 class Reversed(NoisyLinear):

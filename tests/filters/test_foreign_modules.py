@@ -11,9 +11,7 @@ from torch_denkf.running import run_module
 ENSEMBLE, FORECAST = ("belief", "ensemble"), ("forecast", "ensemble")
 
 
-@pytest.fixture(autouse=True)
-def _double(float64):
-    torch.manual_seed(0)
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def forecasts(filter):

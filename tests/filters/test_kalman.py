@@ -12,20 +12,21 @@ from torch_denkf.modules import GaussianPrior
 
 def numpy_kalman(F, Q, H, R, m0, P0, readings, observed, starts, update_at_reset):
     """One row at a time, one step at a time, with plain inverses."""
-    means, covs, log_likelihoods = [], [], []
+    means, covs, squares, log_likelihoods = [], [], [], []
     m, P = m0, P0
     for y, seen, start in zip(readings, observed, starts, strict=True):
         m, P = (m0, P0) if start else (F @ m, F @ P @ F.T + Q)
         h, r, y = H[seen], np.diag(R[seen]), y[seen]
         S = h @ P @ h.T + r
         d = y - h @ m
-        log_likelihoods.append(0.0)  # of what is not read
+        squares.append(0.0), log_likelihoods.append(0.0)  # of what is not read
         if update_at_reset or not start:
-            log_likelihoods[-1] = -0.5 * (d @ np.linalg.inv(S) @ d + np.log(np.linalg.det(2 * np.pi * S)))
+            squares[-1] = d @ np.linalg.inv(S) @ d
+            log_likelihoods[-1] = -0.5 * (squares[-1] + np.log(np.linalg.det(2 * np.pi * S)))
             K = P @ h.T @ np.linalg.inv(S)
             m, P = m + K @ d, P - K @ S @ K.T
         means.append(m), covs.append(P)
-    return np.stack(means), np.stack(covs), np.array(log_likelihoods)
+    return np.stack(means), np.stack(covs), np.array(squares), np.array(log_likelihoods)
 
 
 @pytest.mark.parametrize("update_at_reset", [False, True])
@@ -41,7 +42,7 @@ def test_sequence_equals_numpy(float64, update_at_reset, width):
     out = kf.sequence(td)
     m0, P0 = kf.initial.mean.numpy(), kf.initial.cov.numpy()
     for row in range(B):
-        means, covs, log_likelihoods = numpy_kalman(
+        means, covs, squares, log_likelihoods = numpy_kalman(
             *(matrix.numpy() for matrix in linear_system()),
             m0,
             P0,
@@ -54,6 +55,7 @@ def test_sequence_equals_numpy(float64, update_at_reset, width):
         np.testing.assert_allclose(out["belief", "mean"][row], means, rtol=0, atol=1e-12)
         np.testing.assert_allclose(out["belief", "cov"][row], covs, rtol=0, atol=1e-12)
         np.testing.assert_allclose(out["belief", "var"][row], np.diagonal(covs, axis1=1, axis2=2), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(out["info", "nis"][row].flatten(), squares, rtol=0, atol=1e-11)
         np.testing.assert_allclose(out["info", "log_likelihood"][row].flatten(), log_likelihoods, rtol=0, atol=1e-11)
 
 

@@ -6,22 +6,11 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.modules import set_recurrent_mode
 
 from tests.filters.composed import ReplayedFrames
-from tests.filters.factories import (
-    FixedEnsemble,
-    NoisyLinear,
-    linear_denkf,
-    linear_kalman,
-    linear_with,
-    random_walk,
-    stepwise,
-)
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_kalman, random_walk, stepwise
 from torch_denkf.filters import Filter
-from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
-from torch_denkf.imperfect import RejectReadings
-from torch_denkf.modules import EnsembleAnalysis, LinearObservation, SubModel, Update
+from torch_denkf.modules import EnsembleAnalysis, LinearObservation, SubModel
 from torch_denkf.transforms import DEnKFTransform, LastAction
 
 MEAN = ("belief", "mean")
@@ -73,53 +62,6 @@ def test_noise_that_depends_on_the_action_is_no_transition(float64, place):
     torch.testing.assert_close(stepwise(filter, frames)[MEAN], out[MEAN], rtol=0, atol=1e-12)
 
 
-# ------------------------------------------------------------------------------------------------ marks, known beliefs
-
-
-def test_a_mark_at_a_known_belief_goes_on_in_a_step_as_in_a_sequence(float64):
-    """A slice of a policy's data begins with ``is_init``, as SliceSampler marks it, and with the belief before it."""
-    filter = linear_kalman()
-    row = TensorDict({"observation": torch.randn(3, 2)}, [3])
-    row["is_init"] = torch.tensor([[True], [True], [False]])
-    row["previous", "known"] = torch.tensor([[True], [False], [True]])
-    before = filter.initialise(row.copy())
-    for key in filter.carry_keys:
-        row["previous", *key] = before[key] + (1.0 if key[-1] == "mean" else 0.0)
-    step = filter(row.copy())
-    with set_recurrent_mode(True):
-        sequence = filter(row.unsqueeze(-1).copy())[:, 0]
-    for key in filter.out_keys:
-        torch.testing.assert_close(step[key], sequence[key], rtol=0, atol=1e-12)
-    fresh = filter.initialise(row.copy())
-    assert torch.equal(step[MEAN][1], fresh[MEAN][1])
-    assert not torch.equal(step[MEAN][0], fresh[MEAN][0])
-
-
-def test_an_episode_that_diverged_leaves_no_gradient_of_nan(float64):
-    """The belief before the second element is NaN, and the element begins an episode of its own."""
-    filter = linear_denkf(noisy=True)
-    weight = nn.Parameter(filter["transition"].matrix.clone())
-    del filter["transition"].matrix
-    filter["transition"].matrix = weight
-    frames = TensorDict({"observation": torch.randn(2, 4, 2)}, [2, 4])
-    for key in filter.carry_keys:
-        stored = torch.randn(2, 4, 6, 2)
-        stored[0, 2] = torch.nan
-        frames["previous", *key] = stored
-    frames["previous", "known"] = torch.ones(2, 4, 1, dtype=torch.bool)
-    frames["previous", "known"][0, 2] = False
-    frames["is_init"] = torch.zeros(2, 4, 1, dtype=torch.bool)
-    frames["is_init"][0, 2] = True
-    row = frames[:, 2].copy()
-    filter(row)[MEAN].sum().backward()
-    assert weight.grad.isfinite().all()
-    assert weight.grad.abs().sum() > 0
-    weight.grad = None
-    filter.sequence(frames[:, 2:].copy())[MEAN].sum().backward()
-    assert weight.grad.isfinite().all()
-    assert weight.grad.abs().sum() > 0
-
-
 # -------------------------------------------------------------------------------------------- readings in policies
 
 
@@ -143,37 +85,6 @@ def test_readings_of_several_robots_are_not_averaged(make, way):
         run[way]()
 
 
-# ------------------------------------------------------------------------------------- an analysis of a user's own
-
-
-class Robust(Update):
-    """An ensemble update that trusts a reading the less, the further it is from what was predicted."""
-
-    def __init__(self):
-        reads = [("forecast", "ensemble"), ("forecast", "observation"), "observation", ("sensor", "noise")]
-        writes = [("belief", name) for name in ("ensemble", "mean", "var")]
-        super().__init__(nn.Identity(), reads, writes, optional_keys=["observed"])
-        self.reading_keys, self.observed_key = self.in_keys[2:], "observed"
-
-    def compute(self, forecast, predicted, reading, variance, observed=None):
-        ensemble = analyse(forecast, predicted, reading, variance, scheme="etkf", observed=observed).ensemble
-        return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)
-
-
-def robust():
-    return linear_with({}, analysis=Robust())
-
-
-def test_an_analysis_whose_reading_is_rejected(float64):
-    frames = TensorDict({"observation": torch.randn(2, 6, 2)}, [2, 6])
-    frames["observation"][0, 3] = torch.nan
-    seen = frames["observation"].isfinite()
-    out = robust().sequence(RejectReadings({"observation": "observed"})(frames.copy()))
-    expected = robust().sequence(frames.copy().set("observed", seen))
-    torch.testing.assert_close(out[MEAN], expected[MEAN], rtol=0, atol=1e-12)
-    assert out["info", "rejected"].sum() == 1
-
-
 # ------------------------------------------------------------------------------------------- groups that end alone
 
 
@@ -183,33 +94,18 @@ class Groups(EnvBase):
     def __init__(self, *, each):
         super().__init__(batch_size=[2])
         shape = (2, 2) if each else (2,)
-        self.each, self.now = shape, torch.zeros(2)
-        self.observation_spec = Composite(
-            observation=Unbounded((2, 1)), agents=Composite(x=Unbounded((*shape, 1)), shape=shape), shape=(2,)
-        )
         done = Composite(done=Binary(1, shape=(*shape, 1), dtype=torch.bool), shape=shape)
+        self.observation_spec = Composite(observation=Unbounded((2, 1)), shape=(2,))
         self.full_done_spec = Composite(agents=done, shape=(2,))
-        self.full_action_spec = Composite(agents=Composite(action=Unbounded((*shape, 1)), shape=shape), shape=(2,))
-        self.full_reward_spec = Composite(agents=Composite(reward=Unbounded((*shape, 1)), shape=shape), shape=(2,))
-
-    def _emit(self, done):
-        agents = TensorDict({"x": self.now.reshape(2, *[1] * len(self.each)).expand(*self.each, 1).clone()}, self.each)
-        agents["done"] = done
-        return TensorDict({"observation": self.now.unsqueeze(-1).clone(), "agents": agents}, [2])
+        for name in ("action", "reward"):
+            group = Composite({name: Unbounded((*shape, 1))}, shape=shape)
+            setattr(self, f"full_{name}_spec", Composite(agents=group, shape=(2,)))
 
     def _reset(self, tensordict=None, **kwargs):
-        mask = None if tensordict is None else tensordict.get(("agents", "_reset"), None)
-        rows = torch.ones(2, dtype=torch.bool) if mask is None else mask.reshape(2, -1).any(-1)
-        self.now = torch.where(rows, 0.0, self.now)
-        return self._emit(torch.zeros(*self.each, 1, dtype=torch.bool))
+        return self.observation_spec.zero().update(self.full_done_spec.zero())
 
     def _step(self, tensordict):
-        self.now = self.now + 10
-        done = torch.zeros(*self.each, 1, dtype=torch.bool)
-        done[0] = self.now[0] == 30
-        out = self._emit(done)
-        out["agents", "reward"] = torch.zeros(*self.each, 1)
-        return out
+        return self._reset().update(self.full_reward_spec.zero())
 
     def _set_seed(self, seed):
         return seed
@@ -217,12 +113,11 @@ class Groups(EnvBase):
 
 @pytest.mark.parametrize("each", [True, False])
 def test_a_belief_that_torchrl_would_not_reset_is_refused(each):
-    with pytest.raises(ValueError, match=r"end in .*agents.* alone, and torchrl then keeps what stands outside"):
-        TransformedEnv(Groups(each=each), DEnKFTransform(random_walk())).rollout(2)
-    with pytest.raises(ValueError, match=r"end in .*agents.* alone"):
-        TransformedEnv(Groups(each=each), random_walk().make_tensordict_primer()).rollout(2)
-    with pytest.raises(ValueError, match=r"end in .*agents.* alone"):
-        TransformedEnv(Groups(each=each), LastAction({("agents", "action"): "last"})).rollout(2)
-
-
-# --------------------------------------------------------------------------------------------------------- messages
+    filter = random_walk()
+    for transform in (
+        DEnKFTransform(filter),
+        filter.make_tensordict_primer(),
+        LastAction({("agents", "action"): "last"}),
+    ):
+        with pytest.raises(ValueError, match=r"end in .*agents.* alone, and torchrl then keeps what stands outside"):
+            TransformedEnv(Groups(each=each), transform).rollout(2)

@@ -10,16 +10,14 @@ from tests.filters.beliefs_for_tests import BELIEF, ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import (
     NoisyLinear,
     linear_denkf,
-    linear_kalman,
     linear_system,
     linear_with,
+    parts_of_reading,
     random_draws,
 )
-from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.particle_for_tests import bootstrap
 from tests.filters.test_several_analyses import reads
-from tests.filters.two_readings_for_tests import parts_of_reading
-from torch_denkf.filters import DEnKF, Filter, KalmanFilter
+from torch_denkf.filters import DEnKF, Filter, KalmanFilter, ParticleFilter
 from torch_denkf.modules import ConstantNoise, FromSensor, GaussianPrior, LinearObservation
 from torch_denkf.modules.particles import with_weights
 
@@ -32,24 +30,6 @@ def test_noise_that_is_given_and_is_not_finite_is_named():
     td["noise", "transition"][3, 1] = torch.inf
     with pytest.raises(ValueError, match=r"NaN or infinity in \[\('noise', 'transition'\)\]"):
         filter.step(td)
-
-
-@pytest.mark.parametrize(
-    "make",
-    [linear_denkf, linear_kalman, lambda: bootstrap(50), *(lambda n=n: linear_filter(n) for n in ("EKF", "UKF"))],
-)
-def test_a_step_without_a_frame_is_the_forecast(float64, make):
-    filter = make()
-    td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
-    hidden = td.copy().set("observed", torch.tensor([False]))
-    torch.manual_seed(0)
-    expected = filter.step(hidden)
-    torch.manual_seed(0)
-    out = filter.predict(td.exclude("observation"))
-    close(out, expected, filter.belief_keys)
-    assert out.get("observation", None) is None
-    with pytest.raises(KeyError, match="'observation'"):
-        filter.step(td.exclude("observation"))
 
 
 @pytest.mark.parametrize("observed", [None, True])
@@ -134,39 +114,32 @@ def test_a_start_without_the_reading_is_the_prior(float64, case):
         filter.initialise(given, without=["y2"])
 
 
-@pytest.mark.parametrize("kind", ["ensemble", "kalman", pytest.param("particles", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["ensemble", "Kalman", "particles"])
 def test_an_unstable_system_that_nobody_observes_stays_finite_and_comes_back(kind):
-    """Unheld it overflows at step 872 in float32: the standard deviation grows by a tenth a step."""
-    F, one = 1.1 * torch.eye(1), torch.eye(1)
-    if kind == "kalman":
-        filter = KalmanFilter(F, one, process_noise_cov=one, noise_cov=one, mean=torch.ones(1), cov=one)
-    else:
-        parts = {"observation": LinearObservation(one), "noise": ConstantNoise([1.0], in_key="observation")}
-        prior = GaussianPrior([1.0], [1.0], ensemble_size=64)
-        if kind == "ensemble":
-            filter = DEnKF(NoisyLinear(F, one), None, **parts, initial=prior, observation_key="observation")
-        else:
-            filter = bootstrap(64, initial=prior)
-            filter.module["transition"].module = NoisyLinear(F, one)
-            filter = filter.with_modules(observation=parts["observation"]).with_modules(noise=parts["noise"])
+    """Without a ceiling it overflows at step 40 in float32: the standard deviation is nine times larger each step."""
+    F, one = 9.0 * torch.eye(1), torch.eye(1)
+    matrices = {"process_noise_cov": one, "noise_cov": one, "mean": torch.ones(1), "cov": one}
+    parts = (NoisyLinear(F, one), None, LinearObservation(one))
+    noise, prior = ConstantNoise([1.0], in_key="observation"), GaussianPrior([1.0], [1.0], ensemble_size=64)
+    filter = {
+        "Kalman": lambda: KalmanFilter(F, one, **matrices),
+        "ensemble": lambda: DEnKF(*parts, noise, initial=prior, observation_key="observation"),
+        "particles": lambda: ParticleFilter(*parts, noise=noise, initial=prior, observation_key="observation"),
+    }[kind]()
     td = filter.initialise(TensorDict({"observation": torch.zeros(1)}))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        for _ in range(2_000):
+        for _ in range(60):
             td = filter.predict(td)
     assert sum("variance_ceiling" in str(warning.message) for warning in said) == 1
     assert td[MEAN].isfinite().all()
     assert td[VAR] <= 1.001e12
     if kind == "particles":  # a reading that none of the 64 particles explains leaves one of them
         return
-    for reading in (3.0, 3.3, 3.6, 4.0, 4.4, 4.8):
+    for reading in (3.0 * 9.0**k for k in range(6)):
         td = filter.step(td.set("observation", torch.tensor([reading])))
-    assert (td[MEAN] - 4.8).abs() < 3.0
+    assert (td[MEAN] - reading).abs() < 3.0
     assert td[VAR] < 3.0
-    loose = KalmanFilter(
-        F, one, process_noise_cov=one, noise_cov=one, mean=torch.ones(1), cov=one, variance_ceiling=None
-    )
-    frames = TensorDict(
-        {"observation": torch.zeros(1000, 1), "observed": torch.zeros(1000, 1, dtype=torch.bool)}, [1000]
-    )
+    loose = KalmanFilter(F, one, **matrices, variance_ceiling=None)
+    frames = TensorDict({"observation": torch.zeros(60, 1), "observed": torch.zeros(60, 1, dtype=torch.bool)}, [60])
     assert not loose.sequence(frames)[VAR].isfinite().all()

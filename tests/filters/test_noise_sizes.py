@@ -11,9 +11,7 @@ from tests.filters.factories import FixedEnsemble, linear_denkf, linear_system, 
 MEAN, ENSEMBLE = ("belief", "mean"), ("belief", "ensemble")
 
 
-@pytest.fixture(autouse=True)
-def _double(float64):
-    torch.manual_seed(0)
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def readings(*batch):

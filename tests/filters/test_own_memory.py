@@ -1,10 +1,12 @@
 """Tests that what a filter writes is its own memory, and that what it was given is copied."""
 
+from functools import partial
+
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import nn
 
+from tests.filters.gaussian_for_tests import prior
 from tests.filters.test_contract import FILTERS, every_filter, readings
 from torch_denkf.baselines import BackpropKF
 from torch_denkf.filters import KalmanFilter
@@ -70,24 +72,11 @@ def test_every_way_to_run_a_filter_writes_memory_of_its_own(float64, name, batch
     check_apart(filter, entries(policy, keys), before)
 
 
-def test_a_belief_that_is_written_to_leaves_the_next_episode_alone():
-    one = torch.eye(1)
-    filter = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
-    belief = filter.initialise(TensorDict({}, [3]))
-    belief["belief", "mean"][0] = 7.0
-    belief["belief", "cov"].mul_(100.0)
-    assert belief["belief", "mean"].flatten().tolist() == [7.0, 0.0, 0.0]
-    fresh = filter.initialise(TensorDict({}, [3]))
-    assert fresh["belief", "mean"].flatten().tolist() == [0.0, 0.0, 0.0]
-    assert fresh["belief", "var"].flatten().tolist() == [1.0, 1.0, 1.0]
-    assert one.item() == 1.0
-    step = filter.step(fresh.set("observation", torch.ones(3, 1)))
-    assert torch.allclose(step["belief", "mean"], torch.full((3, 1), 2 / 3))  # gain (1 + 1) / (1 + 1 + 1)
-
-
 # ------------------------------------------------------------------------------------------------------- constructors
 
 MATRIX, VECTOR = (2, 2), (2,)
+noise = partial(ConstantNoise, [0.5, 0.5], in_key="observation")
+READ = {"initial": prior(), "observation_key": "observation"}
 #: Constructors, and the shapes of the constants that they take.
 TAKES = {
     "KalmanFilter": (
@@ -95,16 +84,8 @@ TAKES = {
         [MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, MATRIX],
     ),
     "BackpropKF": (
-        lambda a, b, c, d, e: BackpropKF(
-            a,
-            None,
-            c,
-            ConstantNoise([0.5, 0.5], in_key="observation"),
-            process_noise_cov=b,
-            initial=MomentPrior(d, e),
-            observation_key="observation",
-        ),
-        [MATRIX, MATRIX, MATRIX, VECTOR, MATRIX],
+        lambda a, b, c: BackpropKF(a, None, c, noise(), process_noise_cov=b, **READ),
+        [MATRIX, MATRIX, MATRIX],
     ),
     "GaussianPrior": (lambda a, b: GaussianPrior(a, b, ensemble_size=4), [VECTOR, VECTOR]),
     "AroundState": (lambda a: AroundState(a), [VECTOR]),

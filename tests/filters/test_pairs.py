@@ -11,10 +11,11 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.envs import TransformedEnv
+from torchrl.modules import set_recurrent_mode
 from torchrl.modules.utils import get_env_transforms_from_module
 
 from tests.filters.composed import ReplayedFrames
-from torch_denkf.deployment import export_step, load_step
+from tests.filters.factories import assert_equal
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import RejectReadings
 from torch_denkf.modules import EKFAnalysis, LinearTransition, MomentPrior, Select, SubModel
@@ -36,10 +37,8 @@ FEATURES = (
 #: Inflation would spread the past anew with each reading.
 REFUSED = {("late reading", "inflation"), ("joint past", "inflation")}
 PAIRS = [pair for pair in combinations(FEATURES, 2) if pair not in REFUSED]
-EAGER = ("loop", "sequence", "transform", "policy", "recurrent mode")
+EAGER = ("loop", "sequence", "transform", "policy")
 ALL = tuple(feature for feature in FEATURES if feature != "inflation")
-#: To trace a filter takes dynamo and torch.export seconds: each feature, and every pair with `make test-all`.
-TRACED = [ALL]
 ROWS, T, BEGIN = 2, 9, 4
 F, Q = np.array([[1.0, 0.1], [0.0, 0.9]]), np.diag([0.01, 0.09])
 STD = {"camera": 0.5, "wheel": 0.4}
@@ -185,11 +184,11 @@ def weighted(readings, noise, mean, cov):
 # ------------------------------------------------------------------------------------------------------ ways to run it
 
 
-def run(way, filter, frames, start=None, tmp_path=None):
+def run(way, filter, frames, start=None):
     """Runs the filter on ``[ROWS, T]``; from a stored belief, if there is one: that of the first element."""
     if way in ("sequence", "compiled"):
         if way == "compiled":
-            filter.compile(chunk=2, backend="eager")
+            filter.compile(chunk=1, backend="eager")
         data = frames.copy()
         if start is not None:  # one is stored for each element, and the first is used
             for key in filter.belief_keys:
@@ -201,11 +200,9 @@ def run(way, filter, frames, start=None, tmp_path=None):
         rollout = env.rollout(frames.shape[1], break_when_any_done=False, tensordict=reset, auto_reset=False)
         last = rollout["next"][:, -1:].exclude("done", "reward")
         return torch.cat([rollout.select(*last.keys(True, True), strict=False), last], 1)[:, : frames.shape[1]]
-    if way in ("policy", "recurrent mode"):
-        return by_policy(way, filter, frames, start)
+    if way == "policy":
+        return by_policy(filter, frames, start)
     first = filter.initialise(frames[:, 0].copy()) if start is None else frames[:, 0].copy().update(start)
-    if way == "packaged":
-        return packaged(filter, frames, first, tmp_path)
     rows = [first]
     for t in range(1, frames.shape[1]):
         rows.append(filter.step(rows[-1].copy().update(frames[:, t])))
@@ -217,40 +214,21 @@ def further(filter):
     return [key for key in filter.out_keys if key[-1] == "p_value" and key not in filter.belief_keys]
 
 
-def by_policy(way, filter, frames, start):
+def by_policy(filter, frames, start):
+    """From a belief that was known before the first frame, if there is one; and again in torchrl's recurrent mode."""
     policy = TensorDictSequential(filter, ReplayedFrames(frames).player())
     env = TransformedEnv(ReplayedFrames(frames), get_env_transforms_from_module(policy))
-    row, rows = env.reset(), []
-    for t in range(frames.shape[1]):
-        if t == 0 and start is not None:  # the belief that has seen the frame is that of the first element
-            rows.append(frames[:, 0].copy().update(start.select(*filter.belief_keys)))
-            for key in filter.carry_keys:
-                row[previous(filter, key)] = start[key]
-            row[previous(filter, ("known",))] = torch.ones(ROWS, 1, dtype=torch.bool)
-            row["action"] = torch.zeros(ROWS, 1)
-        else:
-            row = policy(row)
-            rows.append(row.copy())
-            for key in filter.carry_keys:
-                row[previous(filter, key)] = row["next"][previous(filter, key)]
-            row[previous(filter, ("known",))] = torch.ones(ROWS, 1, dtype=torch.bool)
-        if t + 1 < frames.shape[1]:
-            carried = {key: row[key].clone() for key in row.keys(True, True) if "previous" in key}
-            row = env.step(row)["next"].exclude("done", "reward", "terminated").update(carried_tensordict(carried))
-    keys = filter.belief_keys
-    out = torch.stack([row.select(*keys, *further(filter), strict=False) for row in rows], 1)
-    if way == "policy":
-        return out
-    data = frames.copy()  # filtered anew, from the beliefs that were stored before each step
-    before = torch.stack([rows[max(t - 1, 0)].select(*filter.carry_keys) for t in range(frames.shape[1])], 1)
-    for key in filter.carry_keys:
-        data[previous(filter, key)] = before[key]
-    data[previous(filter, ("known",))] = torch.ones(ROWS, frames.shape[1], 1, dtype=torch.bool)
-    if start is None:
-        data[previous(filter, ("known",))][:, 0] = False
-        return filter.sequence(data)
-    again = filter.sequence(data[:, 1:].copy())
-    return torch.cat([out[:, :1].select(*keys), again.select(*keys)], 1)
+    row = env.reset()
+    if start is not None:
+        for key in filter.carry_keys:
+            row[previous(filter, key)] = start[key]
+        row[previous(filter, ("known",))] = torch.ones(ROWS, 1, dtype=torch.bool)
+    steps = {"break_when_any_done": False, "tensordict": row, "auto_reset": False}
+    out = env.rollout(frames.shape[1], policy, **steps)
+    with set_recurrent_mode(True):  # from the beliefs that were stored before each step
+        again = filter(out.exclude(*filter.belief_keys))
+    assert_equal(again, out, filter.belief_keys, atol=1e-9)
+    return out
 
 
 def previous(filter, key):
@@ -258,28 +236,7 @@ def previous(filter, key):
     return filter.outer(("previous", *names))
 
 
-def carried_tensordict(entries):
-    out = TensorDict({}, [ROWS])
-    for key, value in entries.items():
-        out[key] = value
-    return out
-
-
-def packaged(filter, frames, first, tmp_path):
-    step = load_step(export_step(filter, first.copy(), tmp_path / "step.pt2", compiled=False))
-    inner = {filter.outer(key): ".".join(key) for key in (*filter.structure.belief, *filter.structure.carry)}
-    entries, rows = {name: first[key] for key, name in inner.items()}, [first.select(*inner)]
-    for t in range(1, frames.shape[1]):
-        now = {name: value.clone() for name, value in frames[:, t].items() if name in step.inputs}
-        entries = step({**entries, **now})
-        row = TensorDict({}, [ROWS])
-        for key, name in inner.items():
-            row[key] = entries[name]
-        rows.append(row)
-    return torch.stack(rows, 1)
-
-
-def check(features, way, tmp_path=None):
+def check(features, way):
     filter, frames = build(features), frames_for(features)
     expected, start, begin = oracle(features, frames), None, 0
     if "reject" in features:
@@ -287,9 +244,10 @@ def check(features, way, tmp_path=None):
     if "stored belief" in features:
         begin = BEGIN
         start = filter.sequence(frames.copy())[:, begin].select(*filter.belief_keys).clone()
+        begin += way == "policy"  # whose first step has a belief before it
         frames, expected = frames[:, begin:], {name: value[:, begin:] for name, value in expected.items()}
     with torch.no_grad():
-        out = run(way, filter, frames, start, tmp_path)
+        out = run(way, filter, frames, start)
     keys = {"mean": ("belief", "mean"), "var": ("belief", "var")}
     if "late reading" in features or "joint past" in features:
         keys["smoothed"] = ("smoothed", "mean")
@@ -307,23 +265,13 @@ def test_pairs_are_the_filter_in_numpy(float64, pair, way):
     check(pair, way)
 
 
-@pytest.mark.parametrize("way", ["compiled", "packaged"])
-@pytest.mark.parametrize(
-    "features",
-    [*TRACED, *(pytest.param(pair, marks=pytest.mark.slow) for pair in PAIRS if pair not in TRACED)],
-    ids=lambda features: "all" if features == ALL else " + ".join(features),
-)
-def test_traced_features_are_the_filter_in_numpy(float64, features, way, tmp_path):
-    check(features, way, tmp_path)
-
-
 @pytest.mark.parametrize("pair", sorted(REFUSED), ids=" + ".join)
 def test_pairs_that_are_refused(float64, pair):
     with pytest.raises(ValueError, match="inflation"):
         build(pair)
 
 
-@pytest.mark.parametrize("way", EAGER)
+@pytest.mark.parametrize("way", [*EAGER, "compiled"])
 def test_all_features_at_once(float64, way):
     check(ALL, way)
 

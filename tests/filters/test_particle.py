@@ -7,16 +7,8 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.differences_for_tests import check_largest_gradients
-from tests.filters.factories import (
-    NoisyLinear,
-    assert_equal,
-    linear_system,
-    random_draws,
-    toy_frames,
-)
+from tests.filters.factories import assert_equal, random_draws, toy_frames
 from tests.filters.particle_for_tests import BELIEF, SCHEMES, E, bootstrap, toy_filter
-from torch_denkf.filters import ParticleFilter
-from torch_denkf.modules import ConstantNoise, GaussianLikelihood, LinearObservation
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -56,26 +48,6 @@ def test_missing_frames_are_pure_prediction(float64, scheme, learned):
     out["belief", "mean"].square().sum().backward()
     grads = [p.grad for p in filter.parameters() if p.grad is not None]
     assert all(grad.isfinite().all() for grad in grads)
-
-
-@pytest.mark.parametrize("kept", [0, 1])
-def test_partial_mask_is_the_filter_of_the_remaining_dimension(float64, kept):
-    F, Q, H, R = linear_system()
-    both = bootstrap(50)
-    one = ParticleFilter(
-        NoisyLinear(F, torch.linalg.cholesky(Q)),
-        None,
-        LinearObservation(H[[kept]]),
-        GaussianLikelihood(observation_key="observation"),
-        noise=ConstantNoise(R[[kept]].sqrt(), in_key="observation"),
-        initial=both.initial,
-    )
-    td = both.draw_noise(TensorDict({"observation": torch.randn(2, 8, 2)}, [2, 8]))
-    single = one.sequence(td.copy().set("observation", td["observation"][..., [kept]]))
-    observed = torch.tensor([kept == 0, kept == 1]).expand(2, 8, 2)
-    td["observation"] = torch.where(observed, td["observation"], torch.nan)
-    masked = both.sequence(td.set("observed", observed))
-    assert_equal(masked, single, [*BELIEF, ("info", "ess"), ("info", "log_likelihood")], atol=1e-11)
 
 
 @pytest.mark.parametrize("scheme", ["systematic", "soft", "transport"])

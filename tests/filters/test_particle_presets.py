@@ -6,11 +6,8 @@ from tensordict import TensorDict
 
 from tests.filters.factories import OBS, M, NoisyLinear, assert_equal, linear_system, toy_frames
 from tests.filters.particle_for_tests import BELIEF, bootstrap, toy_parts
-from torch_denkf.applications.car import UnicycleTransition
-from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation
 from torch_denkf.filters import DPF, MixtureParticleFilter, ParticleFilter
 from torch_denkf.modules import (
-    AroundState,
     ConstantNoise,
     DiagonalNoise,
     GaussianLikelihood,
@@ -71,35 +68,3 @@ def test_a_raw_reading_is_read_where_the_key_says(float64, preset):
 
     with pytest.raises(ValueError, match="say where the reading is: observation_key="):
         preset(motion, None, LinearObservation(H), noise=noise, **options)
-
-
-def test_clones_of_past_velocities_are_resampled_along():
-    # Pairs over gaps with particles: the past is part of each particle.
-    q = ConstantNoise([1.0, 0.1], in_key=("belief", "ensemble"), out_key=("forecast", "q"))
-    vehicle = NoisyTransition(UnicycleTransition(torch.zeros_like, dt=0.1), q, [3, 4], before=True)
-    filter = ParticleFilter(
-        ClonedTransition(vehicle),
-        None,
-        PairObservation(history_key=None),
-        GaussianLikelihood(observation_key="y", observed_key=("forecast", "observed")),
-        noise=ConstantNoise([0.5, 0.1], in_key="y"),
-        initial=ClonedPrior(AroundState([0.0, 0.0, 0.0, 1.0, 0.1], ensemble_size=200), lags=2),
-        resampling="soft",
-    )
-    frames = TensorDict({"y": torch.zeros(2, 6, 2), "state": torch.zeros(2, 6, 5)}, [2, 6])
-    frames["observed"] = torch.ones(2, 6, 1, dtype=torch.bool)
-    frames["steps"] = torch.ones(2, 6, 1, dtype=torch.int64)
-    frames["observed"][:, 3] = False
-    frames["steps"][:, 4] = 2
-    frames["y"][..., 0] = frames["state"][..., 3] = 10.0  # 1 m a step
-    frames["y"][:, 4] = torch.tensor([20.0, 0.0])  # over two steps
-    out = filter.sequence(frames.copy())
-    ensemble = out["belief", "ensemble"]
-    assert ensemble.shape == (2, 6, 200, 9)
-    # The pose of every particle is the sum of its own velocities: of this step and the two before it.
-    moved = 0.1 * (ensemble[:, 5, :, 4] + ensemble[:, 5, :, 6] + ensemble[:, 5, :, 8])
-    start = ensemble[:, 5, :, 2] - moved
-    known = out["belief", "ensemble"][:, 2, :, 2]
-    assert (start.unsqueeze(-1) - known.unsqueeze(-2)).abs().min(-1).values.max() < 1e-5
-    # Steps of noise 1 m/s and readings of 0.5 m/s leave a standard deviation of some 0.5 m/s.
-    assert ((out["belief", "mean"][:, 1:, 3] - 10).abs() < 2).all()

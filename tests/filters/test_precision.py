@@ -6,10 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.beliefs_for_tests import COV, MEAN, close
-from tests.filters.factories import (
-    NoisyLinear,
-    linear_system,
-)
+from tests.filters.factories import NoisyLinear, linear_system
 from tests.filters.gaussian_for_tests import linear_filter
 from torch_denkf.filters import EKF, UKF, KalmanFilter
 from torch_denkf.modules import ConstantNoise, LinearObservation, MomentPrior
@@ -19,11 +16,6 @@ def test_float64_matrices_beside_float32_are_refused():
     F, Q, H, R = linear_system(torch.float64)
     with pytest.raises(TypeError, match=r"mean is torch.float32 and transition is torch.float64; convert one"):
         KalmanFilter(F, H, process_noise_cov=Q, noise=R.sqrt(), mean=torch.zeros(2), cov=torch.eye(2))
-    kf = KalmanFilter(
-        F, H, process_noise_cov=Q, noise=R.sqrt(), mean=torch.zeros(2).double(), cov=torch.eye(2).double()
-    )
-    frames = TensorDict({"observation": torch.randn(5, 2, dtype=torch.float64)}, [5])
-    assert kf.sequence(frames)[MEAN].dtype == torch.float64
 
 
 def test_float64_readings_are_refused_by_name():

@@ -1,8 +1,5 @@
 """An entry that a module both reads and writes is carried, or refused; a mask that nobody reads is refused."""
 
-import inspect
-import re
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -11,9 +8,7 @@ from torch import nn
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear
 from tests.filters.test_contract import FILTERS, every_filter
-from torch_denkf.filters import DEnKF, Filter
-from torch_denkf.fusion import FusedFilter, FusedSensor
-from torch_denkf.imperfect import RejectReadings
+from torch_denkf.filters import Filter
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, LinearObservation, SubModel, VectorSensor
 from torch_denkf.monitoring import BlackIsMissing
 from torch_denkf.running import reads_of, writes
@@ -61,19 +56,6 @@ def test_a_module_of_a_users_own_that_reads_what_it_writes_is_refused():
         camera(("tally", TensorDictSequential(tally)))
 
 
-def every_class(kind=SubModel):
-    """A class and all that inherit from it, in the library."""
-    yield kind
-    for inner in kind.__subclasses__():
-        yield from every_class(inner)
-
-
-def test_the_modules_that_make_masks_are_known():
-    ours = {kind for kind in every_class() if kind.__module__.startswith("torch_denkf.")}
-    makers = {kind.__name__ for kind in ours if re.search(r"\bmarks\b", inspect.getsource(kind))}
-    assert makers == {"BlackIsMissing", "Renamed", "Sensor", "SignGate"}
-
-
 @pytest.mark.parametrize("way", ["loop", "dictionary", "policy", "sequence"])
 def test_one_black_picture_hides_one_reading(float64, way):
     """The oracle: the same pictures, and a mask written by hand."""
@@ -103,50 +85,3 @@ def test_one_black_picture_hides_one_reading(float64, way):
             rows.append(row["belief", "mean"].clone())
         out = torch.stack(rows, 1)
     torch.testing.assert_close(out, expected["belief", "mean"], rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("where", ["sequence", "FusedSensor", "DEnKF"])
-def test_black_pictures_and_readings_that_cannot_be_true(float64, where):
-    """NaN in a picture is rejected, too, through the mask that the check of black pictures reads."""
-    torch.manual_seed(0)
-    flat = torch.rand(2, 6, 4)
-    flat[0, 2] = 0.0
-    seen = flat.amax(-1, keepdim=True) > 0
-    broken = flat.clone()
-    broken[1, 3, 0] = torch.nan
-    seen[1, 3] = False
-    frames = TensorDict({"flat": flat, "pixels": broken.reshape(2, 6, 1, 2, 2)}, [2, 6])
-    torch.manual_seed(1)
-    plain = camera(observed_key="seen")
-    sensor = TensorDictSequential(BlackIsMissing(), OfPicture(plain["sensor"]))
-    parts = dict(plain.module.named_children())
-    if where == "sequence":
-        filter = Filter({**parts, "sensor": sensor}, initial=plain.initial)
-    elif where == "DEnKF":
-        filter = DEnKF(
-            parts["transition"],
-            sensor,
-            parts["observation"],
-            parts["noise"],
-            parts["analysis"],
-            initial=plain.initial,
-        )
-    else:
-        fused = FusedSensor(parts["observation"], parts["noise"], sensor=sensor)
-        filter = FusedFilter(parts["transition"], {"cam": fused}, initial=plain.initial)
-    mask = "cam_observed" if where == "FusedSensor" else "observed"
-    out = filter.sequence(RejectReadings({"pixels": mask})(frames.copy()))
-    expected = plain.sequence(frames.copy().set("seen", seen))
-    torch.testing.assert_close(out["belief", "mean"], expected["belief", "mean"], rtol=0, atol=1e-12)
-    assert out["info", "rejected"].flatten().tolist() == [0] * 9 + [1, 0, 0]
-
-
-class OfPicture(SubModel):
-    """A sensor that reads the picture's four pixels."""
-
-    def __init__(self, sensor):
-        super().__init__(sensor, ["pixels"], [("sensor", "ensemble")])
-
-    def compute(self, pixels):
-        td = TensorDict({"flat": pixels.flatten(-3)}, pixels.shape[:-3])
-        return self.module(td)["sensor", "ensemble"]

@@ -1,7 +1,5 @@
 """Resets that update, policies' data, analyses inside sequences, marks in data: what a stranger composed first."""
 
-import copy
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,17 +7,11 @@ from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
 from tests.filters.beliefs_for_tests import ENSEMBLE, MEAN, VAR, close
-from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_with
-from tests.filters.two_readings_for_tests import parts_of_reading
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_with, parts_of_reading
 from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import PairObservation, with_history
 from torch_denkf.filters import Filter
-from torch_denkf.modules import (
-    AroundState,
-    ConstantNoise,
-    EnsembleAnalysis,
-    Select,
-)
+from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, Select
 from torch_denkf.transforms import DEnKFTransform
 
 # ------------------------------------------------------------------------------------------------ resets that update
@@ -53,16 +45,6 @@ def test_an_update_at_a_reset_sees_nothing_of_the_episode_before(float64, histor
     close(whole, halves, filter.belief_keys)
 
 
-def test_elements_without_a_belief_before_them_do_not_count_as_steps():
-    filter = linear_denkf()
-    data = TensorDict({"observation": torch.randn(9, 2)}, [9])
-    data["previous", "belief", "ensemble"] = torch.randn(9, 6, 2)
-    data["previous", "known"] = torch.tensor([0, 1, 1, 1, 0, 1, 1, 1, 1]).bool().unsqueeze(-1)
-    assert filter.stepped(data).equal(data["previous", "known"].squeeze(-1))
-    assert filter.stepped(data.exclude(("previous", "known"))).all()
-    assert not filter.stepped(data.exclude("previous"))[0]
-
-
 # ------------------------------------------------------------------------------------------------ nested sequences
 
 
@@ -86,23 +68,6 @@ def test_analyses_inside_sequences_count_all_or_are_refused(float64):
     close(out, exact, [MEAN, VAR])
     likelihood = sum(out[key] for key in filter.structure.likelihoods)
     torch.testing.assert_close(likelihood[:, 1:], exact["info", "log_likelihood"][:, 1:])
-
-
-def test_a_module_replaced_inside_a_sequence_is_sorted_anew(float64):
-    filter = blocks(named=True)
-    new = EnsembleAnalysis(
-        "etkf",
-        forecast_key=("mid", "ensemble"),
-        predicted_key="p1",
-        observation_key="y1",
-        noise_variance_key="r1",
-        observed_key="seen",
-    )
-    filter = filter.with_modules({"second.1": new})
-    assert filter["second"].module[1] is new
-    frames = TensorDict({"y0": torch.randn(5, 1), "y1": torch.randn(5, 1)}, [5])
-    hidden = filter.sequence(frames.copy().set("seen", torch.zeros(5, 1, dtype=torch.bool)))
-    assert not hidden[MEAN].equal(filter.sequence(frames.copy())[MEAN])
 
 
 def test_a_belief_that_no_module_passes_on_is_refused():
@@ -143,32 +108,23 @@ def test_a_buffer_that_filters_before_its_slices_are_marked_is_refused():
 
 # ---------------------------------------------------------------------------------------------------- marks in data
 
-
-def marked(*entries):
-    """Readings of nine steps with a mark at the fourth, and those with ``is_init`` at the fifth."""
-    frames = TensorDict({"observation": torch.randn(9, 2)}, [9])
-    ends = torch.zeros(9, 1, dtype=torch.bool)
-    ends[3] = True
-    starts = torch.zeros(9, 1, dtype=torch.bool)
-    starts[[0, 4]] = True
-    return frames.copy().update(dict.fromkeys(entries, ends)), frames.set("is_init", starts)
+ENDS = [("next", "done"), ("next", "truncated"), "done", ("next", "agents", "done"), ("next", "agents", "truncated")]
 
 
-@pytest.mark.parametrize("mark", [("next", "done"), ("next", "truncated"), "done", ("next", "agents", "truncated")])
-def test_what_ends_an_episode_starts_the_next(float64, mark):
-    filter, (data, expected) = linear_denkf(), marked()
-    data[mark] = torch.zeros(9, *(2,) * ("agents" in mark), 1, dtype=torch.bool)
-    data[mark][3] = True
-    close(filter.sequence(data), filter.sequence(expected), [ENSEMBLE, MEAN])
-
-
-def test_marks_of_beginnings_stand_above_those_of_ends(float64):
+@pytest.mark.parametrize("mark", [*ENDS, ("agents", "is_init")])
+def test_what_ends_an_episode_starts_the_next_unless_beginnings_are_marked(float64, mark):
     """SliceSampler sets both; an environment's time limit alone ends nothing where is_init says so."""
-    filter, (data, _) = linear_denkf(), marked(("next", "done"))
-    plain = filter.sequence(data.select("observation").copy())
-    data["is_init"] = torch.zeros(9, 1, dtype=torch.bool)
-    data["is_init"][0] = True
-    close(filter.sequence(data), plain, [ENSEMBLE, MEAN])
+    filter, frames = linear_denkf(), TensorDict({"observation": torch.randn(2, 9, 2)}, [2, 9])
+    begins = torch.zeros(2, 9, 1, dtype=torch.bool)
+    begins[:, 0] = begins[1, 4] = True
+    marked = torch.zeros(2, 9, *[3] * ("agents" in mark), 1, dtype=torch.bool)
+    marked[1, 4 if "is_init" in mark else 3].view(-1)[-1] = True  # of one agent
+    data = frames.copy().set(mark, marked)
+    close(filter.sequence(data.copy()), filter.sequence(frames.copy().set("is_init", begins)), [ENSEMBLE, MEAN])
+    if mark[0] == "next":
+        only = torch.zeros_like(begins)
+        only[:, 0] = True
+        close(filter.sequence(data.set("is_init", only)), filter.sequence(frames.copy()), [ENSEMBLE, MEAN])
 
 
 def test_other_modules_make_a_new_filter():
@@ -182,10 +138,14 @@ def test_other_modules_make_a_new_filter():
     with pytest.raises(ValueError, match="no module writes"):
         filter.with_modules(second=Select([0], out_key="elsewhere"))
     assert filter.structure.modules == before.modules
-    other = filter.with_modules({"second.1": copy.deepcopy(filter["second"].module[1])})
-    assert other["second"].module[1] is not filter["second"].module[1]
+    masked = parts_of_reading(1, "mid", "belief", info_prefix="info1", observed_key="seen")["a1"]
+    other = filter.with_modules({"second.1": masked})
+    assert other["second"].module[1] is masked
     assert other["second"].module[0] is filter["second"].module[0]
-    close(other.sequence(frames.copy()), filter.sequence(frames.copy()), [MEAN])
+    expected = filter.sequence(frames.copy())
+    close(other.sequence(frames.copy()), expected, [MEAN])
+    hidden = other.sequence(frames.set("seen", torch.zeros(5, 1, dtype=torch.bool)))  # its mask is read
+    assert not hidden[MEAN].equal(expected[MEAN])
 
 
 @pytest.mark.parametrize("left_out", [["y0"], ["y1"], ["y0", "y1"]])

@@ -1,31 +1,26 @@
-"""The loop: one step and a sequence are the same; resets, stored beliefs, controls, masks, gradients."""
+"""The loop: one step and a sequence are the same; resets, controls, gradients."""
 
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 
 from tests.filters.factories import (
     OBS,
     E,
     FixedEnsemble,
-    NoisyLinear,
     S,
     assert_equal,
     linear_denkf,
     linear_system,
+    linear_with,
     make_dyadic,
     stepwise,
     toy_denkf,
     toy_frames,
 )
-from torch_denkf.filters import DEnKF
-from torch_denkf.modules import (
-    ConstantNoise,
-    EnsembleAnalysis,
-    LearnedObservation,
-    LinearObservation,
-    StochasticMLP,
-)
+from tests.filters.test_forecasts import Reversed
+from torch_denkf.modules import FromSensor, LearnedObservation, StochasticMLP
 
 SCHEMES = ["sensor", "perturbed", "etkf", "sakov"]
 BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
@@ -63,9 +58,7 @@ def test_noise_that_is_given_is_kept_and_the_rest_drawn():
     assert frames["noise", "transition"] is given
     assert frames["noise", "analysis"].shape == (3, 5, E, OBS)
     again = filter.draw_noise(toy_frames((3, 5)), generator=torch.Generator().manual_seed(3))
-    assert again["noise", "sensor"].equal(
-        filter.draw_noise(toy_frames((3, 5)), generator=torch.Generator().manual_seed(3))["noise", "sensor"]
-    )
+    assert again["noise", "sensor"].equal(frames["noise", "sensor"])
 
 
 # -------------------------------------------------------------------------------------------------- resets
@@ -82,98 +75,47 @@ def test_reset_rows_get_the_initial_belief_and_others_do_not(float64):
     assert (out["belief", "ensemble"][~start] != members).any(-1).any(-1).all()
 
 
-def test_update_at_reset_is_the_analysis_of_the_initial_belief(float64):
-    filter = linear_denkf(update_at_reset=True)
+def test_a_start_that_is_updated_needs_no_action(float64):
+    """The first observation of an episode comes before any action."""
+    plain = linear_denkf(update_at_reset=True)
+    driven = Reversed(linear_system()[0], torch.tensor([[0.5], [-1.0]]))
+    filter = linear_with({"transition": driven}, update_at_reset=True)
     td = TensorDict({"observation": torch.randn(3, 2)}, [3])
-    out = filter.initialise(td.copy())
-    row = filter.initial(td.copy())
-    row["forecast", "ensemble"] = row["belief", "ensemble"]
-    for name in ("noise", "observation", "analysis"):
-        row = filter[name](row)
-    assert_equal(out, row, BELIEF)
-    assert_equal(filter.sequence(td.unsqueeze(1)).squeeze(1), row, BELIEF)
-    plain = linear_denkf().initialise(td.copy())
-    assert plain["belief", "ensemble"][0].equal(filter.initial.members)
+    start = filter.initialise(td.copy())
+    assert start.get(("forecast", "speed"), None) is None
+    torch.testing.assert_close(start[BELIEF[1]], plain.initialise(td.copy())[BELIEF[1]])
 
 
-def test_stored_belief_starts_the_sequence_and_is_not_updated_again(float64):
-    for update_at_reset in (False, True):
-        filter = linear_denkf(update_at_reset=update_at_reset)
-        frames = TensorDict({"observation": torch.randn(2, 10, 2)}, [2, 10])
-        whole = filter.sequence(frames.copy())
-        tail = filter.sequence(whole[:, 4:].copy())
-        assert tail["belief", "ensemble"][:, 0].equal(whole["belief", "ensemble"][:, 4])
-        assert_equal(tail, whole[:, 4:], BELIEF)
-        # An ensemble that was not stored: the sequence starts from the initial belief.
-        fresh = filter.sequence(whole[:, 4:].exclude(("belief", "ensemble")))
-        assert not fresh["belief", "mean"].equal(whole["belief", "mean"][:, 4:])
-        assert fresh["belief", "mean"].equal(filter.sequence(frames[:, 4:].copy())["belief", "mean"])
-
-
-def test_flat_slices_are_the_slices(float64):
-    filter = linear_denkf()
-    whole = filter.sequence(TensorDict({"observation": torch.randn(20, 2)}, [20]))
-    starts = [3, 11, 7]
-    slices = [whole[start : start + 5].copy() for start in starts]
-    flat = torch.cat(slices)
-    flat["is_init"] = (torch.arange(15) % 5 == 0).unsqueeze(-1)
-    torch.nn.init.normal_(flat["forecast", "ensemble"])  # what follows from the belief is computed anew
-    out = filter.sequence(flat)
-    expected = torch.cat([filter.sequence(part) for part in slices])
-    assert_equal(out, expected, [*BELIEF, ("forecast", "ensemble")])
-    assert_equal(out, torch.cat([whole[start : start + 5] for start in starts]), BELIEF)
+def test_a_start_from_the_sensors_reading_runs_the_sensor(float64):
+    """Also where it is not updated with that frame: the initial belief reads what the frame modules write."""
+    *_, R = linear_system()
+    sensor = TensorDictModule(lambda raw: 2.0 * raw, ["raw"], ["observation"])
+    initial = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=20_000, observation_key="observation")
+    filter = linear_with({"sensor": sensor}, initial=initial)
+    out = filter.initialise(TensorDict({"raw": torch.tensor([[1.0, -3.0]])}, [1]))
+    # 5 standard errors of 20,000 members.
+    assert ((out[BELIEF[1]] - torch.tensor([2.0, -6.0])).abs() < 5 * (R / 20_000).sqrt()).all()
+    torch.testing.assert_close(out[BELIEF[2]][0], R, rtol=5 * (2 / 20_000) ** 0.5, atol=0)
+    assert filter.initialise({"raw": torch.zeros(2)})[BELIEF[1]].shape == (2,)
 
 
 # ------------------------------------------------------------------------------------------------- controls
 
 
-def adds_up_actions(**kwargs) -> DEnKF:
-    return DEnKF(
-        NoisyLinear(torch.eye(2), control=torch.eye(2)),
-        None,
-        LinearObservation(torch.eye(2)),
-        ConstantNoise([1e6, 1e6], in_key="observation"),
-        EnsembleAnalysis("etkf", observation_key="observation"),
-        initial=FixedEnsemble(torch.zeros(3, 2)),
-        **kwargs,
-    )
-
-
 def test_action_is_read_one_step_earlier(float64):
-    # x_t = x_{t-1} + a_{t-1} and no information from readings: x_t is the sum of all actions before t.
-    filter = adds_up_actions()
+    """Members without spread learn nothing from readings: x_t = F x_{t-1} + a_{t-1}."""
+    filter, F = linear_denkf(control=torch.eye(2), initial=FixedEnsemble(torch.zeros(3, 2))), linear_system()[0]
     td = TensorDict({"observation": torch.randn(2, 6, 2), "action": torch.randn(2, 6, 2)}, [2, 6])
-    expected = torch.cat([torch.zeros(2, 1, 2), td["action"].cumsum(1)[:, :-1]], 1)
+    states = [torch.zeros(2, 2)]
+    for t in range(5):
+        states.append(states[-1] @ F.mT + td["action"][:, t])
+    expected = torch.stack(states, 1)
     out = filter.sequence(td.copy())
     torch.testing.assert_close(out["belief", "mean"], expected, rtol=0, atol=1e-14)
     assert out["action"].equal(td["action"])
     # A step takes the action that is in its tensordict.
     row = filter.step(filter.initialise(td[:, 0].copy()))
     torch.testing.assert_close(row["belief", "mean"], td["action"][:, 0], rtol=0, atol=1e-14)
-
-
-# ---------------------------------------------------------------------------------------------------- masks
-
-
-@pytest.mark.parametrize("scheme", ["etkf", "sakov"])
-@pytest.mark.parametrize("kept", [0, 1])
-def test_partial_mask_is_the_filter_of_the_remaining_dimensions(float64, scheme, kept):
-    both = linear_denkf(scheme)
-    one = DEnKF(
-        both["transition"],
-        None,
-        LinearObservation(both["observation"].matrix[[kept]]),
-        ConstantNoise(linear_system()[3][[kept]].sqrt(), in_key="observation"),
-        both["analysis"],
-        initial=both.initial,
-    )
-    readings = torch.randn(2, 10, 2)
-    observed = torch.tensor([kept == 0, kept == 1]).expand(2, 10, 2)
-    broken = torch.where(observed, readings, torch.nan)
-    masked = both.sequence(TensorDict({"observation": broken, "observed": observed}, [2, 10]))
-    single = one.sequence(TensorDict({"observation": readings[..., [kept]]}, [2, 10]))
-    # Cholesky factors of 2 x 2 with an identity row and of 1 x 1 may differ in the last digit.
-    assert_equal(masked, single, [*BELIEF, ("info", "nis"), ("info", "log_likelihood")], atol=1e-12)
 
 
 # ------------------------------------------------------------------------------------------------- gradients
@@ -213,6 +155,3 @@ def test_a_stochastic_observation_model_draws_its_own_noise(float64, layer):
     assert_equal(stepwise(filter, frames), first, BELIEF, atol=1e-12)
     fresh = filter.sequence(frames.exclude(("noise", "observation")))
     assert not fresh["belief", "mean"].equal(first["belief", "mean"])
-    if layer == "dropout":
-        compiled = filter.compile(chunk=2, backend="eager").sequence(frames.copy())
-        assert_equal(compiled, first, BELIEF, atol=1e-12)

@@ -7,8 +7,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from tests.filters.beliefs_for_tests import ENSEMBLE, MEAN, VAR, close
-from tests.filters.factories import linear_denkf, linear_system, linear_with
-from tests.filters.two_readings_for_tests import parts_of_reading
+from tests.filters.factories import linear_denkf, linear_system, linear_with, parts_of_reading, stepwise
 from torch_denkf.filters import Filter
 from torch_denkf.modules import SubModel
 
@@ -29,17 +28,24 @@ def reads(parts):
     return Filter({"transition": plain["transition"], **parts}, initial=plain.initial)
 
 
-def test_their_diagnostics_add_up_to_those_of_all_readings():
+@pytest.mark.parametrize("way", ["step", "sequence"])
+def test_their_diagnostics_add_up_to_those_of_all_readings(way):
     """The chain rule: a density of two readings is that of one times that of the other, given the first."""
-    both = linear_denkf()
-    filter = reads({**parts_of_reading(0, "forecast", "mid"), **parts_of_reading(1, "mid", "belief")})
-    frames = readings(3, 6)
-    out, expected = filter.sequence(frames.copy()), both.sequence(frames.copy())
+    both, seen = linear_denkf(), torch.rand(3, 8, 2) < 0.7
+    masked = [{"observed_key": f"seen{i}"} for i in (0, 1)]
+    parts = {**parts_of_reading(0, "forecast", "mid", **masked[0]), **parts_of_reading(1, "mid", "belief", **masked[1])}
+    filter, frames = reads(parts), readings(3, 8)
+    frames["is_init"] = torch.zeros(3, 8, 1, dtype=torch.bool)
+    frames["is_init"][:, 0] = frames["is_init"][1, 4] = True
+    expected = both.sequence(frames.copy().set("observed", seen))
+    frames.update({f"seen{i}": seen[..., i : i + 1] for i in (0, 1)})
+    out = stepwise(filter, frames) if way == "step" else filter.sequence(frames.copy())
     close(out, expected, [MEAN, VAR, *TOTALS], atol=1e-10)
     for name in ("nis", "log_likelihood"):
         own = [out["info", place, name] for place in ("a0", "a1")]
         close({name: sum(own)}, out["info"], [name])
-        assert all((value[:, 1:] != 0).all() for value in own)
+        for i, value in enumerate(own):
+            assert value.squeeze(-1).bool().equal(seen[..., i] & ~frames["is_init"].squeeze(-1))
 
 
 def test_analyses_side_by_side_may_be_put_together():

@@ -90,5 +90,7 @@ def test_single_precision_keeps_its_digits(scheme, count, noise):
     double = {name: value.double() if torch.is_tensor(value) else value for name, value in arguments.items()}
     space = "observation" if count == 10 else "ensemble"
     expected = analyse(**double, space=space).ensemble - double["forecast"]
-    found = analyse(**arguments).ensemble.double() - double["forecast"]
+    found = analyse(**arguments).ensemble
+    assert found.dtype == torch.float32
+    found = found.double() - double["forecast"]
     assert (found - expected).norm() / expected.norm() < 1.5e-6

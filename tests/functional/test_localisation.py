@@ -85,14 +85,6 @@ def test_gradients_equal_finite_differences():
     assert torch.autograd.gradcheck(lambda *parts: letkf(*parts, near, tile=2), parts)
 
 
-def test_single_precision_follows_double():
-    parts = problem(8, 12, 12)
-    places = torch.arange(12.0).unsqueeze(-1)
-    near = neighbours(places, places, 2.0)
-    single = letkf(*(value.float() for value in parts), near)
-    torch.testing.assert_close(single.double(), letkf(*parts, near), rtol=2e-5, atol=2e-5)
-
-
 def test_neighbours_of_a_taper_are_its_positive_entries():
     taper = torch.tensor([[0.0, 0.3, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0], [0.2, 0.4, 0.1, 0.0]])
     found = neighbours_of_taper(taper, tile=2)

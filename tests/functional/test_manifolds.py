@@ -48,9 +48,7 @@ ANGLES = {
 EXACT = {"rtol": 0, "atol": 1e-13}
 
 
-@pytest.fixture(autouse=True)
-def _double(float64):
-    return
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def tangents(space, *batch, size=None):
@@ -165,29 +163,16 @@ def test_rotations_are_those_of_mujoco():
         torch.testing.assert_close(rotate(first, tangent), turned, **EXACT)
         whole = by_mujoco(mujoco.mju_quat2Mat, 9, first).reshape(3, 3)
         torch.testing.assert_close(rotation_matrix(first), whole, **EXACT)
-        angle = tangent.norm()
-        torch.testing.assert_close(
-            space.exp(tangent), by_mujoco(mujoco.mju_axisAngle2Quat, 4, tangent / angle, angle.item()), **EXACT
-        )
-        # An angular velocity in the body's axes for half a second.
-        moved = first.clone()
-        mujoco.mju_quatIntegrate(moved.numpy(), tangent.numpy(), 0.5)
-        assert_same_points(space, space.plus(first, 0.5 * tangent), moved)
         difference = by_mujoco(mujoco.mju_subQuat, 3, first, second)
         # MuJoCo takes 2 pi off angles above pi by its own sine: 1e-12 is rounding.
         torch.testing.assert_close(space.minus(first, second), difference, rtol=0, atol=1e-12)
 
 
 def test_quaternions_of_mujocos_matrices_in_all_quadrants():
-    rotations = [torch.tensor([0.0, 0.0, 0.0, 0.0]).index_fill(0, torch.tensor(at), 1.0) for at in range(4)]
-    rotations += [
-        torch.tensor([w, x, y, z]).div(math.sqrt(30.0))
-        for signs in range(8)
-        for big in range(4)
-        for w, x, y, z in [np.roll([5.0, *(1.0 + (signs >> at & 1) * -2.0 for at in range(3))], big)]
-    ]
-    stack = torch.stack(rotations)
-    stack = torch.cat([stack / stack.norm(dim=-1, keepdim=True), points(SO3(), 100)])
+    """Each of the four numbers is the largest once, with all signs of the others; and is all there is."""
+    signs = torch.cartesian_prod(torch.tensor([5.0]), *[torch.tensor([1.0, -1.0])] * 3)
+    stack = torch.cat([torch.eye(4), *(signs.roll(place, -1) for place in range(4)), points(SO3(), 100)])
+    stack = stack / stack.norm(dim=-1, keepdim=True)
     own = quaternion_of(rotation_matrix(stack))
     torch.testing.assert_close((own * stack).sum(-1).abs(), torch.ones(len(stack)), **EXACT)
     for quaternion, found in zip(stack, own, strict=True):
@@ -214,9 +199,7 @@ def test_steps_lead_there_and_back(space):
     torch.testing.assert_close(space.distance(moved, point), tangent.norm(dim=-1), rtol=0, atol=1e-11)
     first, second = points(space, 3, 20), points(space, 3, 20)
     assert_same_points(
-        space,
-        space.compose(space.compose(first, second), point),
-        space.compose(first, space.compose(second, point)),
+        space, space.compose(space.compose(first, second), point), space.compose(first, space.compose(second, point))
     )
     noise, std = torch.randn_like(tangent), torch.rand(space.tangent_dim)
     assert space.perturb(point, std, noise).equal(space.plus(point, std * noise))
@@ -242,17 +225,6 @@ def test_bases_are_the_derivatives_of_steps(space):
     # A tangent says nothing of numbers off the space.
     torch.testing.assert_close(space.dual_basis(point) @ plus, minus @ plus, **EXACT)
     torch.testing.assert_close(space.dual_basis(point) @ plus, torch.eye(space.tangent_dim), **EXACT)
-
-
-def test_quaternions_that_other_libraries_store_with_w_last():
-    from scipy.spatial.transform import Rotation  # (x, y, z, w)
-
-    quaternion, vector = points(SO3(), 30), torch.randn(30, 3)
-    other = Rotation.from_quat(quaternion.roll(-1, -1).numpy())
-    torch.testing.assert_close(rotate(quaternion, vector), torch.from_numpy(other.apply(vector.numpy())), **EXACT)
-    torch.testing.assert_close(rotation_matrix(quaternion), torch.from_numpy(other.as_matrix()), **EXACT)
-    torch.testing.assert_close(SO3().log(quaternion), torch.from_numpy(other.as_rotvec()), rtol=0, atol=1e-12)
-    torch.testing.assert_close(SO3().exp(SO3().log(quaternion)).abs(), quaternion.abs(), rtol=0, atol=1e-12)
 
 
 def test_a_quaternion_and_its_negative_are_one_rotation():
@@ -296,15 +268,13 @@ def test_gradients(space):
     def mean(center, away):
         return space.minus(space.mean(space.plus(center.unsqueeze(-2), away)), center.detach())
 
-    assert torch.autograd.gradcheck(space.plus, (point, tangent))
-    assert torch.autograd.gradcheck(space.minus, (point, origin))
-    assert torch.autograd.gradcheck(space.exp, (tangent,))
-    assert torch.autograd.gradcheck(space.right_jacobian, (tangent,))
-    assert torch.autograd.gradcheck(space.adjoint, (point,))
-    assert torch.autograd.gradcheck(space.basis, (point,))
-    assert torch.autograd.gradcheck(space.dual_basis, (point,))
-    assert torch.autograd.gradcheck(mean, (point.detach(), group))
-    assert torch.autograd.gradgradcheck(space.exp, (tangent,))
+    for function, inputs in (
+        *((space.plus, (point, tangent)), (space.minus, (point, origin)), (mean, (point.detach(), group))),
+        *((function, (tangent,)) for function in (space.exp, space.right_jacobian)),
+        *((function, (point,)) for function in (space.adjoint, space.basis, space.dual_basis)),
+    ):
+        assert torch.autograd.gradcheck(function, inputs, fast_mode=True)  # along random directions
+    assert torch.autograd.gradgradcheck(space.exp, (tangent,), fast_mode=True)
 
 
 # -------------------------------------------------------------------------------------- at zero and at half a turn
@@ -406,28 +376,19 @@ def test_means_of_numbers_and_angles():
 # ------------------------------------------------------------------------------------------ graphs, shapes, errors
 
 
-@pytest.mark.parametrize(
-    "space",
-    [
-        Circle(),
-        SE2(),
-        pytest.param(SO3(), marks=pytest.mark.slow),
-        pytest.param(Product(SE23(), Circle(), Euclidean(2)), marks=pytest.mark.slow),
-    ],
-    ids=repr,
-)
-def test_compiled_is_eager(space):
-    point, origin = points(space, 3, 5).requires_grad_(), points(space, 3, 5).requires_grad_()
-    tangent = near(space, 3, 5).requires_grad_()
-    torch._dynamo.reset()
-    for function, inputs in (
-        (lambda *both: (space.plus(*both),), (point, tangent)),
-        (lambda *both: (space.minus(*both),), (point, origin)),
-        (lambda value: (space.mean(value),), (space.plus(origin[:, :1], 0.2 * tangent).detach().requires_grad_(),)),
-        (lambda value: (space.right_jacobian(value) @ space.exp(value)[..., : space.tangent_dim, None],), (tangent,)),
-        (lambda value: (space.adjoint(value) @ value[..., : space.tangent_dim, None],), (point,)),
-    ):
-        assert_compiled_is_eager(function, *inputs, gradients=1e-10)
+SLOW = [pytest.param(space, marks=pytest.mark.slow) for space in (SO3(), Product(SE23(), Circle(), Euclidean(2)))]
+
+
+@pytest.mark.parametrize("space", [SE2(), *SLOW], ids=repr)
+def test_compiled_is_eager(space, monkeypatch):
+    monkeypatch.setattr("torch_denkf.functional.manifolds.space._MEAN_STEPS", 1)  # which are all alike
+    point, origin, tangent = (make(space, 3, 5).requires_grad_() for make in (points, points, near))
+
+    def everything(point, origin, tangent):
+        axes = space.right_jacobian(tangent) @ space.adjoint(point)
+        return space.plus(point, tangent), space.minus(point, origin), axes, space.mean(space.plus(origin, tangent))
+
+    assert_compiled_is_eager(everything, point, origin, tangent, gradients=1e-10)
 
 
 @pytest.mark.parametrize("space", SPACES, ids=repr)

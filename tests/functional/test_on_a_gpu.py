@@ -3,11 +3,8 @@
 import pytest
 import torch
 
-from tests.waits import NothingWaits
 from torch_denkf.functional import _ensemble_space, analyse
 from torch_denkf.functional.gaussian import solve_for_gain
-from torch_denkf.functional.inflation import random_rotation
-from torch_denkf.functional.kernels import small_system
 from torch_denkf.functional.kernels.small_system import LARGEST, inverse_of
 from torch_denkf.functional.linalg import (
     divide,
@@ -16,18 +13,6 @@ from torch_denkf.functional.linalg import (
     semidefinite_solve,
     solve,
 )
-
-
-@pytest.fixture
-def as_on_a_gpu(monkeypatch):
-    """Returns a function that runs another as a GPU would, and raises where that waits."""
-
-    def run(function, *args, **kwargs):
-        with monkeypatch.context() as patch, NothingWaits():
-            patch.setattr(small_system, "GPUS", ("cuda", "cpu"))
-            return function(*args, **kwargs)
-
-    return run
 
 
 def covariance(size, *batch, rank=None, seed=0):
@@ -114,19 +99,6 @@ def test_analysis(float64, as_on_a_gpu, scheme, dim):
 
     for mine, other in zip((*ours, *as_on_a_gpu(gradients, ours)), (*theirs, *gradients(theirs)), strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-9, atol=1e-9)
-
-
-def test_rotations_are_orthogonal_uniform_and_keep_ones(as_on_a_gpu):
-    torch.manual_seed(0)
-    turns = as_on_a_gpu(random_rotation, 4, (20_000,), dtype=torch.float64)
-    torch.testing.assert_close(turns @ turns.mT, torch.eye(4).double().expand_as(turns), rtol=0, atol=1e-12)
-    torch.testing.assert_close(turns.sum(-1), torch.ones(20_000, 4).double())
-    # Of a uniform orthogonal matrix of 3 rows all first moments are 0, traces have variance 1, half of them turn round.
-    trace = turns.diagonal(dim1=-2, dim2=-1).sum(-1) - 1
-    assert abs(trace.mean()) < 0.03
-    assert abs(trace.var() - 1) < 0.03
-    assert abs((torch.linalg.det(turns) > 0).double().mean() - 0.5) < 0.02
-    assert (turns.mean(0) - 0.25).abs().max() < 0.02
 
 
 def test_a_gpu_takes_no_tiles_of_a_cache(monkeypatch, as_on_a_gpu):

@@ -4,16 +4,19 @@ from functools import partial
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch.testing import assert_close
 
 from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf, toy_frames
 from tests.filters.gaussian_for_tests import directional_check
+from tests.filters.particle_for_tests import bootstrap
 from tests.functional.checks import assert_refused
 from tests.smoothers.joint import drive, joint_beliefs
 from torch_denkf.baselines import LSTMFilter
 from torch_denkf.functional.smoothing.ensemble import enrts_step
 from torch_denkf.modules import GaussianPrior
-from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
+from torch_denkf.monitoring import Gated
+from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
 
 KINDS = {
     "EnKS": EnKS,
@@ -102,14 +105,32 @@ def test_gradients_with_gaps_and_new_episodes(float64, kind):
     directional_check(lambda: (means(smoother, frames) * weights).sum(), list(filter.parameters()), rtol=1e-4)
 
 
-def test_what_is_no_lag_and_what_no_filter():
-    for lag in (1.5, True, "2"):
-        assert_refused(TypeError, "lag must be a whole number", EnRTS, linear_denkf(), lag)
-        assert_refused(TypeError, "lag must be a whole number", FixedLag, linear_denkf(), lag)
-    assert_refused(ValueError, r"damping must be .*at most 1; got 1.2", EnRTS, linear_denkf(), damping=1.2)
-    assert_refused(TypeError, "damping must be a number", EnRTS, linear_denkf(), damping="0.9")
-    recurrent = LSTMFilter(None, state_dim=2, observation_dim=2)
-    for smoother in (partial(FixedLag, lag=2), RTSSmoother):
-        assert_refused(TypeError, "before and after a step", smoother, recurrent)
-    for smoother in (EnKS, EnRTS):
-        assert_refused(TypeError, "LSTMFilter carries", smoother, recurrent)
+LSTM = partial(LSTMFilter, None, state_dim=2, observation_dim=2)
+REFUSED = [
+    *((TypeError, "lag must be a whole number", partial(EnRTS, lag=lag), linear_denkf) for lag in (1.5, True, "2")),
+    *((TypeError, "lag must be a whole number", partial(FixedLag, lag=lag), linear_denkf) for lag in (1.5, True, "2")),
+    (ValueError, "at least 1", partial(FixedLag, lag=0), linear_denkf),
+    (ValueError, "lag must be a whole number, at least 0; got -1", partial(EnRTS, lag=-1), linear_denkf),
+    (ValueError, r"damping must be .*at most 1; got 1.2", partial(EnRTS, damping=1.2), linear_denkf),
+    (TypeError, "damping must be a number", partial(EnRTS, damping="0.9"), linear_denkf),
+    *((TypeError, "before and after a step", smoother, LSTM) for smoother in (partial(FixedLag, lag=2), RTSSmoother)),
+    *((TypeError, "LSTMFilter carries", smoother, LSTM) for smoother in (EnKS, EnRTS)),
+    (ValueError, r"adapt_inflation=0.1.*damping=", EnRTS, lambda: Gated(linear_denkf(), adapt_inflation=0.1)),
+    (TypeError, "EnRTS takes a filter with an ensemble", EnRTS, linear_kalman),
+    (TypeError, "EnKS takes a filter with an ensemble", EnKS, linear_kalman),
+    (TypeError, "takes a filter with a mean and a covariance; DEnKF carries", RTSSmoother, linear_denkf),
+    (TypeError, "takes a filter with particles", ParticleSmoother, linear_denkf),
+    (TypeError, "density of the motion", ParticleSmoother, partial(bootstrap, 5)),
+    (ValueError, "picks none", partial(FixedLag, lag=2), partial(bootstrap, 5, resampling="transport")),
+    (TypeError, "carries a past already", partial(FixedLag, lag=2), lambda: FixedLag(linear_denkf(), 2)),
+]
+
+
+@pytest.mark.parametrize(("error", "words", "smoother", "make"), REFUSED)
+def test_what_cannot_be_smoothed_says_so(error, words, smoother, make):
+    assert_refused(error, words, smoother, make())
+
+
+def test_a_belief_that_was_stored_without_a_lag_says_so():
+    stored = linear_denkf().sequence(TensorDict({"observation": torch.zeros(4, 2)}, [4]))
+    assert_refused(KeyError, "stored without a lag", FixedLag(linear_denkf(), 2).sequence, stored)

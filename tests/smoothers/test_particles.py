@@ -2,13 +2,11 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch.testing import assert_close
 
-from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
+from tests.filters.factories import NoisyLinear, linear_system
 from tests.filters.gaussian_for_tests import known_process_noise
-from tests.functional.checks import assert_refused
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.functional.gaussian import gaussian_log_prob
@@ -118,15 +116,6 @@ def test_gradients_are_those_of_finite_differences(float64):
     assert torch.autograd.gradcheck(backward_weights, [value.requires_grad_() for value in inputs])
 
 
-def test_densities_of_pairs(float64):
-    values, means, root = torch.randn(3, 4, 2), torch.randn(3, 4, 2), torch.randn(3, 2, 2)
-    cov = root @ root.mT + torch.eye(2)
-    found = log_density_of_pairs(values, means, cov)
-    for i in range(4):
-        for j in range(4):
-            assert_close(found[:, i, j], gaussian_log_prob(values[:, j], means[:, i], cov))
-
-
 @pytest.mark.parametrize("previous", [False, True])
 def test_each_step_uses_the_action_that_led_into_it(float64, previous):
     """The action stored at a time leads out of it; a policy's data store it one step later."""
@@ -145,19 +134,3 @@ def test_each_step_uses_the_action_that_led_into_it(float64, previous):
     moved = out["belief", "ensemble"] @ F.mT + (action @ control.mT).unsqueeze(-2)
     expected = log_density_of_pairs(out["belief", "ensemble"][:, 1:], moved[:, :-1], Q.expand(2, 3, 2, 2))
     assert_close(density[:, 1:], expected, rtol=0, atol=1e-9)
-
-
-def test_what_cannot_be_smoothed_says_so():
-    assert_refused(TypeError, "takes a filter with particles", ParticleSmoother, linear_denkf())
-    F, Q, H, R = linear_system()
-    own = ParticleFilter(
-        NoisyLinear(F, Q),
-        None,
-        LinearObservation(H),
-        GaussianLikelihood(observation_key="observation"),
-        noise=ConstantNoise(R.sqrt(), in_key="observation"),
-        initial=GaussianPrior(MEAN, [1.0, 1.0], ensemble_size=5),
-    )
-    assert_refused(TypeError, "density of the motion", ParticleSmoother, own)
-    assert_refused(ValueError, "picks none", FixedLag, particles(5, resampling="transport"), 2)
-    assert FixedLag(own, 2).sequence(TensorDict({"observation": torch.zeros(4, 2)}, [4]))["smoothed", "mean"].ndim == 2

@@ -7,12 +7,12 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
-from tests.filters.factories import NoisyLinear, linear_kalman, linear_system
+from tests.filters.factories import NoisyLinear, linear_kalman
 from tests.filters.gaussian_for_tests import directional_check, learned_filter, learned_frames, linear_filter
 from tests.smoothers.joint import drive, joint_beliefs
 from torch_denkf import EKF, UKF, KalmanFilter
 from torch_denkf.functional.manifolds import SE2
-from torch_denkf.functional.smoothing.rts import rts_smooth, smoothing_gain
+from torch_denkf.functional.smoothing.rts import smoothing_gain
 from torch_denkf.modules import ConstantNoise, LinearObservation, MappedNoise, MomentPrior
 from torch_denkf.motions import ConstantTwist, PoseOf
 from torch_denkf.smoothers import FixedLag, RTSSmoother
@@ -60,25 +60,6 @@ def test_an_update_at_the_first_frame_counts_for_the_past_too(float64, name):
     assert_close(online["smoothed", "mean"][:, -1], whole["smoothed", "mean"][:, 0], rtol=0, atol=1e-10)
     assert_close(online["smoothed", "mean"][:, 0], online["belief", "mean"][:, 0], rtol=0, atol=1e-10)
     assert online["smoothed", "age"][0].flatten().tolist() == [0, 1, 2, 3, 4, 5]
-
-
-def test_gradients_are_those_of_finite_differences(float64):
-    frames = drive(1, 4, missing=0.0, resets=False)
-    F = linear_system()[0]
-    filtered = RTSSmoother(linear_kalman())(frames)
-    beliefs = [filtered["belief", "mean"], filtered["belief", "cov"]]
-    beliefs += [filtered["forecast", "mean"], filtered["forecast", "cov"]]
-    cross = torch.cat([torch.zeros(1, 1, 2, 2), filtered["belief", "cov"][:, :-1] @ F.mT], 1)
-    inputs = [value.detach().requires_grad_() for value in (*beliefs, cross)]
-    follows = torch.tensor([[False, True, True, False]])
-
-    for options in ({"follows": follows}, {"lag": 1}):
-
-        def smooth(mean, cov, forecast, forecast_cov, cross, options=options):
-            symmetric = [(value + value.mT) / 2 for value in (cov, forecast_cov)]
-            return rts_smooth(mean, symmetric[0], forecast, symmetric[1], cross, **options)
-
-        assert torch.autograd.gradcheck(smooth, inputs)
 
 
 @pytest.mark.parametrize("name", ["EKF", "UKF", "BackpropKF"])

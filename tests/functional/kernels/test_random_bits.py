@@ -3,12 +3,7 @@
 import pytest
 import torch
 
-from torch_denkf.functional.kernels.random_bits import (
-    dropout_factor,
-    random_bytes,
-    random_signs,
-    representable_rate,
-)
+from torch_denkf.functional.kernels.random_bits import dropout_factor, random_bytes, random_signs, representable_rate
 
 
 def binomial_bound(n, p):
