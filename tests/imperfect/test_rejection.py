@@ -10,12 +10,12 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import ExcludeTransform, TransformedEnv, check_env_specs
 from torchrl.modules.utils import get_env_transforms_from_module
 
-from tests.borders.test_readings import from_sensor
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.transforms.envs_for_tests import base_env, toy_base_env, toy_filter
 from torch_denkf import DEnKFTransform, RejectReadings
 from torch_denkf.functional.manifolds import SE2, SE3, SO3, Circle, Euclidean, Product
+from torch_denkf.modules import FromSensor
 
 NAN, INF = torch.nan, torch.inf
 COUNT = ("info", "rejected")
@@ -278,6 +278,11 @@ def rejecting_env(filter, *, silent=True, **options):
 
 @pytest.mark.parametrize("apart", [False, True])
 @pytest.mark.parametrize("update_at_reset", [False, True])
+def from_sensor(**kwargs):
+    start = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, observation_key="observation")
+    return linear_denkf("etkf", initial=start, **kwargs)
+
+
 @pytest.mark.parametrize("make", [linear_kalman, lambda **kw: linear_denkf("etkf", **kw), from_sensor])
 def test_in_an_environment(make, update_at_reset, apart):
     """An environment that says when a reading is missing, and one that does not: the beliefs are the same."""
