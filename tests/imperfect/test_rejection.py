@@ -276,13 +276,13 @@ def rejecting_env(filter, *, silent=True, **options):
     return env.append_transform(DEnKFTransform(filter))
 
 
-@pytest.mark.parametrize("apart", [False, True])
-@pytest.mark.parametrize("update_at_reset", [False, True])
 def from_sensor(**kwargs):
     start = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, observation_key="observation")
     return linear_denkf("etkf", initial=start, **kwargs)
 
 
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("update_at_reset", [False, True])
 @pytest.mark.parametrize("make", [linear_kalman, lambda **kw: linear_denkf("etkf", **kw), from_sensor])
 def test_in_an_environment(make, update_at_reset, apart):
     """An environment that says when a reading is missing, and one that does not: the beliefs are the same."""
