@@ -28,7 +28,7 @@ setup(
         "Topic :: Scientific/Engineering :: Artificial Intelligence",
         "Typing :: Typed",
     ],
-    python_requires=">=3.11",  # labmaze, which dm-control needs, has no wheel for 3.13
+    python_requires=">=3.11,<3.13",  # labmaze, which dm-control needs, has no wheel for 3.13
     packages=find_packages(include=["torch_denkf", "torch_denkf.*"]),
     package_data={
         "torch_denkf": ["py.typed", "**/*.pyi"],
@@ -68,6 +68,7 @@ setup(
         # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
         "bench": [
             "matplotlib",
+            "pandas>=3.0",  # tables of the studies
             "vqf==2.1.2",  # the peers of benchmarks/broad
             "ahrs==0.4.0",
             "filterpy==2.0.0",
@@ -96,6 +97,7 @@ setup(
             "onnxscript>=0.7.2",
             "onnxruntime>=1.32",
             "hypothesis",
+            "pandas>=3.0",  # tables of the studies
             "pytest",
             "pytest-xdist",
             "ruff",

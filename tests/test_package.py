@@ -153,31 +153,8 @@ def test_what_an_import_costs():
 
 
 def test_every_public_name_is_there():
-    for name in (
-        "functional",
-        "metrics",
-        "modules",
-        "filters",
-        "smoothers",
-        "transforms",
-        "objectives",
-        "data",
-        "envs",
-        "plots",
-        "pretrained",
-        "fusion",
-        "monitoring",
-        "motions",
-        "training",
-        "deployment",
-        "imperfect",
-        "diagnosis",
-        "baselines",
-        "applications.car",
-        "applications.imu",
-        "applications.ur5",
-        "applications.reacher",
-    ):
-        package = import_module(f"torch_denkf.{name}")
+    packages = [path.parent.relative_to(ROOT) for path in (ROOT / "torch_denkf").rglob("__init__.py")]
+    for name in (".".join(package.parts) for package in packages):
+        package = import_module(name)
         for public in getattr(package, "__all__", ()):
-            assert hasattr(package, public), f"torch_denkf.{name}.{public}"
+            assert hasattr(package, public), f"{name}.{public}"

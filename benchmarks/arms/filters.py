@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from benchmarks.arms.arms import NOISE, Arm, wrap
 from benchmarks.arms.sensor import FromPlaces, JointPlaces, JointSensor
+from benchmarks.common.training import random_rows
 from torch_denkf import modules as m
 from torch_denkf.filters import DEnKF
 from torch_denkf.training import Stage
@@ -115,14 +116,8 @@ def make_filter(arm: Arm, motion: TensorDict, sensor: JointSensor | None, error:
 
 def train_sensor(sensor: JointSensor, frames: TensorDict, updates: int, out: Path, seed: int) -> None:
     """On single pictures ``[N]``, each of another pose."""
-
-    def loss(batch: TensorDict) -> dict[str, Tensor]:
-        return sensor.losses(batch["pixels"], batch["state"])
-
-    def sample(generator: torch.Generator, _: int | None) -> TensorDict:
-        return frames[torch.randint(len(frames), (48,), generator=generator)]
-
-    stage = Stage("sensor", loss, sample, updates)
+    loss = lambda batch: sensor.losses(batch["pixels"], batch["state"])  # noqa: E731
+    stage = Stage("sensor", loss, random_rows(frames, 48), updates)
     train_part(sensor, stage, out=out / stage.name, loggers=(), device="cpu", seed=seed)
 
 
@@ -137,8 +132,6 @@ def train_motion(denkf: DEnKF, motion: TensorDict, updates: int, out: Path, seed
         mean, std = (part / transition.change for part in transition.faster(batch["state"], batch["action"]))
         return {"loss_motion": nn.functional.gaussian_nll_loss(mean, batch["faster"], std.square())}
 
-    def sample(generator: torch.Generator, _: int | None) -> TensorDict:
-        return steps[torch.randint(len(steps), (512,), generator=generator)]
-
-    stage = Stage("motion", loss, sample, updates, parameters=transition.module.parameters(), lr=3e-3)
+    learned = {"parameters": transition.module.parameters(), "lr": 3e-3}
+    stage = Stage("motion", loss, random_rows(steps, 512), updates, **learned)
     train_part(transition, stage, out=out / stage.name, loggers=(), device="cpu", seed=seed)

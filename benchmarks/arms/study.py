@@ -16,11 +16,11 @@ from torchrl.envs import TransformedEnv
 
 from benchmarks.arms.arms import ARMS, Arm, HoldAngles, make_env, make_one, wrap
 from benchmarks.arms.filters import make_filter, train_motion, train_sensor
-from benchmarks.arms.page import COLUMNS, SOURCES, page
+from benchmarks.arms.page import SOURCES, page
 from benchmarks.arms.sensor import JointSensor
 from benchmarks.common.arguments import some_of
 from benchmarks.common.jobs import once, read_rows, same_settings
-from benchmarks.common.tables import report
+from benchmarks.common.tables import write_page, write_table
 from torch_denkf.filters import DEnKF
 from torch_denkf.transforms import DEnKFTransform
 
@@ -174,4 +174,5 @@ def run_study(study: Study) -> None:
         for source in study.sources:
             once(study.out / "parts" / f"{task}-{source}.json", partial(rows_of, task, source, study))
     rows = read_rows(sorted((study.out / "parts").glob("*.json")))
-    report(study.out, COLUMNS, rows, page(rows))
+    order = ("task", "source", "missing", "estimate", "seed", "episode")
+    write_page(page(write_table(rows, study.out / "table.csv", order)), study.out / "table.md")

@@ -89,3 +89,8 @@ def read_rows(files: Iterable[Path], shared: Callable[[dict], Hashable] = lambda
         rows += [row for key, row in keyed if key not in seen]
         seen |= {key for key, _ in keyed if key is not None}
     return rows
+
+
+def rows_in(out: Path) -> list[dict]:
+    """All rows that a study's folder holds, in ``out/rows``."""
+    return read_rows(sorted((out / "rows").glob("*.json")))

@@ -2,128 +2,92 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from statistics import fmean, median
+
+import pandas as pd
 
 from benchmarks.common.plots import plt, save
-from benchmarks.common.tables import pick
 
+ENDS = ("first", "last")
 STUDIES = Path(__file__).parents[1]
 PAGES = STUDIES.parent / "docs" / "results"
-Bars = dict[str, dict[str, float]]  # of each row, by what the row is: a number of each series
+Bars = tuple[str, pd.DataFrame]  # the axis' label; numbers of each series, by what a row is
 
 
-def rows_of(file: str) -> list[dict]:
-    """Rows of a CSV of a study; cells stay text."""
-    return list(csv.DictReader((STUDIES / file).open()))
-
-
-def mean(rows: Sequence[dict], name: str) -> float:
-    """Returns the mean of a column."""
-    return fmean(float(row[name]) for row in rows)
-
-
-def smoothing() -> tuple[str, Bars]:
+def smoothing() -> Bars:
     """Error of filter and smoother on chaotic systems; methods without a smoother are left out."""
-    rows = [row for row in rows_of("smoothing/results/smoothing.csv") if row["rmse_smoother"]]
-    cases = dict.fromkeys((row["system"], row["method"], row["lag"]) for row in rows)
-    bars = {}
-    for system, method, lag in cases:
-        some = pick(rows, system=system, method=method, lag=lag)
-        name = f"{system}, {method}" + (f", lag {lag}" if lag else "")
-        bars[name] = {"filter": mean(some, "rmse_filter"), "smoother": mean(some, "rmse_smoother")}
-    return "root mean square error", bars
+    rows = pd.read_csv(STUDIES / "smoothing/results/smoothing.csv").dropna(subset="rmse_smoother")
+    lags = rows["lag"].map(", lag {:.0f}".format, na_action="ignore").fillna("")
+    names = rows["system"] + ", " + rows["method"] + lags
+    bars = rows.groupby(names, sort=False)[["rmse_filter", "rmse_smoother"]].mean()
+    return "root mean square error", bars.set_axis(["filter", "smoother"], axis=1)
 
 
-def fusion() -> tuple[str, Bars]:
+def fusion() -> Bars:
     """Error on KITTI while a sensor fails, median over the trainings."""
-    rows = [row for row in rows_of("fusion/results/fusion.csv") if row["task"] == "KITTI" and row["error_without"]]
-    bars = {}
-    for condition in dict.fromkeys(row["condition"] for row in rows):
-        plain, weights = (pick(rows, condition=condition, method=method) for method in ("plain", "weights"))
-        bars[condition] = {
-            "plain": median(float(row["error"]) for row in plain),
-            "weights": median(float(row["error"]) for row in weights),
-            "without that sensor": median(float(row["error_without"]) for row in weights),
-        }
-    return "car: error while a sensor fails, m", bars
+    rows = pd.read_csv(STUDIES / "fusion/results/fusion.csv").query("task == 'KITTI'").dropna(subset="error_without")
+    medians = rows.pivot_table(["error", "error_without"], "condition", "method", "median", sort=False)
+    bars = {"plain": medians["error", "plain"], "weights": medians["error", "weights"]}
+    without = medians["error_without", "weights"]
+    return "car: error while a sensor fails, m", pd.DataFrame({**bars, "without that sensor": without})
 
 
-def monitor() -> tuple[str, Bars]:
+def monitor() -> Bars:
     """Error of the path's end, alone and with an answer to the signs."""
-    rows = [row for row in rows_of("monitor/results/monitor.csv") if row["m_per_m"]]
-    named = {"none": "no fault", "black-all": "30 % black", "box-all": "a box"}
-    return "car: error of the path's end, m/m", {
-        f"{row['task'].removeprefix('kitti-')}: {named[row['fault']]}": {
-            "alone": float(row["m_per_m"]),
-            "with an answer": float(row["m_per_m_gated"]),
-        }
-        for row in rows
-    }
+    rows = pd.read_csv(STUDIES / "monitor/results/monitor.csv").dropna(subset="m_per_m")
+    faults = rows["fault"].map({"none": "no fault", "black-all": "30 % black", "box-all": "a box"})
+    names = rows["task"].str.removeprefix("kitti-") + ": " + faults
+    bars = rows.set_index(names)[["m_per_m", "m_per_m_gated"]].set_axis(["alone", "with an answer"], axis=1)
+    return "car: error of the path's end, m/m", bars
 
 
-def arms() -> tuple[str, Bars]:
+def arms() -> Bars:
     """Mean distance of an arm's tip from its goal."""
-    rows = rows_of("arms/results/table.csv")
-    bars = {}
-    for task, source, missing in dict.fromkeys((row["task"], row["source"], row["missing"]) for row in rows):
-        some = pick(rows, task=task, source=source, missing=missing)
-        name = f"{task}, {source}" + (f", {float(missing):.0%} missing" if float(missing) else "")
-        bars[name] = {read: mean(pick(some, estimate=read), "tip") for read in ("reading", "belief")}
-    return "tip to goal, cm", bars
+    rows = pd.read_csv(STUDIES / "arms/results/table.csv")
+    missing = rows["missing"].map(lambda share: f", {share:.0%} missing" if share else "")
+    tips = rows.groupby([rows["task"] + ", " + rows["source"] + missing, "estimate"], sort=False)["tip"].mean()
+    return "tip to goal, cm", tips.unstack("estimate", sort=False)[["reading", "belief"]]
 
 
-def odometry() -> tuple[str, Bars]:
+def odometry() -> Bars:
     """Length of the path over the true length, mean over the drives."""
-    rows = rows_of("odometry/results/odometry.csv")
-    heights = sorted(dict.fromkeys(row["height_m"] for row in rows), key=float)
-    bars = {f"height {height} m": {"path": mean(pick(rows, height_m=height), "scale")} for height in heights}
-    return "length of the path / true length", bars
+    scales = pd.read_csv(STUDIES / "odometry/results/odometry.csv").groupby("height_m")["scale"].mean()
+    return "length of the path / true length", scales.rename(index="height {:g} m".format).to_frame("path")
 
 
-def reliability() -> tuple[str, Bars]:
+def reliability() -> Bars:
     """Error of packaged steps in the first and in the last chunk of a million."""
     rows = json.loads((STUDIES / "reliability/results/soak.json").read_text())["parts"]["steps"]
-    return "mean squared error", {
-        row["name"]: {f"{chunk} steps": row[f"mean squared error, {chunk} chunk"] for chunk in ("first", "last")}
-        for row in rows
-    }
+    bars = {f"{at} steps": {row["name"]: row[f"mean squared error, {at} chunk"] for row in rows} for at in ENDS}
+    return "mean squared error", pd.DataFrame(bars)
 
 
-def speed() -> tuple[str, Bars]:
+def speed() -> Bars:
     """Time of a compiled sequence over that of a peer."""
-    rows = json.loads((STUDIES / "speed/results/speed.json").read_text())
-    bars: Bars = {}
-    for row in rows:
-        what, _, size = row["name"].removeprefix("compiled ").partition(", B=")
-        if row["name"].startswith("compiled") and size and " / " in what and "floor" not in what:
-            bars.setdefault(what, {})[f"{size} at a time"] = row["ratio"]
-    return "our time / theirs", bars
+    rows = pd.DataFrame(json.loads((STUDIES / "speed/results/speed.json").read_text()))
+    found = rows["name"].str.extract(r"^compiled (?P<what>.+ / .+), B=(?P<size>.+)$").join(rows["ratio"]).dropna()
+    found = found[~found["what"].str.contains("floor")]
+    bars = found.pivot(index="what", columns="size", values="ratio").loc[found["what"].unique(), found["size"].unique()]
+    return "our time / theirs", bars.add_suffix(" at a time")
 
 
-DRAWN: tuple[Callable[[], tuple[str, Bars]], ...] = (smoothing, fusion, monitor, arms, odometry, reliability, speed)
+DRAWN: tuple[Callable[[], Bars], ...] = (smoothing, fusion, monitor, arms, odometry, reliability, speed)
 
 
-def draw(label: str, bars: Bars, file: Path) -> None:
+def draw(label: str, bars: pd.DataFrame, file: Path) -> None:
     """Draws one group of bars a row, the first on top."""
-    series = list(dict.fromkeys(name for values in bars.values() for name in values))
-    width = 0.8 / len(series)
-    figure, axis = plt.subplots(figsize=(6, 1.2 + 0.18 * len(bars) * (1 + len(series))), layout="constrained")
-    for at, name in enumerate(series):
-        chosen = [(row, values[name]) for row, values in enumerate(bars.values()) if name in values]
-        places, values = zip(*chosen, strict=True)
-        drawn = axis.barh([row + (at - (len(series) - 1) / 2) * width for row in places], values, width, label=name)
+    figure, axis = plt.subplots(figsize=(6, 1.2 + 0.18 * len(bars) * (1 + bars.shape[1])), layout="constrained")
+    bars.plot.barh(ax=axis, width=0.8, legend=False, xlabel=label, ylabel="")
+    for drawn in axis.containers:
         axis.bar_label(drawn, fmt="{:.3g}", padding=2, fontsize=8)
-    axis.set(yticks=range(len(bars)), yticklabels=bars, xlabel=label)
     axis.invert_yaxis()
     axis.margins(x=0.12)
     axis.spines[["top", "right"]].set_visible(False)
-    if len(series) > 1:
-        figure.legend(loc="outside upper right", ncols=len(series), fontsize=9, frameon=False)
+    if bars.shape[1] > 1:
+        figure.legend(loc="outside upper right", ncols=bars.shape[1], fontsize=9, frameon=False)
     save(figure, file)
 
 

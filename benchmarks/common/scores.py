@@ -1,4 +1,4 @@
-"""Scores that both studies take of sensors and beliefs, and what a filter costs."""
+"""Scores that several studies take of sensors and beliefs, and what a filter costs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble, crps_gaussian
-from torch_denkf.metrics import interval_coverage
 
 
 def counted(out: TensorDict, dims: Sequence[int], floor: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -25,12 +24,6 @@ def counted(out: TensorDict, dims: Sequence[int], floor: float) -> tuple[Tensor,
     values = out["belief", "mean"], out["belief", "var"], out["state"]
     mean, variance, truth = (value[..., 1:, list(dims)] for value in values)
     return mean, variance.clamp_min(floor), truth
-
-
-def coverage(out: TensorDict, dims: Sequence[int], floor: float, level: float = 0.9) -> Tensor:
-    """Share of the truth inside a belief's intervals, ``[D]``."""
-    mean, variance, truth = (value.flatten(0, -2) for value in counted(out, dims, floor))
-    return interval_coverage(mean, variance, truth, level=level)
 
 
 def belief_crps(out: TensorDict, dims: Sequence[int], unit: Tensor, floor: float) -> Tensor:

@@ -1,9 +1,10 @@
 """A tiny run of every study and example, two side by side: ``python -m benchmarks.common.smoke``.
 
-Torch and torchrl are imported once, and each run is a fork of this process: otherwise to import them takes longer than
-most of the runs.
+What they share is imported once, and each run is a fork of this process: otherwise the imports take longer than most of
+the runs.
 """
 
+# ruff: noqa: F401  # imports that nearly all programs share
 from __future__ import annotations
 
 import os
@@ -15,11 +16,17 @@ import traceback
 from pathlib import Path
 from typing import IO
 
+import matplotlib.pyplot
+import scipy.stats
 import torchrl.collectors
 import torchrl.envs
-import torchrl.objectives  # noqa: F401  # what nearly all programs import
+import torchrl.objectives
 
-import torch_denkf.filters  # noqa: F401
+import torch_denkf.filters
+import torch_denkf.fusion
+import torch_denkf.objectives
+import torch_denkf.plots
+import torch_denkf.training
 
 ROOT = Path(__file__).parents[2]
 LONG = ("kitti", "ur5", "g1", "lorenz96")  # studies that come first
@@ -63,7 +70,14 @@ def start(program: str, log: IO[bytes]) -> int:
 
 
 def main() -> None:
-    """Runs all; prints what each said, and ends with an error if one failed."""
+    """Runs all; prints what each said, and ends with an error if one failed. What they leave is deleted."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["TMPDIR"] = tempfile.tempdir = folder
+        run_all()
+
+
+def run_all() -> None:
+    """Runs all, two side by side."""
     waiting, running, failed = programs(), {}, []
     while waiting or running:
         while waiting and len(running) < SIDE_BY_SIDE:

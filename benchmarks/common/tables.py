@@ -6,7 +6,8 @@ import csv
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import mean, stdev
+
+import pandas as pd
 
 from torch_denkf.deployment.files import replacing, write_text
 
@@ -66,49 +67,25 @@ def head(*titles: object) -> list[str]:
     return [line(*titles), "|" + "---|" * len(titles)]
 
 
-def average(
-    rows: Iterable[dict],
-    column: str,
-    form: str = "{:.2f}",
-    of: Callable[[Iterable[float]], float] = mean,
-    deviation: bool = False,
-) -> str:
-    """Returns a column's mean over rows, as text; empty where no row has the column.
-
-    Args:
-        rows: of several seeds.
-        column: its name.
-        form: of the number.
-        of: the average.
-        deviation: whether the standard deviation follows, where there are three values or more.
-    """
-    values = [row[column] for row in rows if column in row]
-    if not values:
-        return ""
-    return form.format(of(values)) + (f" ± {form.format(stdev(values))}" if deviation and len(values) > 2 else "")
+def markdown(frame: pd.DataFrame) -> list[str]:
+    """Returns a Markdown table of a frame's index and columns; missing values are empty."""
+    frame = frame.reset_index()
+    return [*head(*frame.columns), *(line(*row) for row in frame.astype(object).where(frame.notna(), "").to_numpy())]
 
 
-def covered(rows: Iterable[dict], column: str = "coverage90", of: Callable[[Iterable[float]], float] = mean) -> str:
-    """Returns the average coverage, in percent."""
-    return average([{"percent": 100 * row[column]} for row in rows], "percent", "{:.0f} %", of)
+def write_table(rows: Iterable[dict], file: Path, order: Sequence[str]) -> pd.DataFrame:
+    """Writes rows as CSV with five digits, sorted by some columns if any; returns them as they are there."""
+    frame = pd.DataFrame(rows).convert_dtypes()
+    frame = frame.sort_values(list(order), kind="stable") if order else frame
+    with replacing(file) as beside:
+        frame.to_csv(beside, index=False, float_format="%.5g")
+    return pd.read_csv(file)
 
 
-def grid(
-    rows: Sequence[dict], keys: Sequence[str], cells: dict[str, Callable[[list[dict]], str]], titles: Sequence[str] = ()
-) -> list[str]:
-    """Returns a Markdown table with a line for each group of rows, in the order of the first of each.
-
-    Args:
-        rows: all of them.
-        keys: columns by which rows are grouped, and that open a line.
-        cells: functions of a group's rows, by title.
-        titles: of the keys, by default their names.
-    """
-    groups: dict[tuple, list[dict]] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
-    lines = [line(*names, *(cell(own) for cell in cells.values())) for names, own in groups.items()]
-    return [*head(*(titles or keys), *cells), *lines]
+def records(file: Path) -> list[dict]:
+    """Rows of a CSV, without what is empty; none where there is no file."""
+    rows = pd.read_csv(file).to_dict("records") if file.exists() else []
+    return [{key: value for key, value in row.items() if pd.notna(value)} for row in rows]
 
 
 def write_page(page: str, file: Path | None) -> None:

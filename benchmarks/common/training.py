@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.common.recipes import Recipe
@@ -63,3 +65,8 @@ def read_filter(recipe: Recipe, model: Filter, saved: dict) -> Filter:
     model.load_state_dict(saved["model"])
     recipe.set_inflation(model, saved["inflation"])
     return model
+
+
+def random_rows(rows: TensorDict, batch: int) -> Callable[[torch.Generator, int | None], TensorDict]:
+    """Returns a stage's ``sample``: so many of the rows ``[N]``."""
+    return lambda generator, length: rows[torch.randint(len(rows), (batch,), generator=generator)]

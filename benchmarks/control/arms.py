@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tensordict import NestedKey
-from tensordict.nn import TensorDictModuleBase
+import torch
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.modules import GRUModule, LSTMModule
+from torchrl.data import Unbounded
+from torchrl.envs.transforms import Transform
+from torchrl.modules import LSTMModule
 
-MEMORY = 64  # units of an LSTM or a GRU
+MEMORY = 64  # units of an LSTM
 
 
 @dataclass(frozen=True)
@@ -17,34 +19,31 @@ class Arm:
     """What an arm reads.
 
     Attributes:
-        keys: entries of the environment.
+        key: entry of the environment.
         stack: readings side by side.
-        memory: ``"lstm"`` or ``"gru"``, or nothing.
+        memory: whether an LSTM remembers what was seen.
         filter: ``"learned"`` from readings, ``"taught"`` with the simulator's states, ``"exact"``, or nothing.
         end_to_end: whether the loss of the actor trains the filter, too.
     """
 
-    keys: tuple[NestedKey, ...]
+    key: NestedKey
     stack: int = 1
-    memory: str = ""
+    memory: bool = False
     filter: str = ""
     end_to_end: bool = False
 
 
-MEAN, VAR, ENSEMBLE = ("belief", "mean"), ("belief", "var"), ("belief", "ensemble")
+MEAN = ("belief", "mean")
 ARMS = {
-    "last reading": Arm(("seen",)),
-    "four readings": Arm(("seen",), stack=4),
-    "LSTM": Arm(("seen",), memory="lstm"),
-    "GRU": Arm(("seen",), memory="gru"),
-    "belief mean": Arm((MEAN,), filter="learned"),
-    "belief mean, spread": Arm((MEAN, VAR), filter="learned"),
-    "ensemble": Arm((ENSEMBLE,), filter="learned"),
-    "belief mean, taught": Arm((MEAN,), filter="taught"),
-    "belief mean, end to end": Arm((MEAN,), filter="learned", end_to_end=True),
-    "Kalman": Arm((MEAN,), filter="exact"),
-    "physics": Arm((MEAN,), filter="exact"),
-    "truth": Arm(("state",)),
+    "last reading": Arm("seen"),
+    "four readings": Arm("seen", stack=4),
+    "LSTM": Arm("seen", memory=True),
+    "belief mean": Arm(MEAN, filter="learned"),
+    "belief mean, taught": Arm(MEAN, filter="taught"),
+    "belief mean, end to end": Arm(MEAN, filter="learned", end_to_end=True),
+    "Kalman": Arm(MEAN, filter="exact"),
+    "physics": Arm(MEAN, filter="exact"),
+    "truth": Arm("state"),
 }
 
 
@@ -65,8 +64,49 @@ class Inputs:
     limit: float
 
 
-def memory(kind: str, width: int, name: str) -> TensorDictModuleBase:
-    """An LSTM or a GRU of torchrl's on what is seen."""
-    states = [f"{name}_hidden", f"{name}_cell"][: 2 if kind == "lstm" else 1]
+def memory(width: int, name: str) -> LSTMModule:
+    """An LSTM of torchrl's on what is seen."""
+    states = [f"{name}_hidden", f"{name}_cell"]
     keys = {"in_keys": ["seen", *states], "out_keys": [f"{name}_memory", *(("next", key) for key in states)]}
-    return {"lstm": LSTMModule, "gru": GRUModule}[kind](input_size=width, hidden_size=MEMORY, **keys)
+    return LSTMModule(input_size=width, hidden_size=MEMORY, **keys)
+
+
+def reader(arm: Arm, inputs: Inputs, name: str) -> tuple[list[LSTMModule], NestedKey, int, Tensor | None]:
+    """What stands before the layers of an actor or a critic; the entry that these read, its width, and its units."""
+    if arm.memory:
+        return [memory(inputs.seen, name)], f"{name}_memory", MEMORY, None
+    if arm.key == "seen":
+        return [], "stack" if arm.stack > 1 else "seen", arm.stack * inputs.seen, None
+    return [], arm.key, len(inputs.scale), inputs.scale
+
+
+class Seen(Transform):
+    """Writes ``"seen"`` ``[*B, O + 1 + A]``: the last reading that came, whether it came now, and the last action.
+
+    All that a filter reads in a step, without NaN.
+
+    Args:
+        scale: what a reading is divided by, a number or ``[O]``.
+    """
+
+    def __init__(self, scale: Tensor | float = 1.0):
+        super().__init__(in_keys=["observation", "observed"], out_keys=["seen"])
+        self.scale = scale
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        before = tensordict["seen"][..., : next_tensordict["observation"].shape[-1]]
+        return self._write(next_tensordict, before, tensordict["action"])
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        reading, action = tensordict_reset["observation"], self.parent.full_action_spec["action"].zero()
+        return self._write(tensordict_reset, torch.zeros_like(reading), action)
+
+    def _write(self, tensordict: TensorDictBase, before: Tensor, action: Tensor) -> TensorDictBase:
+        observed = tensordict["observed"]
+        reading = torch.where(observed, tensordict["observation"] / self.scale, before)
+        return tensordict.set("seen", torch.cat([reading, observed.to(reading.dtype), action], -1))
+
+    def transform_observation_spec(self, observation_spec):
+        reading, action = observation_spec["observation"].shape, self.parent.full_action_spec["action"].shape
+        observation_spec["seen"] = Unbounded((*reading[:-1], reading[-1] + 1 + action[-1]))
+        return observation_spec

@@ -17,7 +17,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from benchmarks.control.arms import ENSEMBLE, MEMORY, Arm, Inputs, memory
+from benchmarks.control.arms import Arm, Inputs, reader
 from torch_denkf.filters import Filter
 
 WIDTH = 64
@@ -38,39 +38,32 @@ class Settings:
 
 
 class Head(nn.Module):
-    """Two hidden layers on one or two entries in units of ``scale``; of an ensemble, on its members' mean features."""
+    """Two hidden layers on an entry in units of ``scale``."""
 
-    def __init__(self, width: int, outputs: int, scale: Tensor | None = None, kind: str = "vector"):
+    def __init__(self, width: int, outputs: int, scale: Tensor | None = None):
         super().__init__()
-        self.first, self.second, self.last = nn.Linear(width, WIDTH), nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, outputs)
-        self.register_buffer("scale", scale)
-        self.kind = kind
+        layers = nn.Linear(width, WIDTH), nn.Tanh(), nn.Linear(WIDTH, WIDTH), nn.Tanh(), nn.Linear(WIDTH, outputs)
+        self.layers = nn.Sequential(*layers)
+        self.register_buffer("scale", torch.ones(1) if scale is None else scale)
 
-    def forward(self, value: Tensor, variance: Tensor | None = None) -> Tensor:
+    def forward(self, value: Tensor) -> Tensor:
         """Outputs ``[*B, outputs]``."""
-        if self.scale is not None:
-            value = value / self.scale
-            if variance is not None:
-                value = torch.cat([value, variance.sqrt() / self.scale], -1)
-        hidden = self.first(value).tanh()
-        if self.kind == "ensemble":
-            hidden = hidden.mean(-2)
-        return self.last(self.second(hidden).tanh())
+        return self.layers(value / self.scale)
 
 
 class ActorHead(Head):
     """Mean and standard deviation of an action; the latter is the same everywhere."""
 
-    def __init__(self, width: int, outputs: int, scale: Tensor | None = None, kind: str = "vector"):
-        super().__init__(width, outputs, scale, kind)
+    def __init__(self, width: int, outputs: int, scale: Tensor | None = None):
+        super().__init__(width, outputs, scale)
         self.log_std = nn.Parameter(torch.zeros(outputs))
         with torch.no_grad():
-            self.last.weight.mul_(0.01)
-            self.last.bias.zero_()
+            self.layers[-1].weight.mul_(0.01)
+            self.layers[-1].bias.zero_()
 
-    def forward(self, value: Tensor, variance: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """Two times ``[*B, A]``."""
-        mean = super().forward(value, variance)
+        mean = super().forward(value)
         return mean, self.log_std.exp().expand_as(mean)
 
 
@@ -83,17 +76,9 @@ def networks(arm: Arm, inputs: Inputs) -> tuple[TensorDictModuleBase, TensorDict
     """
     parts = []
     for name, Module, outputs in (("actor", ActorHead, inputs.actions), ("critic", Head, 1)):
-        if arm.memory:
-            module = Module(MEMORY, outputs)
-            keys, before = [f"{name}_memory"], [memory(arm.memory, inputs.seen, name)]
-        else:
-            states = arm.keys[0] != "seen"
-            width = len(arm.keys) * len(inputs.scale) if states else arm.stack * inputs.seen
-            kind = "ensemble" if ENSEMBLE in arm.keys else "vector"
-            module = Module(width, outputs, inputs.scale if states else None, kind)
-            keys, before = ["stack" if arm.stack > 1 else arm.keys[0], *arm.keys[1:]], []
-        parts.append((module, keys, before))
-    (actor, actor_keys, actor_before), (critic, critic_keys, critic_before) = parts
+        before, key, width, scale = reader(arm, inputs, name)
+        parts += [before, Module(width, outputs, scale), [key]]
+    actor_before, actor, actor_keys, critic_before, critic, critic_keys = parts
     head = TensorDictModule(actor, actor_keys, ["loc", "scale"])
     policy = ProbabilisticActor(
         TensorDictSequential(*actor_before, head),

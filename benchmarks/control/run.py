@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,13 +15,32 @@ from torchrl.envs import CatFrames, EnvBase, ExplorationType, InitTracker, Trans
 from torchrl.modules import get_primers_from_module
 
 from benchmarks.control import ppo, sac
-from benchmarks.control.arms import ARMS, ENSEMBLE, Arm, Inputs
-from benchmarks.control.inputs import Seen
+from benchmarks.control.arms import ARMS, Arm, Inputs, Seen
 from benchmarks.control.learning import Learner, refiltered
-from benchmarks.control.shift import LEFT, SHIFTED, told
 from benchmarks.control.tasks import RATES, TASKS, Task
 from torch_denkf.filters import Filter
 from torch_denkf.transforms import DEnKFTransform
+
+NOT_TRAINED = "not trained"
+SHIFTED = f"{{}}, {NOT_TRAINED}"
+LEFT = f"{SHIFTED}, R as learned"
+
+
+@contextmanager
+def told(filter: Filter | None, noise: float) -> Iterator[None]:
+    """Sets R of a filter, which nothing else is told, to the square of ``noise`` for a while."""
+    if filter is None:
+        yield
+        return
+    log_variance = filter["noise"].log_variance
+    learned = log_variance.detach().clone()
+    with torch.no_grad():
+        log_variance.fill_(2 * math.log(noise))
+    try:
+        yield
+    finally:
+        with torch.no_grad():
+            log_variance.copy_(learned)
 
 
 @dataclass(frozen=True)
@@ -26,7 +48,6 @@ class Budget:
     """What all arms of all tasks may use.
 
     Attributes:
-        rate: factor on the task's learning rate of PPO; ``None`` for what the search chose for the arm.
         env_steps: in the place of the task's; ``None`` for those.
         tests: in a run, evenly spaced.
         episodes: of a test.
@@ -35,7 +56,6 @@ class Budget:
         every: environment steps for each update of SAC, in the place of the task's; ``None`` for those.
     """
 
-    rate: float | None = None
     env_steps: int | None = None
     tests: int = 5
     episodes: int = 100
@@ -60,16 +80,6 @@ def shifted_names(task: Task, cell: tuple[float, float]) -> list[str]:
     return [text.format(cell_name((task.shift, cell[1]))) for text in (SHIFTED, LEFT)]
 
 
-def planned_tests(task_name: str, cell: tuple[float, float], arm_name: str, budget: Budget) -> list[tuple[str, int]]:
-    """Of each row of a run the cell's name, and the environment steps."""
-    task = TASKS[task_name]
-    batches, tested = batches_of(task, budget)
-    rows = [(cell_name(cell), number) for number in tested]
-    after = shifted_names(task, cell)[: 2 if ARMS[arm_name].filter else 1]
-    rows += [(name, batches) for name in after]
-    return [(name, number * task.count * task.steps) for name, number in rows]
-
-
 def rollout(env: EnvBase, policy: TensorDictModuleBase | None, steps: int, kind: ExplorationType) -> TensorDict:
     """Whole episodes ``[B, T]``."""
     with torch.no_grad(), set_exploration_type(kind):
@@ -89,8 +99,8 @@ def make_env(task: Task, arm: Arm, count: int, cell: tuple[float, float], seed: 
     """
     env = TransformedEnv(task.world(count, *cell, seed), InitTracker())
     if filter is not None:
-        env.append_transform(DEnKFTransform(filter, store_ensemble=ENSEMBLE in arm.keys or arm.end_to_end))
-    if "seen" in arm.keys:
+        env.append_transform(DEnKFTransform(filter, store_ensemble=arm.end_to_end))
+    if arm.key == "seen":
         env.append_transform(Seen(torch.tensor(task.scale[: env.observation_spec["observation"].shape[-1]])))
     if arm.stack > 1:
         env.append_transform(CatFrames(arm.stack, dim=-1, in_keys=["seen"], out_keys=["stack"]))
@@ -112,14 +122,13 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
         learner = Learner(filter, task.prior, batches * task.count, task.learning, arm.filter == "taught")
     env = make_env(task, arm, task.count, cell, 2 * seed, filter)
     tests = make_env(task, arm, budget.episodes, cell, 2 * seed + 1, filter)
-    seen = env.observation_spec["seen"].shape[-1] if "seen" in arm.keys else 0
+    seen = env.observation_spec["seen"].shape[-1] if arm.key == "seen" else 0
     actions = env.full_action_spec["action"].shape[-1]
     settings = task.settings
     if isinstance(settings, sac.Settings):
         settings = replace(settings, every=budget.every or settings.every)
     elif isinstance(settings, ppo.Settings):
-        rate = RATES.get((task_name, arm_name), 1.0) if budget.rate is None else budget.rate
-        settings = replace(settings, lr=rate * settings.lr)
+        settings = replace(settings, lr=RATES.get((task_name, arm_name), 1.0) * settings.lr)
     inputs = Inputs(seen, actions, torch.tensor(task.scale), task.limit)
     within = {"filter": filter} if arm.end_to_end else {}
     agent = task.agent(arm, inputs, settings, batches, **within)

@@ -12,7 +12,7 @@ from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator, set_recurrent_mode
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from benchmarks.control.arms import MEMORY, Arm, Inputs, memory
+from benchmarks.control.arms import Arm, Inputs, reader
 from benchmarks.control.learning import refiltered
 from torch_denkf.filters import Filter
 
@@ -31,34 +31,23 @@ class Settings:
     target: float = 0.995  # that stays of the target networks in an update
 
 
-class Units(nn.Module):
-    """Mean and variance of a belief, or a state, in units of ``scale``; of a variance the root."""
+class Scaled(nn.Module):
+    """Two hidden layers on an entry in units of ``scale``, and on the action behind it, if there is one."""
 
-    def __init__(self, scale: Tensor):
+    def __init__(self, width: int, outputs: int, units: int, scale: Tensor | None):
         super().__init__()
-        self.register_buffer("scale", scale)
+        self.layers = MLP(width, outputs, num_cells=[units, units], activation_class=nn.ReLU)
+        self.register_buffer("scale", torch.ones(1) if scale is None else scale)
 
-    def forward(self, value: Tensor, variance: Tensor | None = None) -> Tensor:
-        """Features ``[*B, S]`` or ``[*B, 2 S]``."""
-        value = value / self.scale
-        return value if variance is None else torch.cat([value, variance.sqrt() / self.scale], -1)
-
-
-def _reader(arm: Arm, inputs: Inputs, name: str) -> tuple[list[TensorDictModuleBase], NestedKey, int]:
-    """What stands before the layers of an actor or a critic; the entry that these read, and its width."""
-    if arm.memory:
-        return [memory(arm.memory, inputs.seen, name)], f"{name}_memory", MEMORY
-    if arm.keys[0] == "seen":
-        return [], "stack" if arm.stack > 1 else "seen", arm.stack * inputs.seen
-    key = f"{name}_input"
-    return [TensorDictModule(Units(inputs.scale), list(arm.keys), [key])], key, len(arm.keys) * len(inputs.scale)
+    def forward(self, value: Tensor, *action: Tensor) -> Tensor:
+        """Outputs ``[*B, outputs]``."""
+        return self.layers(torch.cat([value / self.scale, *action], -1))
 
 
 def networks(arm: Arm, inputs: Inputs, units: int) -> tuple[TensorDictModuleBase, TensorDictModuleBase]:
-    """Actor, which writes ``"action"``, and critic, which reads it; both have two hidden layers."""
-    size = {"num_cells": [units, units], "activation_class": nn.ReLU}
-    before, key, width = _reader(arm, inputs, "actor")
-    head = nn.Sequential(MLP(width, 2 * inputs.actions, **size), NormalParamExtractor(scale_lb=1e-3))
+    """Actor, which writes ``"action"``, and critic, which reads it."""
+    before, key, width, scale = reader(arm, inputs, "actor")
+    head = nn.Sequential(Scaled(width, 2 * inputs.actions, units, scale), NormalParamExtractor(scale_lb=1e-3))
     actor = ProbabilisticActor(
         TensorDictSequential(*before, TensorDictModule(head, [key], ["loc", "scale"])),
         in_keys=["loc", "scale"],
@@ -66,8 +55,8 @@ def networks(arm: Arm, inputs: Inputs, units: int) -> tuple[TensorDictModuleBase
         distribution_kwargs={"low": -inputs.limit, "high": inputs.limit},
         return_log_prob=False,
     )
-    before, key, width = _reader(arm, inputs, "critic")
-    value = ValueOperator(MLP(width + inputs.actions, 1, **size), in_keys=[key, "action"])
+    before, key, width, scale = reader(arm, inputs, "critic")
+    value = ValueOperator(Scaled(width + inputs.actions, 1, units, scale), in_keys=[key, "action"])
     return actor, TensorDictSequential(*before, value)
 
 

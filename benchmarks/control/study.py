@@ -8,15 +8,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import pandas as pd
+
 from benchmarks.common.arguments import parse, some_of
 from benchmarks.common.jobs import once, read_rows, side_by_side
-from benchmarks.common.tables import write_page
-from benchmarks.control.page import COLUMNS, draw, page
-from benchmarks.control.run import Budget, cell_name, planned_tests, run, shifted_names
+from benchmarks.common.tables import write_page, write_table
+from benchmarks.control.page import draw, page
+from benchmarks.control.run import Budget, cell_name, run, shifted_names
 from benchmarks.control.tasks import TASKS
 
-BELIEFS = ("belief mean", "belief mean, spread", "ensemble")
-MEMORIES = ("last reading", "four readings", "LSTM", "GRU")
+SEEING = ("last reading", "four readings", "LSTM")
 CELLS = {  # noise of readings, and missing share; those that say most come first
     "hike": [(noise, 0.0) for noise in (0.4, 0.0, 0.8, 0.2, 0.1)],
     "pendulum": [(0.2, 0.3), (0.0, 0.0), (0.2, 0.0), (0.2, 0.6), (0.3, 0.0), (0.1, 0.0)],
@@ -24,15 +25,15 @@ CELLS = {  # noise of readings, and missing share; those that say most come firs
     "cartpole-full": [(0.1, 0.0)],
 }
 READERS = {
-    "hike": ("Kalman", *BELIEFS, *MEMORIES),
-    "pendulum": (*BELIEFS, "belief mean, taught", "belief mean, end to end", *MEMORIES),
+    "hike": ("Kalman", "belief mean", *SEEING),
+    "pendulum": ("belief mean", "belief mean, taught", "belief mean, end to end", *SEEING),
     "cartpole": ("belief mean", "LSTM", "physics"),
     "cartpole-full": ("belief mean", "LSTM", "physics", "last reading"),
 }  # in the order in which they run; what reads the truth is the same in all cells, and runs in that of the least noise
 FEW = ("Kalman", "physics", "belief mean", "LSTM", "last reading", "truth")  # in all cells
 MORE_CELLS = 2  # the others run in a task's first cells,
 ONCE = ("belief mean, end to end",)  # and these, which take long, in its first cell
-SEEDS = range(100)  # that the tables know; the search has others
+SEEDS = range(100)  # that the tables know
 
 
 @dataclass(frozen=True)
@@ -71,38 +72,18 @@ def jobs(study: Study, seed: int, budget: Budget) -> Iterator[partial]:
                 yield partial(once, part(study, task, cell, arm, seed), partial(run, task, cell, arm, seed, budget))
 
 
-def keep(study: Study, table: Path, budget: Budget) -> None:
-    """Leaves the rows of a table where their runs would have left them; what has run is not overwritten.
-
-    Raises:
-        SystemExit: if the rows are not those of whole runs of this study; names the run.
-    """
-    try:
-        rows = COLUMNS.read(table)
-    except (OSError, ValueError) as error:
-        raise SystemExit(f"--known {table} is no table of this study: {error}") from error
-    if not rows:
-        raise SystemExit(f"--known {table} holds no rows.")
-    runs: dict[tuple, list[dict]] = {}
-    for row in rows:
-        if set(row) != set(COLUMNS.names):
-            raise SystemExit(f"--known {table}: something is missing in the row {row}.")
-        runs.setdefault((row["task"], _trained(row["task"], row["cell"]), row["arm"], row["seed"]), []).append(row)
-    for (task, cell, arm, seed), found in runs.items():
-        run = f"--known {table}: {task}, {found[0]['cell']}, {arm}, seed {seed}"
-        if cell is None or arm not in arms_of(task, cell) or seed not in SEEDS:
-            raise SystemExit(f"{run} is no run of this study: see CELLS and READERS in benchmarks/control/study.py.")
-        if sorted((row["cell"], row["env_steps"]) for row in found) != sorted(planned_tests(task, cell, arm, budget)):
-            raise SystemExit(f"{run} is not whole, or is there twice: its tests are not those of a run. Leave it out.")
-        once(part(study, task, cell, arm, seed), partial(list, found))
-
-
-def _trained(task: str, name: str) -> tuple[float, float] | None:
-    """The cell that a row's run was trained in: its own, or another if its readings got noisier afterwards."""
-    for cell in CELLS.get(task, []):
-        if name in (cell_name(cell), *shifted_names(TASKS[task], cell)):
-            return cell
-    return None
+def keep(study: Study, table: Path) -> None:
+    """Leaves the rows of a table where their runs would have left them; what has run is not overwritten."""
+    rows = pd.read_csv(table)
+    trained = {
+        (task, name): cell
+        for task, cells in CELLS.items()
+        for cell in cells
+        for name in (cell_name(cell), *shifted_names(TASKS[task], cell))
+    }
+    cells = rows[["task", "cell"]].apply(lambda row: trained[tuple(row)], axis=1)
+    for (task, cell, arm, seed), found in rows.groupby([rows["task"], cells, rows["arm"], rows["seed"]]):
+        once(part(study, task, cell, arm, seed), partial(found.to_dict, "records"))
 
 
 def complete(study: Study) -> list[dict]:
@@ -117,31 +98,28 @@ def complete(study: Study) -> list[dict]:
                 if 0 < len(absent) < len(found):
                     where = f"{task}, {cell_name(cell)}, seed {seed}"
                     print(f"Left out of the tables: {where}. Not run: {', '.join(absent)}.")
-    return sorted(read_rows(files), key=COLUMNS.order)
+    return read_rows(files)
 
 
 def main() -> None:
     """Runs the study; one that was broken off goes on."""
     study, budget = parse(Study), Budget()
-    if study.smoke and study.known is not None:
-        raise SystemExit("--smoke makes runs of its own and knows of no others: leave --known out.")
     if study.smoke:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="control-")), seeds=1, cells=1)
         budget = Budget(env_steps=2 * 16 * 200, tests=1, episodes=2, members=4, updates=0.02, every=200)
         for task in ("hike", "pendulum"):
-            CELLS[task], READERS[task] = [(0.0, 0.0)], ("four readings", "LSTM", "ensemble")
-        READERS["cartpole"] = ("four readings", "LSTM", "belief mean, spread", "physics")
+            CELLS[task], READERS[task] = [(0.0, 0.0)], ("four readings", "LSTM", "belief mean")
+        READERS["cartpole"] = ("four readings", "LSTM", "belief mean", "physics")
         READERS["cartpole-full"] = ("last reading", "belief mean")
     if study.known is not None:
-        keep(study, study.known, budget)
+        keep(study, study.known)
     todo = [job for seed in range(study.seeds) for job in jobs(study, seed, budget)]
     side_by_side(todo, study.processes, "runs")
     rows = complete(study)
     if not rows:
         raise SystemExit(f"{study.out} holds no cell of which all arms have run.")
-    COLUMNS.write(rows, study.out / "control.csv")
-    rows = COLUMNS.read(study.out / "control.csv")  # the page says what its table says, to the last digit
-    draw(rows, study.out / "control.png")
-    write_page(page(rows, budget), study.out / "control.md")
+    table = write_table(rows, study.out / "control.csv", ("task", "cell", "arm", "seed", "env_steps"))
+    draw(table, study.out / "control.png")
+    write_page(page(table, budget), study.out / "control.md")
     if study.smoke:
         print("A smoke run: it ran, and its figures say nothing.")

@@ -11,6 +11,7 @@ from torch_denkf.envs import SaltAndPepper
 BOX = 0.3  # side of a box over the hand, in widths of the picture
 SHIFT = 10 / 320  # of a camera that was pushed, in widths of the picture
 DARK = 0.45  # share of the light that is left
+PICTURES = ("clean", "salt_and_pepper", "box", "shifted", "dark")  # conditions that change pictures
 MARGIN = (0.16, 0.3)  # between the hand's middle and another episode's table, in widths of the picture
 
 
@@ -87,3 +88,30 @@ def disturb(pixels: Tensor, place: Tensor, generator: torch.Generator) -> tuple[
     some = TensorDict({"pixels": frames[salted]}, batch_size=[len(salted)])
     frames[salted] = SaltAndPepper(generator=generator)(some)["pixels"]
     return frames, moved
+
+
+def failing(pixels: Tensor, place: Tensor, condition: str, draw: Tensor, exact: bool) -> Tensor:
+    """Pictures of a failing camera.
+
+    Args:
+        pixels: ``[N, 3, H, W]`` in [0, 1].
+        place: of the hand, ``[N, 2]``.
+        condition: one of :data:`PICTURES`.
+        draw: four numbers in [0, 1) that say how it fails in this episode.
+        exact: as in the tests, instead of by the draw: box and light as large as there, a shift of 10 px of 320.
+    """
+    first, second, third, fourth = draw.tolist()
+    if condition == "salt_and_pepper":
+        generator = torch.Generator().manual_seed(int(first * 2**31))
+        fraction = {} if exact else {"fraction": 0.04 * second}
+        return SaltAndPepper(generator=generator, **fraction)(TensorDict({"pixels": pixels}, [len(pixels)]))["pixels"]
+    if condition == "box":
+        off = torch.tensor([second - 0.5, third - 0.5]) * 0.3
+        return boxed(pixels, place) if exact else boxed(pixels, place + off, BOX * (0.7 + 0.8 * first))
+    if condition == "shifted":
+        reach = SHIFT * pixels.shape[-1] * (1 if exact else 1.4 * first)
+        down = round(reach * (second - 0.5)) if not exact else 0
+        return shifted(pixels, round(reach if third < 0.5 else -reach), down)
+    if condition == "dark":
+        return pixels * (DARK if exact else 0.3 + 0.6 * fourth)
+    return pixels

@@ -15,8 +15,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.common.arguments import made_by, parse
+from benchmarks.common.arm import JOINTS
 from benchmarks.common.tables import head, line, write_page
-from benchmarks.g1.recordings import ARM, JOINTS
+from benchmarks.g1.recordings import ARM
 from torch_denkf import DEnKF
 from torch_denkf.data.episodes import hashed_share
 from torch_denkf.data.lerobot.replay import is_for_tests
@@ -40,7 +41,6 @@ class Later:
     page: Path | None = None  # where to leave the table
     rows: tuple[int, ...] = (3, 6, 12)  # how far to look ahead, in rows of 1/30 s
     chosen: int = 6  # rows ahead at which the factor is chosen
-    late: int = 0  # rows by which encoders of one more filter come late, which takes much longer; 0 for none
 
 
 def episodes(root: Path) -> dict[str, TensorDict]:
@@ -89,7 +89,7 @@ class Motion:
         left = after - read @ weight
         return cls(weight.mT, left.mT @ left / len(left), center)
 
-    def filter(self, kind: str, factor: float, late: int = 0) -> Filter:
+    def filter(self, kind: str, factor: float) -> Filter:
         """A filter of joints and those of the row before; ``kind`` is ``"EKF"`` or ``"DEnKF"``."""
         passed = torch.eye(JOINTS, 2 * JOINTS)
         matrix = torch.cat([self.weight[:, : 2 * JOINTS], passed])
@@ -99,7 +99,7 @@ class Motion:
             noise = torch.zeros(2 * JOINTS, 2 * JOINTS)
             noise[:JOINTS, :JOINTS] = factor**2 * self.noise
             start = MomentPrior(torch.zeros(2 * JOINTS), torch.eye(2 * JOINTS))
-            sensors = {"encoders": FusedSensor(reads, [ENCODER] * JOINTS, delay=late)}
+            sensors = {"encoders": FusedSensor(reads, [ENCODER] * JOINTS)}
             return FusedFilter(LinearTransition(matrix, noise, control=control), sensors, initial=start)
         std = factor * self.noise.diagonal().sqrt()
         both = torch.cat([matrix, control], -1).mT
@@ -113,20 +113,19 @@ class Motion:
             observation_key="encoders",
         )
 
-    def centered(self, data: TensorDict, ahead: int, late: int) -> TensorDict:
+    def centered(self, data: TensorDict, ahead: int) -> TensorDict:
         """Returns what a filter reads, with the commands under way; those of the last rows are missing."""
         drive = TensorDict({key: data[key] - self.center for key in ("encoders", "action")}, data.batch_size)
-        drive["encoders"] = drive["encoders"].roll(late, 1)
         waiting = [drive["action"].roll(-k, 1) for k in range(ahead)]
         return drive.set(("under_way", "action"), torch.stack(waiting, 2))
 
 
-def looked(motion: Motion, data: TensorDict, kind: str, factor: float, steps: int, late: int) -> TensorDict:
+def looked(motion: Motion, data: TensorDict, kind: str, factor: float, steps: int) -> TensorDict:
     """The belief now, and those of the next rows ``[B, T, steps, 14]``."""
-    filter = motion.filter(kind, factor, late)
+    filter = motion.filter(kind, factor)
     ahead = BeliefAhead(filter, steps, each=True, keep=[("belief", "mean"), ("belief", "var")])
     with torch.no_grad():
-        return ahead(filter.sequence(motion.centered(data, steps, late), keep=filter.belief_keys))
+        return ahead(filter.sequence(motion.centered(data, steps), keep=filter.belief_keys))
 
 
 def scores(motion: Motion, data: TensorDict, out: TensorDict, ahead: int) -> tuple[float, ...]:
@@ -150,20 +149,18 @@ def main() -> None:
     motion = Motion.fitted(data["train"])
     counts = ", ".join(f"{len(part)} {role}" for role, part in data.items())
     lines = [f"Episodes: {counts}. Errors in degrees, over the seven joints; encoders with 0.1 degrees of noise.", ""]
-    lines += head("ahead, s", "encoders late, s", "filter", "last belief", "ahead", "ratio", "within 90 %", "factor")
-    most = max(study.rows)
-    for kind, late in (("EKF", 0), ("DEnKF", 0), *([("EKF", study.late)] if study.late else [])):
+    lines += head("ahead, s", "filter", "last belief", "ahead", "ratio", "within 90 %", "factor")
+    for kind in ("EKF", "DEnKF"):
         held = {}
         for factor in FACTORS:
-            out = looked(motion, data["validation"], kind, factor, most, late)
+            out = looked(motion, data["validation"], kind, factor, study.chosen)
             held[factor] = abs(scores(motion, data["validation"], out, study.chosen)[2] - 0.9)
         factor = min(held, key=held.__getitem__)
-        out = looked(motion, data["test"], kind, factor, most, late)
+        out = looked(motion, data["test"], kind, factor, max(study.rows))
         for ahead in study.rows:
             now, later, inside = scores(motion, data["test"], out, ahead)
-            times = f"{ahead / RATE:.1f}", f"{late / RATE:.1f}"
             cells = f"{now:.2f}", f"{later:.2f}", f"{later / now:.2f}", f"{100 * inside:.0f} %", factor
-            lines.append(line(*times, kind, *cells))
+            lines.append(line(f"{ahead / RATE:.1f}", kind, *cells))
             print(lines[-1], flush=True)
     write_page("\n".join([*lines, "", *made_by("g1.later"), ""]), study.page)
 

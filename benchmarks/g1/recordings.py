@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,17 +10,17 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torch_denkf.data import LeRobotReplay, lag_errors
+from benchmarks.common.arm import Roles
+from torch_denkf.data import LeRobotReplay
 from torch_denkf.data.episodes import hashed_share
 from torch_denkf.data.lerobot.recording import DecodedRecording
 from torch_denkf.data.lerobot.replay import is_for_tests
 from torch_denkf.data.lerobot.rows import recording_from_rows
 
 ARM, HAND = range(7, 14), range(20, 26)  # numbers of the robot's 26: the right arm, rad, and the right hand, 0 to 1
-JOINTS, FINGERS = len(ARM), len(HAND)
-READ = JOINTS + FINGERS  # numbers that a sensor reads: arm, then hand
+FINGERS = len(HAND)
+READ = len(ARM) + FINGERS  # numbers that a sensor reads: arm, then hand
 NAMES = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
-LAGS = range(-8, 11)  # rows that are tried
 
 
 @dataclass(frozen=True)
@@ -36,32 +35,10 @@ class Recordings:
     drawn: bool = False  # a drawn robot instead of the folder
 
     @cached_property
-    def _source(self) -> Path | DecodedRecording:
-        return drawn_recording(self.size) if self.drawn else self.root
-
-    def open(self, lag: int = 0) -> LeRobotReplay:
-        """All episodes, with repeats masked."""
-        return LeRobotReplay(
-            self._source, size=self.size, split="all", repeats="mask", lag=lag, cache=self.out / "cache"
-        )
-
-    @cached_property
-    def lag(self) -> int:
-        """Rows by which the states are later than the pictures, from the episodes that are not tested on."""
-        file = self.out / "lag.json"
-        if not file.exists():
-            data = LeRobotReplay(
-                self._source, size=self.size, split="train", repeats="mask", cache=self.out / "cache", progress=False
-            )
-            errors = lag_errors(data, LAGS, dims=ARM)
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(json.dumps({"lag": min(errors, key=errors.__getitem__), "errors": errors}, indent=1))
-        return int(json.loads(file.read_text())["lag"])
-
-    @cached_property
     def data(self) -> LeRobotReplay:
-        """All episodes, with repeats masked and the lag taken out."""
-        return self.open(self.lag)
+        """All episodes, with repeats masked."""
+        source = drawn_recording(self.size) if self.drawn else self.root
+        return LeRobotReplay(source, size=self.size, split="all", repeats="mask", cache=self.out / "cache")
 
     def roles(self, seed: int) -> Roles:
         """Who trains, tunes and validates with a seed; tested are always the same."""
@@ -72,24 +49,6 @@ class Recordings:
         return Roles(
             sorted(drawn[held:]), sorted(drawn[self.validation : held]), sorted(drawn[: self.validation]), sorted(tests)
         )
-
-
-@dataclass(frozen=True)
-class Roles:
-    """Numbers of episodes by what they are for."""
-
-    sensor: list[int]  # train the sensor and the motion
-    tune: list[int]  # train the filters
-    validation: list[int]  # choose
-    test: list[int]
-
-    def __post_init__(self):
-        everyone = [*self.sensor, *self.tune, *self.validation, *self.test]
-        if len(set(everyone)) < len(everyone):
-            raise ValueError(f"episodes with two roles: {sorted({e for e in everyone if everyone.count(e) > 1})}")
-        for name in ("sensor", "tune", "validation", "test"):
-            if not getattr(self, name):
-                raise ValueError(f"no episodes are left for {name!r}; record more, or ask for less tune and validation")
 
 
 def rows_of(data: LeRobotReplay, numbers: list[int]) -> Tensor:

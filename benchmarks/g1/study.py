@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property, partial
-from pathlib import Path
+from functools import cache, cached_property, partial
 from typing import Literal
 
 import torch
@@ -13,27 +12,33 @@ from torch import Tensor
 from tyro.conf import OmitArgPrefixes, Positional
 
 from benchmarks.common.arguments import some_of
-from benchmarks.common.jobs import once, read_rows
+from benchmarks.common.arm import JOINTS, scores
+from benchmarks.common.arm.motion import train_motion, with_rates
+from benchmarks.common.arm.readings import Windows, fail, read_all
+from benchmarks.common.jobs import once
 from benchmarks.g1.base import SensorBudget, TrainedSensor
-from benchmarks.g1.baselines import Baselines
-from benchmarks.g1.evaluation import baseline_rows, filter_rows, save_beliefs
-from benchmarks.g1.motion import Motion, train_motion
-from benchmarks.g1.readings import (
-    CONDITIONS,
-    PICTURES,
-    Windows,
-    black_readings,
-    fail,
-    read_codes,
-    standardised,
-    with_readings,
-)
-from benchmarks.g1.recipes import FILTERS, G1Recipe
-from benchmarks.g1.recipes._base import MEMBERS
-from benchmarks.g1.recordings import ARM, JOINTS, Recordings, rows_of
-from benchmarks.g1.sensors import encoding_size
-from benchmarks.g1.training import FilterBudget, filter_error, train_filter
+from benchmarks.g1.baselines import SensorSpread, baselines
+from benchmarks.g1.disturbances import PICTURES
+from benchmarks.g1.motion import AHEAD, Motion, delayed
+from benchmarks.g1.recipes import FILTERS, MEMBERS, G1Recipe
+from benchmarks.g1.recordings import NAMES, Recordings
 from torch_denkf.filters import Filter
+
+CONDITIONS = ("clean", "black20", "missing", *PICTURES[1:])
+SHARES = (0.5, 0.08, 0.22, 0.12, 0.08)  # of the windows that filters learn from, by PICTURES
+INFLATIONS = (0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1)
+score_row = partial(scores.score_row, names=NAMES, unit=torch.full((JOINTS,), torch.pi / 180))
+
+
+@dataclass(frozen=True)
+class FilterBudget:
+    """Updates of each stage; the filter's windows."""
+
+    motion: int = 1500  # updates of the motion on true states
+    spread: int = 600  # updates of the sensor's variance
+    filter: int = 45  # updates of a filter on readings
+    length: int = 64  # rows of the filter's windows
+    batch: int = 8  # windows an update
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,7 @@ class Study(Recordings):
     """A real arm that its head camera watches: seven joints, with every filter that is registered.
 
     table: estimate the lag, train sensors and filters, test. diagnosis: how the trained sensors err. pictures: plots
-    and videos of what a table left in --out. What was broken off goes on where it stopped. See benchmarks/g1/README.md.
+    of what a table left in --out. What was broken off goes on where it stopped. See benchmarks/g1/README.md.
     """
 
     command: Positional[Literal["table", "diagnosis", "pictures"]] = "table"
@@ -62,33 +67,20 @@ class Base:
 
     def __init__(self, study: Study, sensor: TrainedSensor):
         self.study, self.trained = study, sensor
-        self.name = f"arm-{sensor.name}"
-        self._motions: dict[bool, Motion] = {}
-
-    @cached_property
-    def sequences(self) -> list[tuple[Tensor, Tensor]]:
-        """True states and commands of the sensor's and the filters' training episodes."""
-        data, roles = self.study.data, self.trained.roles
-        command = data.storage[:]["action"][:, list(ARM)]
-        rows = [rows_of(data, [number]) for number in (*roles.sensor, *roles.tune)]
-        return [(self.trained.target[at][:, :JOINTS], command[at]) for at in rows]
-
-    @property
-    def start(self) -> Tensor:
-        """Returns where the training episodes begin, ``[N, D]``."""
-        return torch.stack([state[0] for state, _ in self.sequences])
+        self.name, self.sequences = f"arm-{sensor.name}", sensor.sequences()
+        self.starts = torch.stack([state[0] for state, _ in self.sequences])  # of episodes, [N, D]
+        self.motion = cache(self._motion)
 
     def _pictures(self, role: str) -> dict[str, TensorDict]:
         """Returns what the sensor reads of the episodes of a role in all pictures; encodings as they are."""
-        trained, study = self.trained, self.study
-        sensors, _ = trained.trained
-        numbers, out = getattr(trained.roles, role), {}
+        out = {}
         for condition in PICTURES:
-            file = study.out / "codes" / f"{trained.name}-{role}-{condition}.pt"
-            exact = role == "test"
-            hand = None if file.exists() else trained.hand
-            codes = read_codes(sensors, study.data, hand, numbers, condition=condition, exact=exact, file=file)
-            out[condition] = with_readings(sensors, codes, MEMBERS, self.start.mean(0))
+            readings = read_all(self.trained.trained[0], self.trained.codes(role, condition), MEMBERS)
+            samples, encoding = readings["sensor", "ensemble"], readings["sensor", "encoding"]
+            spread = samples.std(-2).clamp_min(1e-5).log()
+            sensor = {"ensemble": samples[..., :JOINTS].clone(), "encoding": torch.cat([encoding, spread], -1)}
+            readings["sensor"] = TensorDict(sensor, readings.batch_size)
+            out[condition] = readings.set("start", self.starts.mean(0).expand_as(readings["state"]))
         return out
 
     @cached_property
@@ -101,83 +93,62 @@ class Base:
         seen = torch.cat([one["sensor", "encoding"][one["observed"].squeeze(-1)] for one in self._tune.values()])
         return seen.mean(0), seen.std(0).clamp_min(1e-3)
 
-    def _standardised(self, readings: TensorDict) -> TensorDict:
-        sensor = readings["sensor"].copy()
-        sensor["encoding"] = standardised(sensor["encoding"], *self._encoding)
-        return readings.copy().set("sensor", sensor)
-
-    def _readings(self, role: str) -> dict[str, TensorDict]:
-        """Returns what the sensor reads of the episodes of a role, in all conditions."""
-        pictures = self._tune if role == "tune" else self._pictures(role)
-        out = {condition: self._standardised(one) for condition, one in pictures.items()}
-        for condition in set(CONDITIONS) - set(PICTURES):
-            out[condition] = fail(out["clean"], condition, self.black)
-        return {condition: out[condition] for condition in CONDITIONS}
-
-    @cached_property
-    def black(self) -> TensorDict:
-        """The reading of a black frame."""
-        black = black_readings(self.trained.trained[0], MEMBERS)
-        return black.set("encoding", standardised(black["encoding"], *self._encoding))
+    def readings(self, role: str) -> dict[str, TensorDict]:
+        """Returns what the sensor reads of a role's episodes in all conditions, with encodings of variance one."""
+        pictures, (loc, scale), out = self._tune if role == "tune" else self._pictures(role), self._encoding, {}
+        for condition, one in pictures.items():
+            sensor = one["sensor"].copy()
+            sensor["encoding"] = ((sensor["encoding"] - loc) / scale).clamp(-5, 5)
+            out[condition] = one.copy().set("sensor", sensor)
+        return {name: out[name] if name in out else fail(out["clean"], name) for name in CONDITIONS}
 
     @cached_property
     def tune(self) -> dict[str, TensorDict]:
         """Readings that filters are trained on."""
-        return self._readings("tune")
+        return self.readings("tune")
 
     @cached_property
     def validation(self) -> dict[str, TensorDict]:
         """Readings to choose by."""
-        return self._readings("validation")
+        return self.readings("validation")
 
     @cached_property
     def test(self) -> dict[str, TensorDict]:
         """Readings of the test episodes."""
-        return self._readings("test")
+        return self.readings("test")
 
     @cached_property
-    def baselines(self) -> Baselines:
-        """All baselines."""
-        return Baselines([state for state, _ in self.sequences], self.tune, self.validation)
+    def spread(self) -> SensorSpread:
+        """The variance of the sensor's errors."""
+        tune, validation = ([one[name] for name in PICTURES] for one in (self.tune, self.validation))
+        return SensorSpread(tune, validation, self.study.out / "spreads" / self.name, self.study.budget.spread)
 
-    def motion(self, actions: bool) -> Motion:
+    def _motion(self, actions: bool) -> Motion:
         """The motion, trained once on true states."""
-        if actions not in self._motions:
-            seed, study = self.trained.seed, self.study
-            torch.manual_seed(seed)
-            motion = Motion(self.trained.trained[1], actions)
-            out = study.out / "motions" / f"arm{'-actions' * actions}-{seed}"
-            self._motions[actions] = train_motion(
-                motion, self.sequences, out=out, seed=seed, updates=study.budget.motion
-            )
-        return self._motions[actions]
-
-    @cached_property
-    def error(self) -> Tensor:
-        """Root mean square error of the sensor on clean validation episodes, ``[D]``."""
-        clean = self.validation["clean"]
-        at = clean["observed"].squeeze(-1)
-        return (clean["sensor", "ensemble"].mean(-2) - clean["state"])[at].square().mean(0).sqrt().clamp_min(1e-4)
+        seed, study = self.trained.seed, self.study
+        torch.manual_seed(seed)
+        paths = [torch.cat([with_rates(state, 1), delayed(action)], -1) for state, action in self.sequences]
+        out = study.out / "motions" / f"arm{'-actions' * actions}-{seed}"
+        motion = Motion(self.trained.trained[1], actions)
+        return train_motion(motion, paths, AHEAD, out=out, seed=seed, updates=study.budget.motion)
 
     def train(self, name: str) -> tuple[G1Recipe, Filter]:
         """Trains a filter, or reads it."""
-        kind = FILTERS[name]
-        sensors, facts = self.trained.trained
-        encoding = encoding_size(sensors)
-        recipe = kind(
-            facts,
-            self.motion(kind.actions),
-            self.error,
-            self.start.std(0).clamp_min(1e-3),
-            encoding,
-            self.baselines.spread.noise,
-        )
-        windows = Windows(self.tune, self.black, self.study.budget.length)
+        kind, budget, clean = FILTERS[name], self.study.budget, self.validation["clean"]
+        wrong = (clean["sensor", "ensemble"].mean(-2) - clean["state"])[clean["observed"].squeeze(-1)]
+        error, first = wrong.square().mean(0).sqrt().clamp_min(1e-4), self.starts.std(0).clamp_min(1e-3)
+        recipe = kind(self.motion(kind.actions), error, first, self.spread.noise)
+        windows = Windows([self.tune[name] for name in PICTURES], budget.length, SHARES)
+        validation, updates = joined(self.validation), budget.filter * recipe.longer
+        torch.manual_seed(self.trained.seed)
+        model = recipe.build()
+
+        def stages():
+            return [scores.filter_stage(recipe, model, windows, validation, updates, budget.batch, lr=2e-3)]
+
         out = self.study.out / "filters" / f"{name}-{self.name}"
-        model = train_filter(
-            recipe, windows, joined(self.validation), out=out, seed=self.trained.seed, budget=self.study.budget
-        )
-        return recipe, model
+        settings = {"inflations": INFLATIONS, "every": updates // 3, "out": out, "seed": self.trained.seed}
+        return recipe, scores.fit(recipe, model, stages, lambda: validation, **settings)
 
 
 def joined(readings: dict[str, TensorDict]) -> TensorDict:
@@ -195,18 +166,34 @@ def run_all(study: Study) -> None:
 
 
 def _baselines(base: Base, names: dict) -> list[dict]:
-    return baseline_rows(base.baselines, base.test, names)
+    states = [state for state, _ in base.sequences]
+    return [
+        {**names, "filter": name, **score_row(out, condition)}
+        for condition, readings in base.test.items()
+        for name, out in baselines(readings, states, base.spread).items()
+    ]
 
 
 def _filter(base: Base, names: dict) -> list[dict]:
-    _, model = base.train(names["filter"])
-    rows = filter_rows(model, base.test, names)
-    rows[0]["validation_crps"] = filter_error(model, joined(base.validation))["crps"]
+    recipe, model = base.train(names["filter"])
+    rows = scores.filter_rows(recipe, model, base.test, lambda out, condition: {**names, **score_row(out, condition)})
+    validation = scores.run_filter(recipe, model, joined(base.validation))
+    rows[0]["validation_crps"] = score_row(validation, "validation")["crps"]
     if names["filter"] == "denkf":
-        save_beliefs(model, base.test, base.trained.roles.test, f"denkf-{base.name}", base.study.out / "beliefs")
+        scores.save_beliefs(recipe, model, base.test, f"denkf-{base.name}", base.study.out / "beliefs")
     return rows
 
 
-def rows_in(out: Path) -> list[dict]:
-    """All rows that a study's folder holds."""
-    return read_rows(sorted((out / "rows").glob("*.json")))
+def diagnosis(sensor: TrainedSensor) -> str:
+    """Returns how slowly a sensor's errors change, on episodes that train and choose filters: none is tested on."""
+    errors = []
+    for role in ("tune", "validation"):
+        readings = read_all(sensor.trained[0], sensor.codes(role), 64)
+        wrong = readings["sensor", "ensemble"].mean(-2)[..., :JOINTS] - readings["state"]
+        errors += [one[at] for one, at in zip(wrong, readings["valid"].squeeze(-1), strict=True)]
+    parts = []
+    for step in (1, 10, 30):
+        both = sum((error[step:] * error[:-step]).sum() for error in errors)
+        norm = sum((error[step:].square().sum() * error[:-step].square().sum()).sqrt() for error in errors)
+        parts.append(f"{step}: {float(both / norm):.2f}")
+    return f"Sensor `{sensor.name}`: correlation of the errors of all joints after so many rows: {', '.join(parts)}."

@@ -22,7 +22,7 @@ from torch_denkf.deployment.files import write_text
 def smoke(study: Study) -> Study:
     """Everything once, on four small drives that are rendered for it."""
     folder = Path(tempfile.mkdtemp(prefix="kitti-"))
-    names = tuple(write_drives(folder / "kitti", ["a", "b", "c", "d"], frames=53, seed=0))
+    names = tuple(write_drives(folder / "kitti", ["a", "b", "c", "d"], frames=20, seed=0))
     budget = Budget(sensor=3, fine_tuning=2, filter=2, end_to_end=2, length=8)
     settings = {"size": (25, 75), "seeds": 1, "processes": 1, "drives": names, "test": names[:1], "budget": budget}
     kinds = {"filters": (*study.filters, "denkf_gated"), "sensors": ("flow", "image"), "sizes": (4, 8)}

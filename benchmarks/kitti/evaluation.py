@@ -29,7 +29,7 @@ from torch_denkf.metrics import interval_coverage, nees, spread_skill_ratio, sta
 from torch_denkf.training import hold_last
 
 MASKS = 8  # draws of the missing frames, over which the errors are averaged
-WINDOWS = (50, 100, 200, 400, 800)  # steps; 50 for drives that have no more
+WINDOWS = (50, 100, 200, 400, 800)  # steps; 50 for drives that have no more, all of a shorter one
 TIMED = 100  # steps to time a filter on
 DRAWS = 3  # runs of a filter that draws random numbers: its errors are means over them
 
@@ -122,20 +122,19 @@ def errors(states: Tensor, truth: Tensor) -> list[dict]:
     except ValueError:  # shorter than 100 m
         pass
     table = []
-    for window in WINDOWS:
-        if window < len(truth):
-            end = kitti_endpoint_error(states[:, :3], truth[:, :3], window=window)
-            length = kitti_pathlength_error(states[:, :3], truth[:, :3], windows=[window])
-            table.append(
-                {
-                    **whole,
-                    "window": window,
-                    "translation_m_per_m": float(end.translation),
-                    "rotation_deg_per_m": float(end.rotation),
-                    "pathlength_m_per_m": float(length.translation),
-                    "pathlength_deg_per_m": float(length.rotation),
-                }
-            )
+    for window in [window for window in WINDOWS if window < len(truth)] or [len(truth) - 1]:
+        end = kitti_endpoint_error(states[:, :3], truth[:, :3], window=window)
+        length = kitti_pathlength_error(states[:, :3], truth[:, :3], windows=[window])
+        table.append(
+            {
+                **whole,
+                "window": window,
+                "translation_m_per_m": float(end.translation),
+                "rotation_deg_per_m": float(end.rotation),
+                "pathlength_m_per_m": float(length.translation),
+                "pathlength_deg_per_m": float(length.rotation),
+            }
+        )
     return table
 
 

@@ -46,7 +46,7 @@ def draw(robot: Robot, beliefs: Mapping[str, TensorDict], path: Path, *, seconds
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     axes[3].imshow(contact.T, aspect="auto", extent=(*seconds, 4.5, 0.5), cmap="Greys", interpolation="nearest")
-    axes[3].set(ylabel="feet that stand", xlabel="time, s", yticks=[1, 2, 3, 4])
+    axes[3].set(ylabel="contact", xlabel="time, s", yticks=[1, 2, 3, 4])
     save(figure, path)
 
 

@@ -5,13 +5,13 @@ python -m benchmarks.legged.policy --out runs/walk
 
 from __future__ import annotations
 
-import math
 import tempfile
 import time
 from dataclasses import dataclass, replace
 from itertools import count, product
 from pathlib import Path
 
+import pandas as pd
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_explorati
 from torchrl.envs.transforms import Transform, UnaryTransform
 
 from benchmarks.common.arguments import made_by, parse
-from benchmarks.common.tables import Columns, head, line, pick, write_page
+from benchmarks.common.tables import markdown, pick, records, write_page, write_table
 from benchmarks.control.arms import Arm, Inputs
 from benchmarks.control.ppo import PPO, Settings
 from benchmarks.legged.pictures import Camera
@@ -34,6 +34,7 @@ from torch_denkf.deployment import export_step, load_step
 from torch_denkf.deployment.files import replacing
 from torch_denkf.functional.manifolds import rotate
 from torch_denkf.plots import write_video
+from torch_denkf.training.checkpoint import read_checkpoint
 from torch_denkf.transforms import DEnKFTransform
 
 TRUE, INPUT = ("true", "velocity"), "input"
@@ -50,13 +51,6 @@ ARMS = (TRUTH, "belief", "LSTM", "zero", "integrated inertial sensor", SPREAD, G
 #: What velocities in m/s, up, turns in rad/s, joints in rad, commands in m/s and the gait's phase are divided by.
 SCALE = (*[0.3] * 3, 0.2, 0.2, 1.0, *[0.5] * 3, *[0.5] * 16, 0.3, 0.2, 1.0, 1.0)
 SPREADS = (0.05,) * 3  # m/s
-SCORES = ("return", "error", "falls", "off")
-COLUMNS = Columns(
-    names=("ground", "arm", "robot", *SCORES),
-    text=("ground", "arm"),
-    whole=("robot",),
-    order=lambda row: (list(GROUNDS).index(row["ground"]), ARMS.index(row["arm"]), row["robot"]),
-)
 
 
 @dataclass(frozen=True)
@@ -163,7 +157,7 @@ class Laboratory:
         """Who learns; its actions begin small."""
         scale = torch.tensor([*SCALE, *(SPREADS if arm == SPREAD else ())])
         settings = Settings(gamma=0.95, lmbda=0.95, minibatch=480, lr=1e-3)
-        agent = PPO(Arm((INPUT,)), Inputs(0, 3, scale, 1.0), settings, batches)
+        agent = PPO(Arm(INPUT), Inputs(0, 3, scale, 1.0), settings, batches)
         with torch.no_grad():
             for name, value in agent.actor.named_parameters():
                 if name.endswith("log_std"):
@@ -199,9 +193,9 @@ class Laboratory:
     def lstm(self, agent: PPO) -> LSTM:
         """Trained to tell the velocity on what a policy does that reads the true one."""
         contacts = LearnedContacts(self.model, **QUADRUPED, rows=ROWS)
-        network, file = LSTM(contacts), self.study.out / "lstm.pt"
-        if file.exists():
-            network.load_state_dict(torch.load(file, weights_only=True))
+        if (file := self.study.out / "lstm" / "lstm.pt").exists():
+            network = LSTM(contacts)
+            network.load_state_dict(read_checkpoint(file)["lstm"])
             return network
         logs = []
         for number in range(2):
@@ -213,10 +207,7 @@ class Laboratory:
             rows = slice(min(100, log.shape[1] // 2), None)
             doubtful = torch.zeros(log.shape, dtype=torch.bool)
             logs.append(Robot("quadruped", self.model, QUADRUPED, 0.01, log, rows, doubtful))
-        network = trained_lstm(*logs, contacts, self.study.lstm_updates)
-        with replacing(file) as beside:
-            torch.save(network.state_dict(), beside)
-        return network
+        return trained_lstm(*logs, contacts, self.study.lstm_updates, self.study.out)
 
 
 def scored(data: TensorDict) -> dict[str, Tensor]:
@@ -232,10 +223,10 @@ def scored(data: TensorDict) -> dict[str, Tensor]:
     return {"return": data["next", "reward"].sum((1, 2)) / 100, "error": wrong, "falls": fell, "off": off}
 
 
-def tested(laboratory: Laboratory, policies: dict[str, TensorDictModuleBase]) -> list[dict]:
+def tested(laboratory: Laboratory, policies: dict[str, TensorDictModuleBase]) -> pd.DataFrame:
     """A row for each ground, arm and robot; robots, commands and forces are the same for all arms."""
     study, file = laboratory.study, laboratory.study.out / "policy.csv"
-    rows = COLUMNS.read(file) if file.exists() else []
+    rows = records(file)
     for (number, ground), arm in product(enumerate(GROUNDS), ARMS):
         policy = policies.get(arm if arm in (SPREAD, GAIT) else TRUTH)
         if policy is None or pick(rows, ground=ground, arm=arm):
@@ -244,13 +235,11 @@ def tested(laboratory: Laboratory, policies: dict[str, TensorDictModuleBase]) ->
         torch.manual_seed(0)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             data = play(env, policy, round(100 * study.test_seconds), ["true", "command", INPUT])
-        found = scored(data)
-        print(ground, arm, {key: value.mean().item() for key, value in found.items()}, flush=True)
-        for robot in range(study.robots):
-            scores = {key: value[robot].item() for key, value in found.items()}
-            rows.append({"ground": ground, "arm": arm, "robot": robot, **scores})
-        COLUMNS.write(rows, file)
-    return rows
+        found = pd.DataFrame({key: value.numpy() for key, value in scored(data).items()})
+        print(ground, arm, found.mean().to_dict(), flush=True)
+        rows += found.assign(ground=ground, arm=arm, robot=range(study.robots)).to_dict("records")
+        write_table(rows, file, ())
+    return pd.read_csv(file)
 
 
 def film(laboratory: Laboratory, policy: PPO, every: int = 8) -> None:
@@ -271,7 +260,7 @@ def film(laboratory: Laboratory, policy: PPO, every: int = 8) -> None:
     write_video(laboratory.study.out / "walk.gif", frames, 100 / every)
 
 
-def page(rows: list[dict], study: Study) -> str:
+def page(rows: pd.DataFrame, study: Study) -> str:
     """The tables."""
     text = [
         "# A policy that walks on the belief of its base's velocity",
@@ -283,19 +272,22 @@ def page(rows: list[dict], study: Study) -> str:
         "truth, all three axes. Both are root mean squares. The gait alone takes its strides from the command, without "
         "any policy.",
     ]
-    titles = ("velocity by", "return", "of the truth's, %", "velocity's error, m/s", "estimate's error, m/s", "falls")
     for ground in GROUNDS:
-        text += ["", f"## {ground.capitalize()}", "", *head(*titles)]
-        truth = torch.tensor([row["return"] for row in pick(rows, ground=ground, arm=TRUTH)])
-        for arm in ARMS:
-            if not (mine := pick(rows, ground=ground, arm=arm)):
-                continue
-            returned, wrong, falls, off = (torch.tensor([row[key] for row in mine]) for key in SCORES)
-            spread = ((returned - truth) / truth.mean()).std() / math.sqrt(len(truth))
-            cells = [f"{returned.mean():.2f}", f"{100 * returned.mean() / truth.mean():.1f} ± {100 * spread:.1f}"]
-            cells += [f"{each.square().mean().sqrt():.3f}" for each in (wrong, off)]
-            cells[-1] = "" if arm == GAIT else cells[-1]
-            text.append(line(arm, *cells, f"{falls.sum():.0f} of {len(truth)}"))
+        own = rows[rows["ground"] == ground].pivot(index="robot", columns="arm")
+        own = own.reindex(columns=[arm for arm in ARMS if arm in own["return"]], level="arm")
+        returned, truth = own["return"], own["return"][TRUTH]
+        share, spread = 100 * returned.mean() / truth.mean(), 100 * returned.sub(truth, axis=0).sem() / truth.mean()
+        wrong, off = ((own[name] ** 2).mean() ** 0.5 for name in ("error", "off"))
+        falls = own["falls"].sum().map("{:.0f}".format) + f" of {len(own)}"
+        cells = {
+            "return": returned.mean().map("{:.2f}".format),
+            "of the truth's, %": share.map("{:.1f}".format) + " ± " + spread.map("{:.1f}".format),
+            "velocity's error, m/s": wrong.map("{:.3f}".format),
+            "estimate's error, m/s": off.map("{:.3f}".format).drop(GAIT, errors="ignore"),
+            "falls": falls,
+        }
+        table = pd.DataFrame(cells).reindex(returned.columns).rename_axis("velocity by")
+        text += ["", f"## {ground.capitalize()}", "", *markdown(table)]
     text += [
         "",
         f"{study.robots} robots a ground, each with friction, motors, load, commands, forces and biases of its own, "

@@ -11,13 +11,15 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import pandas as pd
 import torch
 from torch import Tensor
 
 from benchmarks.common.arguments import made_by, parse
-from benchmarks.common.tables import head, line, write_page
+from benchmarks.common.tables import markdown, write_page
 from benchmarks.legged.study import KINDS
 from benchmarks.legged.task import FIRM, Robot, base_pose, simulated
+from benchmarks.legged.walk import up_of
 from torch_denkf.applications.legged import LeggedNoises, legged_filter
 from torch_denkf.functional.manifolds import SO3, rotate
 
@@ -61,10 +63,8 @@ def tilts(robot: Robot, kind: str, degrees: float) -> tuple[Tensor, Tensor]:
             value = turned(value, turn.unsqueeze(-2))
         log["previous", *key] = value.unsqueeze(1).expand(-1, log.shape[1], *value.shape[1:]).clone()
     belief = filter.sequence(log, keep=KEPT)["belief"]
-    orientation, _ = base_pose(robot, belief["mean"])
-    up = orientation.new_tensor([0.0, 0.0, 1.0])
-    one, other = (rotate(SO3().inverse(each), up) for each in (orientation, log["true", "orientation"]))
-    tilt = torch.atan2(torch.linalg.cross(one, other).norm(dim=-1), (one * other).sum(-1)).rad2deg()
+    up = [up_of(each) for each in (base_pose(robot, belief["mean"])[0], log["true", "orientation"])]
+    tilt = torch.atan2(torch.linalg.cross(*up).norm(dim=-1), (up[0] * up[1]).sum(-1)).rad2deg()
     return tilt, (belief["velocity"] - log["true", "velocity"]).norm(dim=-1)
 
 
@@ -74,7 +74,18 @@ def main() -> None:
     if study.smoke:
         study = Start(runs=1, seconds=0.2, degrees=(20.0,), smoke=True)
     robot = simulated("quadruped", study.runs, study.seconds, study.seed, FIRM)
-    moments, last = (10, 50, 100, 200), slice(-100, None)
+    moments, found = (10, 50, 100, 200), {}
+    for kind in list(KINDS)[: 1 if study.smoke else 2]:
+        for degrees in study.degrees:
+            tilt, velocity = (each.square() for each in tilts(robot, kind, degrees))
+            numbers = [tilt[:, min(each, tilt.shape[1]) - 1].mean().sqrt().item() for each in moments]
+            numbers = [f"{each:.2f}" for each in (*numbers, tilt[:, -100:].mean().sqrt())]
+            found[kind, f"{degrees:g}"] = [*numbers, f"{velocity[:, -100:].mean().sqrt():.3f}"]
+            print(kind, degrees, found[kind, f"{degrees:g}"], flush=True)
+    times = [f"tilt after {each / 100:g} s, deg" for each in moments]
+    columns = [*times, "tilt, last second, deg", "velocity, last second, m/s"]
+    table = pd.DataFrame.from_dict(found, orient="index", columns=columns)
+    table.index = pd.MultiIndex.from_tuples(found, names=["filter", "start, deg"])
     text = [
         "# A start that is tilted",
         "",
@@ -82,23 +93,10 @@ def main() -> None:
         "that knows by how much it may be. Errors are root mean squares over the runs; the last columns are those of "
         "the last second.",
         "",
-        *head(
-            "filter",
-            "start, deg",
-            *(f"tilt after {each / 100:g} s, deg" for each in moments),
-            "tilt, last second, deg",
-            "velocity, last second, m/s",
-        ),
+        *markdown(table),
+        "",
+        *made_by("legged.start"),
     ]
-    for kind in list(KINDS)[: 1 if study.smoke else 2]:
-        for degrees in study.degrees:
-            tilt, velocity = (each.square() for each in tilts(robot, kind, degrees))
-            numbers = [tilt[:, min(each, tilt.shape[1]) - 1].mean().sqrt().item() for each in moments]
-            numbers.append(tilt[:, last].mean().sqrt().item())
-            speed = velocity[:, last].mean().sqrt().item()
-            text.append(line(kind, f"{degrees:g}", *(f"{each:.2f}" for each in numbers), f"{speed:.3f}"))
-            print(text[-1], flush=True)
-    text += ["", *made_by("legged.start")]
     write_page("\n".join(text) + "\n", None if study.out is None else study.out / "start.md")
 
 

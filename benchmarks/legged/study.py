@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -10,11 +11,12 @@ from itertools import product
 from pathlib import Path
 from typing import Literal
 
+import pandas as pd
 import torch
 from tensordict import TensorDict
 
 from benchmarks.common.arguments import command, made_by, parse
-from benchmarks.common.tables import Columns, head, line, write_page
+from benchmarks.common.tables import markdown, pick, records, write_page, write_table
 from benchmarks.legged.pictures import draw
 from benchmarks.legged.task import FIRM, GROUNDS, LEVEL, SIMULATED, Robot, icub, jittered, scores, simulated
 from benchmarks.legged.training import CELLS, VELOCITY, learned_contacts, trained_lstm
@@ -32,19 +34,18 @@ NOISES = ("kinematics", "rate", "gyro", "accelerometer")
 ICUB = "iCub, real"
 #: Names of the data of each simulated robot, with their grounds.
 DATA = {kind: {f"{kind}, {name}": ground for name, ground in GROUNDS.items()} for kind in SIMULATED}
-SCORES = ("velocity", "certain", "tilt", "drift", "nees", "held", "ms")
-COLUMNS = Columns(
-    names=("data", "filter", "draws", *SCORES, "nll", *NOISES),
-    text=("data", "filter", "draws"),  # of an ensemble
-    whole=(),
-    order=lambda row: ([*DATA["quadruped"], *DATA["humanoid"], ICUB].index(row["data"]), row["filter"]),
-)
-VALIDATED = Columns(
-    names=("data", *NOISES, "velocity", "nees", "held", "nll"),
-    text=("data",),
-    whole=(),
-    order=lambda row: (row["data"], *(row[key] for key in NOISES)),
-)
+ORDER = [*DATA["quadruped"], *DATA["humanoid"], ICUB]
+#: Columns of the page, with their digits.
+SCORES = {
+    "velocity": ("velocity, m/s", 3),
+    "certain": ("velocity where the truth is sure, m/s", 3),
+    "tilt": ("tilt, deg", 2),
+    "drift": ("drift, %", 1),
+    "nees": ("NEES", 2),
+    "held": ("held", 2),
+    "ms": ("ms a step", 0),
+}
+HEADS = ("joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)")
 SHOWN = list(DATA["quadruped"])[1]  # in the picture
 VALIDATION_RUNS = 8
 RESULTS = Path(__file__).parent / "results"
@@ -58,17 +59,16 @@ KINDS = {
 }
 
 
+Part = Literal["quadruped", "humanoid", "icub"]
+
+
 @dataclass(frozen=True)
 class Study:
     """How fast is a walking robot's base, by its inertial sensor, joints and feet?"""
 
-    out: Path | None = None  # folder for legged.csv, legged.md and legged.png
+    out: Path = Path("runs/legged")  # folder for legged.csv, legged.md and legged.png
     icub: Path = Path("../shared/data/icub")  # with walking.npz and model.urdf; left out where they are missing
-    parts: tuple[Literal["quadruped", "humanoid", "icub"], ...] = (
-        "quadruped",
-        "humanoid",
-        "icub",
-    )  # rows of the others are read from legged.csv
+    parts: tuple[Part, ...] = ("quadruped", "humanoid", "icub")  # rows of the others are read from legged.csv
     kinds: tuple[str, ...] = ()  # run these filters alone, with the quadruped's contacts that the library has
     runs: int = 20  # of the test, on each ground
     seconds: float = 20.0  # of such a run
@@ -106,27 +106,31 @@ def in_the_air(robot: Robot) -> Robot:
     return replace(robot, log=log)
 
 
-def chosen(make: Callable[[], Robot], name: str, grid: Iterable[dict[str, float]], out: Path | None) -> LeggedNoises:
+def chosen(make: Callable[[], Robot], name: str, grid: Iterable[dict[str, float]], out: Path) -> LeggedNoises:
     """The noises of a grid under which the true velocity is likeliest.
 
     Args:
         make: makes the log.
         name: of the log.
         grid: noises.
-        out: folder with ``validation.csv``; what is in it is not run again. ``None`` for none.
+        out: folder with ``validation.csv``; what is in it is not run again.
     """
-    file = None if out is None else out / "validation.csv"
-    rows, robot = [] if file is None or not file.exists() else VALIDATED.read(file), None
+    file, robot = out / "validation.csv", None
+    rows = records(file)
     for options in grid:
-        if not any(row["data"] == name and all(row[key] == options[key] for key in NOISES) for row in rows):
+        if not pick(rows, data=name, **options):
             robot = make() if robot is None else robot
             found = scored(robot, run(robot, kind="EKF", noises=LeggedNoises(**options))[0])
             rows.append({"data": name, **options, **{key: found[key] for key in ("velocity", "nees", "held", "nll")}})
             print("validation", rows[-1], flush=True)
-            if file is not None:
-                VALIDATED.write(rows, file)
-    best = min((row for row in rows if row["data"] == name), key=lambda row: row["nll"])
-    return LeggedNoises(**{key: best[key] for key in NOISES})
+            write_table(rows, file, ("data", *NOISES))
+    return best(rows, name)
+
+
+def best(rows: list[dict], name: str) -> LeggedNoises:
+    """The noises of rows of a log under which the true velocity is likeliest."""
+    row = min(pick(rows, data=name), key=lambda row: row["nll"])
+    return LeggedNoises(**{key: row[key] for key in NOISES})
 
 
 def feet_grid(smoke: bool) -> list[dict[str, float]]:
@@ -174,7 +178,7 @@ def still(robot: Robot) -> dict[str, float]:
     return {key: scores(robot, zero, torch.ones_like(zero))[key] for key in ("velocity", "certain")}
 
 
-def page(rows: list[dict], study: Study) -> str:
+def page(frame: pd.DataFrame, study: Study) -> str:
     """The table."""
     lines = [
         "# How fast is the base",
@@ -184,17 +188,16 @@ def page(rows: list[dict], study: Study) -> str:
         "squared error of the velocity in units of the variance, over its expectation: above 1 a filter is too sure. "
         f"Held is the share of true velocities within the {LEVEL:.0%} intervals.",
     ]
-    titles = ("filter", "draws", "velocity, m/s", "tilt, deg", "drift, %", "NEES", "held", "ms a step")
-    digits = {"velocity": 3, "tilt": 2, "drift": 1, "nees": 2, "held": 2, "ms": 0}
-    for data in dict.fromkeys(row["data"] for row in rows):
-        real = data.startswith("iCub")
-        own = {"velocity": 3, "certain": 3, **digits} if real else digits
-        lines += ["", f"## {data}", ""]
-        lines += head(*titles[:3], *(["velocity where the truth is sure, m/s"] if real else []), *titles[3:])
-        for row in rows:
-            if row["data"] == data:
-                numbers = (f"{row[k]:.{d}f}" if k in row else "" for k, d in own.items())
-                lines.append(line(row["filter"], row.get("draws", ""), *numbers))
+    frame = frame.reindex(columns=["data", "filter", "draws", *SCORES, *NOISES])
+    shown = frame[["filter", "draws"]].assign(
+        **{title: frame[key].map(f"{{:.{digits}f}}".format, "ignore") for key, (title, digits) in SCORES.items()}
+    )
+    for data, own in shown.groupby(frame["data"], sort=False):
+        own = own if data == ICUB else own.drop(columns=SCORES["certain"][0])
+        lines += ["", f"## {data}", "", *markdown(own.set_index("filter"))]
+    with_noises = frame[frame["filter"].str.startswith("EKF")].set_index("filter")[list(NOISES)]
+    robots = frame.loc[frame["filter"].str.startswith("EKF"), "data"].str.split(",").str[0]
+    noises = with_noises.groupby(robots.to_numpy(), sort=False).last().rename_axis("noises").map("{:g}".format)
     lines += [
         "",
         f"Simulated: {study.runs} runs of {study.seconds:g} s on each ground, scored from 1 s on; every run has biases "
@@ -206,20 +209,12 @@ def page(rows: list[dict], study: Study) -> str:
         f"{study.runs * len(GROUNDS)} runs of a simulated robot, or of iCub's, without compilation, one thread. "
         "`--kinds` runs some filters again, with exact draws; rows of random draws are of a whole run before.",
         "",
-        *head(
-            "noises", "joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)"
-        ),
-        *(line(name, *(f"{row[key]:g}" for key in NOISES)) for name, row in _with_noises(rows).items()),
+        *markdown(noises.set_axis(HEADS, axis=1)),
         "",
         *made_by("legged"),
         f"* Seed: {study.seed}.",
     ]
     return "\n".join(lines) + "\n"
-
-
-def _with_noises(rows: list[dict]) -> dict[str, dict]:
-    """A row with noises of each robot."""
-    return {row["data"].split(",")[0]: row for row in rows if row["filter"].startswith("EKF")}
 
 
 def again(study: Study, kind: str) -> list[dict]:
@@ -230,10 +225,7 @@ def again(study: Study, kind: str) -> list[dict]:
     else:
         robots = grounds(study, kind)
         names = f"{kind}, all grounds"
-    best = min(
-        (row for row in VALIDATED.read(RESULTS / "validation.csv") if row["data"] == names), key=lambda row: row["nll"]
-    )
-    noises = LeggedNoises(**{key: best[key] for key in NOISES})
+    noises = best(records(RESULTS / "validation.csv"), names)
     variants = {"" if kind == "icub" else ", threshold": {"noises": noises}}
     if kind == "quadruped":
         trained = next(m for m in from_pretrained(kind).modules() if isinstance(m, LearnedContacts))
@@ -256,9 +248,10 @@ def walked(study: Study, kind: str) -> list[dict]:
     noises = chosen(make, f"{kind}, all grounds", feet_grid(study.smoke), study.out)
     training = simulated(kind, study.training_runs, length, study.seed + 1)
     validation = make()
-    contacts = learned_contacts(training, validation, noises, study.updates)
-    lstm = trained_lstm(training, validation, contacts, study.lstm_updates)
-    if study.out is not None and kind == "quadruped":
+    out = study.out / "trained" / kind
+    contacts = learned_contacts(training, validation, noises, study.updates, out)
+    lstm = trained_lstm(training, validation, contacts, study.lstm_updates, out)
+    if kind == "quadruped":
         _save(contacts, noises, study)
     robots = grounds(study, kind)
     kinds = {"EKF": KINDS["EKF"]} if study.smoke else KINDS
@@ -268,7 +261,7 @@ def walked(study: Study, kind: str) -> list[dict]:
         with torch.no_grad():
             found = scores(robot, *lstm(lstm.read(robot.log)))
         rows += [{"data": name, "filter": "LSTM", **found}, {"data": name, "filter": "standing still", **still(robot)}]
-    if study.out is not None and SHOWN in robots:
+    if SHOWN in robots:
         number = list(robots).index(SHOWN)
         shown = {label: beliefs[f"EKF, {label}"].chunk(len(robots))[number] for label in ("threshold", "learned")}
         draw(robots[SHOWN], shown, study.out / "legged.png")
@@ -301,29 +294,23 @@ def main() -> None:
     """Runs the study."""
     study = parse(Study)
     if study.smoke:
-        study = replace(
-            study, parts=("quadruped", "humanoid"), runs=1, seconds=0.3, training_runs=4, updates=1, lstm_updates=1
-        )
+        out = Path(tempfile.mkdtemp(prefix="legged-"))
+        tiny = {"runs": 1, "seconds": 0.3, "training_runs": 4, "updates": 1, "lstm_updates": 1}
+        study = replace(study, out=out, parts=("quadruped", "humanoid"), **tiny)
     torch.manual_seed(study.seed)
     parts: dict[str, Callable[[Study], list[dict]]] = {kind: partial(walked, kind=kind) for kind in SIMULATED}
     if (study.icub / "walking.npz").exists():
         parts["icub"] = real
-    if study.out is not None:
-        study.out.mkdir(parents=True, exist_ok=True)
-    file = None if study.out is None else study.out / "legged.csv"
-    rows = COLUMNS.read(file) if file is not None and file.exists() else []
-    for part in study.parts:
-        if part not in parts:
-            continue
+    study.out.mkdir(parents=True, exist_ok=True)
+    rows = records(study.out / "legged.csv")
+    for part in [part for part in study.parts if part in parts]:
         began = time.monotonic()
-        data = DATA.get(part, [ICUB])
         made = again(study, part) if study.kinds else parts[part](study)
-        replaced = {(row["data"], row["filter"]) for row in made}
-        if not study.kinds:
-            rows = [row for row in rows if row["data"] not in data]
-        rows = [row for row in rows if (row["data"], row["filter"]) not in replaced] + made
+        # A whole run replaces all rows of its data; some filters, their own alone.
+        replaced = {(row["data"], row["filter"] if study.kinds else None) for row in made}
+        rows = [row for row in rows if (row["data"], row["filter"] if study.kinds else None) not in replaced]
+        rows += made
         print(f"{part}: {(time.monotonic() - began) / 60:.0f} min", flush=True)
-        if file is not None:
-            COLUMNS.write(rows, file)
-    rows.sort(key=COLUMNS.order)
-    write_page(page(rows, study), None if study.out is None else study.out / "legged.md")
+        rows.sort(key=lambda row: (ORDER.index(row["data"]), row["filter"]))
+        table = write_table(rows, study.out / "legged.csv", ())
+    write_page(page(table, study), study.out / "legged.md")

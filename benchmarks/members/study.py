@@ -107,32 +107,33 @@ def cells(row: dict) -> tuple[str, str]:
 
 
 def draw(rows: list[dict], file: Path) -> None:
-    """Errors above, coverage below, against the members; a column a task."""
+    """Errors at the left, coverage at the right, against the members; a row a task."""
     names = [name for name in tasks.ERRORS if pick(rows, task=name)]
-    figure, axes = plt.subplots(
-        2, len(names), figsize=(2.7 * len(names), 5), sharex=True, squeeze=False, layout="constrained"
-    )
-    for name, (above, below) in zip(names, axes.T, strict=True):
+    size = (7.5, 1.9 * len(names))
+    figure, axes = plt.subplots(len(names), 2, figsize=size, sharex=True, squeeze=False, layout="constrained")
+    for name, (left, right) in zip(names, axes, strict=True):
         own = pick(rows, task=name)
         for kind, style, label in ((PLAIN, "o--", "without"), (BELIEVED, "o-", "significance")):
             points = sorted((row for row in own if row["filter"] == kind), key=lambda row: row["members"])
             count = [row["members"] for row in points]
-            above.plot(count, [row["error"] for row in points], style, markersize=3, label=label)
-            below.plot(count, [100 * row["held"] for row in points], style, markersize=3)
+            left.plot(count, [row["error"] for row in points], style, markersize=3, label=label)
+            right.plot(count, [100 * row["held"] for row in points], style, markersize=3)
         for row in own:
             if row["filter"] not in (PLAIN, BELIEVED):
-                above.axhline(row["error"], color="gray", linewidth=1, label=row["filter"])
-        below.axhline(90, color="gray", linewidth=1, linestyle=":")
-        above.set(title=TITLES.get(name, name), ylabel=tasks.ERRORS[name], xscale="log")
+                left.axhline(row["error"], color="gray", linewidth=1, label=row["filter"])
+        right.axhline(90, color="gray", linewidth=1, linestyle=":")
+        left.set(title=TITLES.get(name, name), ylabel=tasks.ERRORS[name], xscale="log")
         if max(row["error"] for row in own) > 5 * min(row["error"] for row in own):
-            above.set_yscale("log")
-            above.yaxis.set_major_formatter("{x:g}")
-            above.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "2346" else "")
-        below.set(xlabel="members", ylim=(0, 102), ylabel="% in 90 % intervals")
-        above.tick_params(axis="y", which="both", labelsize=8)
-        above.legend(fontsize=7)
-        below.set_xticks([8, 32, 128, 512], ["8", "32", "128", "512"])
-        below.minorticks_off()
+            left.set_yscale("log")
+            left.yaxis.set_major_formatter("{x:g}")
+            left.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "2346" else "")
+        right.set(ylim=(0, 102), ylabel="90 % coverage (%)")
+        left.tick_params(axis="y", which="both", labelsize=8)
+        left.legend(fontsize=7)
+        right.set_xticks([8, 32, 128, 512], ["8", "32", "128", "512"])
+        right.minorticks_off()
+    for axis in axes[-1]:
+        axis.set_xlabel("members")
     save(figure, file)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,11 +11,11 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from benchmarks.common.arm import Roles
 from torch_denkf.applications.ur5 import UR5ExperienceReplay
 from torch_denkf.applications.ur5.envs.collect import collect_ur5_demos
 
 STATE = 10  # J1..J6 rad, J7 the gripper's opening rad, x, y, z m
-JOINTS = 7
 
 
 @dataclass(frozen=True)
@@ -58,69 +59,42 @@ def sequences_of(data: UR5ExperienceReplay, first: int) -> Tensor:
     return torch.stack(parts)
 
 
+@dataclass
 class FramePool:
-    """Single frames with a picture, of chosen demos, in memory.
+    """Single frames in memory: pictures, uint8 ``[N, 3, H, W]``, and their states ``[N, 10]``."""
 
-    Args:
-        data: a replay with ``frames_only``.
-        chosen: numbers of the demos.
-    """
+    pixels: Tensor
+    state: Tensor
 
-    def __init__(self, data: UR5ExperienceReplay, chosen: set[int]):
+    @classmethod
+    def of(cls, data: UR5ExperienceReplay, chosen: Sequence[int]) -> FramePool:
+        """Frames with a picture of chosen demos, of a replay with ``frames_only``."""
         wanted = torch.tensor([episode.demo in chosen for episode in data.episodes])
         rows = wanted[data.storage[:]["episode"]].nonzero().squeeze(-1)
         if not len(rows):
             raise ValueError(f"none of the {len(data.episodes)} demos in {data.root} is chosen; collect more")
         first = data[rows[:1]]
-        self.pixels = torch.empty(len(rows), *first["pixels"].shape[1:], dtype=torch.uint8)  # as floats: 17 GB
-        self.state = first["state"].new_empty(len(rows), first["state"].shape[-1])
+        pixels = torch.empty(len(rows), *first["pixels"].shape[1:], dtype=torch.uint8)  # as floats: 17 GB
         for at in torch.arange(len(rows)).split(512):
-            part = data[rows[at]]
-            self.pixels[at], self.state[at] = (part["pixels"] * 255).round().to(torch.uint8), part["state"]
+            pixels[at] = (data[rows[at]]["pixels"] * 255).round().to(torch.uint8)
+        return cls(pixels, data.storage[:]["state"][rows])
 
     def __len__(self) -> int:
         return len(self.state)
 
     def shrunk(self, times: int) -> FramePool:
         """Returns the same frames with so many times fewer rows and columns, averaged."""
-        pool = object.__new__(FramePool)
         parts = [avg_pool2d(part.float(), times).round().to(torch.uint8) for part in self.pixels.split(512)]
-        pool.pixels, pool.state = torch.cat(parts), self.state
-        return pool
+        return FramePool(torch.cat(parts), self.state)
 
     def rows(self, index: Tensor) -> TensorDict:
         """Frames with float pixels, ``[n]``."""
         pixels = self.pixels[index].float() / 255
         return TensorDict({"pixels": pixels, "state": self.state[index]}, batch_size=[len(index)])
 
-    def joined(self, pixels: Tensor, state: Tensor) -> FramePool:
-        """These frames and others, uint8 ``[n, 3, H, W]``, of states ``[n, 10]``."""
-        pool = object.__new__(FramePool)
-        pool.pixels, pool.state = torch.cat([self.pixels, pixels]), torch.cat([self.state, state])
-        return pool
-
     def sample(self, generator: torch.Generator, batch: int) -> TensorDict:
         """Random frames ``[batch]``."""
         return self.rows(torch.randint(len(self), (batch,), generator=generator))
-
-
-@dataclass(frozen=True)
-class Roles:
-    """Numbers of demos by what they are for."""
-
-    sensor: set[int]  # trains the sensor
-    tune: list[int]  # sequences that train the filter, unseen by the sensor
-    validation: list[int]  # sequences to choose by, unseen by both
-    test: list[int]
-
-    def __post_init__(self):
-        tested = set(self.test)
-        for name in ("sensor", "tune", "validation"):
-            leaked = tested & set(getattr(self, name))
-            if leaked:
-                raise ValueError(f"demos {sorted(leaked)} would be tested on and used as {name}")
-        if self.sensor & {*self.tune, *self.validation}:
-            raise ValueError("the filter must learn from demos that its sensor has not seen")
 
 
 def _numbers(collections: Collections, name: str, split: str, end: int) -> list[int]:
@@ -134,7 +108,7 @@ def sim_roles(collections: Collections) -> Roles:
     sequences = _numbers(collections, "sim-sequences", "train", collections.sequences)
     test = _numbers(collections, "sim-sequences", "test", collections.sequences)
     held = min(max(len(sequences) // 7, 1), collections.validation)
-    sensor = {e.demo for e in frames.episodes if e.demo >= collections.sequences}
+    sensor = [e.demo for e in frames.episodes if e.demo >= collections.sequences]
     return Roles(sensor, sequences[:-held][: collections.tune], sequences[-held:], test)
 
 
@@ -144,4 +118,4 @@ def real_roles(collections: Collections) -> Roles:
     test = _numbers(collections, "real_like-sequences", "test", collections.real)
     own = max(len(train) * 7 // 10, 1)
     held = max((len(train) - own) // 3, 1)
-    return Roles(set(train[:own]), train[own:-held], train[-held:], test)
+    return Roles(train[:own], train[own:-held], train[-held:], test)

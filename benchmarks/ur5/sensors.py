@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 
+from benchmarks.common.arm.close_look import CloseLook, GlimpseTrunk
+from benchmarks.common.arm.sensors import Statistics, camera_sensor, train_sensor
 from benchmarks.common.scores import SensorLoss
 from benchmarks.ur5.demos import STATE, FramePool
-from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
 from torch_denkf.applications.ur5.simulation.domains import SIM, Domain
 from torch_denkf.envs import Brightness, SaltAndPepper
-from torch_denkf.functional import crps_ensemble
-from torch_denkf.modules import ImageSensor, SubModel, convolutional_trunk
-from torch_denkf.training import Stage
-from torch_denkf.training.parts import train_part
+from torch_denkf.modules import ImageSensor, KeypointTrunk, SubModel, convolutional_trunk
 
 SAMPLES = 32  # of a sensor while it is trained
 MEMBERS = 128  # of the ensemble filters, whose states are 34 numbers; they read as many samples
@@ -28,6 +25,53 @@ SALT = 0.02  # share of white pixels of a frame with salt and pepper, and of bla
 NEAR = ("sensor", "near")  # readings as states, see NearForecast
 # What a good sensor leaves: units of all losses. 1.15 degrees; 1.15 degrees of each component; 0.25 cm.
 JOINT_UNIT, PLACE_UNIT = 0.02, 0.0025
+REACH, RAISE = 0.36, 0.15  # half a patch's side and its shift upwards, in half pictures: hand and wrist
+COARSE = 112  # pixels: the side of the picture that the first look gets
+
+
+def project(places: Tensor, look: Domain = SIM) -> Tensor:
+    """Projects places ``[*, 3]`` into a camera's picture: columns and rows ``[*, 2]`` from -1 (left, top) to 1.
+
+    Only where the first looks go follows from it, so that roll and lens are left out.
+    """
+    camera, target = torch.tensor(look.camera), torch.tensor(look.target)
+    ahead = nn.functional.normalize(target - camera, dim=0)
+    right = nn.functional.normalize(torch.linalg.cross(ahead, torch.tensor([0.0, 0.0, 1.0])), dim=0)
+    up = torch.linalg.cross(right, ahead)
+    way = places - camera
+    depth = (way @ ahead) * torch.tan(torch.tensor(look.field / 2).deg2rad())
+    return torch.stack([way @ right / depth, -(way @ up) / depth], -1)
+
+
+class Shrink(nn.Module):
+    """Averages pixels until a picture is at most :data:`COARSE` wide."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Pictures ``[N, 3, H / n, W / n]``."""
+        times = images.shape[-1] // COARSE
+        return nn.functional.avg_pool2d(images, times) if times > 1 else images
+
+
+def keypoint_trunk() -> nn.Module:
+    """The coarse trunk of both presets."""
+    return nn.Sequential(Shrink(), KeypointTrunk(3, channels=(32, 48, 96, 128), keypoints=64, features=256))
+
+
+def glimpse_trunk(side: int) -> GlimpseTrunk:
+    """The trunk that looks at the gripper in pictures of a side of so many pixels."""
+    return GlimpseTrunk(keypoint_trunk(), CloseLook(side, REACH), 256, raised=RAISE)
+
+
+@torch.no_grad()
+def aim(trunk: GlimpseTrunk, images: Tensor, goal: Tensor) -> None:
+    """Sets the patch's centre by least squares to what :func:`project` says, ``[N, 2]``."""
+    code = torch.cat([trunk.coarse(part) for part in images.split(128)])
+    mean = code.mean(0)
+    design = torch.cat([code - mean, torch.ones(len(code), 1)], -1).double()
+    ridge = 1e-3 * len(code) * torch.eye(design.shape[-1], dtype=torch.double)
+    solution = torch.linalg.solve(design.mT @ design + ridge, design.mT @ goal.double()).float()
+    trunk.centre.weight.copy_(solution[:-1].mT)
+    trunk.centre.bias.copy_(solution[-1] - trunk.centre.weight @ mean)
 
 
 class TurnedWrist(nn.Module):
@@ -66,35 +110,6 @@ def wrist_of(reading: Tensor, near: Tensor) -> Tensor:
     return torch.cat([reading[..., :WRIST], angle.unsqueeze(-1), reading[..., WRIST + 4 :]], -1)
 
 
-@dataclass
-class Statistics:
-    """Means and standard deviations of the training demos alone."""
-
-    loc: Tensor  # of the state, [10]
-    scale: Tensor
-    rate: Tensor  # root mean square of a joint's change in a step, [7] rad
-    acceleration: Tensor  # of the change's change
-    jerk: Tensor  # of that one's change
-    pixel_loc: Tensor
-    pixel_scale: Tensor
-    size: int
-
-    @classmethod
-    def of(cls, states: Tensor, pool: FramePool) -> Statistics:
-        """Takes statistics of sequences ``[N, T, 10]`` and of pictures."""
-        flat = states.flatten(0, -2)
-        changes = (states[..., :7].diff(dim=-2, n=order) for order in (1, 2, 3))
-        pixels = pool.pixels[:: max(len(pool) // 500, 1)].float() / 255
-        return cls(
-            flat.mean(0),
-            flat.std(0),
-            *(change.square().mean((0, 1)).sqrt() for change in changes),
-            pixels.mean((0, 2, 3)),
-            pixels.std((0, 2, 3)),
-            pixels.shape[-1],
-        )
-
-
 def _near(reading: Tensor, near: Tensor | None = None) -> Tensor:
     """Encodes what a sensor reads that reads J6 itself."""
     return reading[..., WRIST] if near is None else near
@@ -127,36 +142,24 @@ def _moments(facts: Statistics) -> tuple[Tensor, Tensor]:
     )
 
 
+CELLS = (128, 64)
+
+
 def keypoint_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
     """A better one: places of features beside a coarse view, coordinate channels, J6 by twice its angle."""
-    head = {"num_cells": (128, 64), "layer": "dropout", "rate": 0.05}
-    return _sensor(facts, keypoint_trunk(), samples, *_moments(facts), **head)
+    head = {"num_cells": CELLS, "layer": "dropout", "rate": 0.05}
+    return camera_sensor(facts, keypoint_trunk(), samples, *_moments(facts), **head)
 
 
 def glimpse_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
     """Builds one with a second look at the gripper. Flipout learns how large its noise is; dropout's is what it is."""
-    head = {"num_cells": (128, 64), "layer": "flipout"}
-    return _sensor(facts, GlimpseTrunk(keypoint_trunk(), facts.size), samples, *_moments(facts), **head)
+    head = {"num_cells": CELLS, "layer": "flipout"}
+    return camera_sensor(facts, glimpse_trunk(facts.size[1]), samples, *_moments(facts), **head)
 
 
 def paper_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
     """The paper's: Table I on the frame, which reads all ten numbers of the state."""
-    return _sensor(facts, convolutional_trunk(3), samples, facts.loc, facts.scale)
-
-
-def _sensor(facts: Statistics, trunk: nn.Module, samples: int, loc: Tensor, scale: Tensor, **head) -> ImageSensor:
-    return ImageSensor(
-        len(loc),
-        image_shape=(3, facts.size, facts.size),
-        trunk=trunk,
-        ensemble_size=samples,
-        loc=loc,
-        scale=scale,
-        pixel_loc=facts.pixel_loc,
-        pixel_scale=facts.pixel_scale,
-        encoding_key=("sensor", "encoding"),
-        **head,
-    )
+    return camera_sensor(facts, convolutional_trunk(3), samples, facts.loc, facts.scale)
 
 
 _PRESETS = (
@@ -181,7 +184,7 @@ def adopt(sensor: ImageSensor, coarse: ImageSensor, pool: FramePool, look: Domai
     trunk.coarse.load_state_dict(coarse.module["trunk"].state_dict())
     trunk.coarse.requires_grad_(False)
     rows = pool.rows(torch.arange(0, len(pool), max(len(pool) // count, 1)))
-    trunk.aim(sensor._prepare(rows["pixels"]), project(rows["state"][:, 7:], look))
+    aim(trunk, sensor._prepare(rows["pixels"]), project(rows["state"][:, 7:], look))
 
 
 class NearForecast(SubModel):
@@ -229,59 +232,13 @@ def disturb(frames: TensorDict, generator: torch.Generator, times: int = 1) -> T
     return frames.set("pixels", torch.lerp(frames["pixels"], salted, 1 / area))
 
 
-@torch.no_grad()
-def sensor_error(sensor: ImageSensor, preset: Preset, pool: FramePool) -> dict[str, float]:
-    """CRPS in the same units, and mean absolute errors in degrees and cm."""
-    scores, joints, places = [], [], []
-    for index in torch.arange(len(pool)).split(256):
-        frames = pool.rows(index)
-        samples = sensor(frames)["sensor", "ensemble"]
-        truth = frames["state"]
-        scores.append(crps_ensemble(samples, preset.observe(truth)) / unit_of(preset.dim))
-        error = (preset.state_of(samples.mean(1), truth[:, WRIST]) - truth).abs()
-        joints.append(error[:, :7].rad2deg())
-        places.append(100 * error[:, 7:])
-    return {
-        "crps": float(torch.cat(scores).mean()),
-        "joint_mae_deg": float(torch.cat(joints).mean()),
-        "ee_mae_cm": float(torch.cat(places).mean()),
-    }
-
-
-def train_sensor(
-    sensor: ImageSensor,
-    preset: Preset,
-    train: FramePool,
-    held_out: FramePool,
-    *,
-    out: Path,
-    seed: int,
-    updates: int,
-    lr: float = 2e-3,
-    batch: int = 64,
-    times: int = 1,
+def train_preset(
+    sensor: ImageSensor, preset: Preset, train: FramePool, held_out: FramePool, times: int = 1, **settings
 ) -> ImageSensor:
-    """Trains a sensor, or goes on where that was broken off, or reads it where it was done.
-
-    ``times`` is that of :func:`disturb`: by how much the frames of both pools were shrunk.
+    """Trains a sensor on frames that were shrunk so many times, see :func:`disturb`, and
+    :func:`~benchmarks.common.arm.sensors.train_sensor`.
     """
     terms = {"loss_joints": slice(-3), "loss_place": slice(-3, None)}
-    stage = Stage(
-        "sensor",
-        SensorLoss(sensor, lambda frames: preset.observe(frames["state"]), unit_of(preset.dim), terms),
-        lambda generator, _: disturb(train.sample(generator, batch), generator, times),
-        updates,
-        lr=lr,
-        weight_decay=0.02,
-    )
-    return train_part(
-        sensor,
-        stage,
-        out=out,
-        validate=lambda: sensor_error(sensor, preset, held_out),
-        monitor="crps",
-        validate_every=max(updates // 8, 1),
-        save_every=200,
-        seed=seed,
-        device="cpu",
-    ).eval()
+    loss = SensorLoss(sensor, lambda frames: preset.observe(frames["state"]), unit_of(preset.dim), terms)
+    sample = lambda generator: disturb(train.sample(generator, 64), generator, times)  # noqa: E731
+    return train_sensor(sensor, loss, sample, held_out, weight_decay=0.02, **settings)

@@ -11,10 +11,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.common.scores import belief_crps, counted, coverage
-from benchmarks.common.training import fit_filter
-from benchmarks.ur5.demos import JOINTS
-from benchmarks.ur5.readings import Windows, read_all, read_head, with_missing
+from benchmarks.common.arm.readings import Windows, fail, read_all, with_head
+from benchmarks.common.arm.scores import filter_error, filter_stage, fit
 from benchmarks.ur5.recipes import UR5Recipe
 from benchmarks.ur5.sensors import unit_of
 from torch_denkf.filters import Filter
@@ -23,7 +21,6 @@ from torch_denkf.training import Stage
 from torch_denkf.training.stage import parameters_without
 
 INFLATIONS = (0.75, 0.85, 1.0, 1.15, 1.3, 1.5, 1.75, 2.0, 2.4)
-KEPT = (("belief", "mean"), ("belief", "var"), ("belief", "ensemble"), "state", "observed")
 
 
 @dataclass(frozen=True)
@@ -39,33 +36,10 @@ class Budget:
     batch: int = 12  # windows an update
 
 
-@torch.no_grad()
-def run_filter(recipe: UR5Recipe, model: Filter, readings: TensorDict, chunk: int = 128) -> TensorDict:
-    """Filters demos ``[N, T]``, each from around its true first state."""
-    behind, parts = recipe.behind(model), []
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        for part in readings.split(chunk):
-            out = behind.sequence(part.copy())
-            parts.append(out.select(*[key for key in KEPT if key in out.keys(True)]))
-    return torch.cat(parts)
-
-
-def filter_error(recipe: UR5Recipe, model: Filter, readings: TensorDict) -> dict[str, float]:
-    """CRPS of the belief taken for a Gaussian, in the units of the loss, and mean absolute errors."""
-    out = run_filter(recipe, model, readings)
-    mean, _, truth = counted(out, recipe.dims, 0.0)
-    error = (mean - truth).abs().flatten(0, 1).mean(0)
-    return {
-        "crps": float(belief_crps(out, recipe.dims, recipe.unit, 1e-10).mean()),
-        "joint_mae_deg": float(error[:JOINTS].mean().rad2deg()),
-        "ee_mae_cm": 100 * float(error[JOINTS:].mean()),
-    }
-
-
-def joint_coverage(out: TensorDict) -> Tensor:
-    """Share of the true joints inside the belief's 90 % intervals."""
-    return coverage(out, range(JOINTS), 1e-12).mean()
+def with_missing(recipe: UR5Recipe, codes: TensorDict) -> TensorDict:
+    """Readings of clean demos, and the same with missing frames: what filters are validated on."""
+    readings = read_all([recipe.sensor], codes, recipe.members)
+    return torch.cat([readings, fail(readings, "missing", seed=1)])
 
 
 class WithHead(nn.Module):
@@ -74,12 +48,12 @@ class WithHead(nn.Module):
     def __init__(self, objective: nn.Module, recipe: UR5Recipe):
         super().__init__()
         self.objective, self.sensor, self.preset = objective, recipe.sensor, recipe.preset
-        self.size = recipe.ensemble_size
+        self.size = recipe.members
         self.register_buffer("unit", unit_of(self.preset.dim))
 
     def forward(self, codes: TensorDict) -> dict[str, Tensor]:
         """All terms, of windows ``[B, T]`` of features."""
-        windows = read_head(self.sensor, codes, self.size)
+        windows = with_head([self.sensor], codes, self.size)
         own = crps_ensemble(windows["sensor", "ensemble"], self.preset.observe(codes["state"])) / self.unit
         return {**self.objective(windows), "loss_sensor": 0.5 * own[codes["observed"].squeeze(-1)].mean()}
 
@@ -109,60 +83,36 @@ def train_filter(
         The model, on its best parameters, with its inflation.
     """
     torch.manual_seed(seed)
-    model, sensor = recipe.build(), recipe.sensor
+    model, sensor, (share, rate) = recipe.build(), recipe.sensor, (1, 1.0) if begin is None else (3, 0.2)
     if begin is not None:
         # How large errors are here says the recipe.
-        errors = (".variance", ".floor")
-        mine = {
-            name: value
-            for name, value in begin.state_dict().items()
-            if not name.startswith("module.sensor.") and not name.endswith(errors)
-        }
-        model.load_state_dict(mine, strict=False)
-    share, rate = (1, 1.0) if begin is None else (3, 0.2)
-
-    def read() -> TensorDict:
-        return with_missing(read_all(sensor, validation, recipe.ensemble_size))
+        own = lambda name: name.startswith("module.sensor.") or name.endswith((".variance", ".floor"))  # noqa: E731
+        model.load_state_dict({k: v for k, v in begin.state_dict().items() if not own(k)}, strict=False)
+    read = lambda: with_missing(recipe, validation)  # noqa: E731
 
     def stages() -> list[Stage]:
-        windows = Windows(tune, budget.length, recipe.start_std)
-        read_once = [read_all(sensor, part, recipe.ensemble_size, seed + 1) for part in tune]
-        frozen = Windows(read_once, budget.length, recipe.start_std)
-        objective, clean = recipe.loss(recipe.behind(model, training=True)), read()
+        windows = Windows(tune, budget.length)
+        frozen = Windows([read_all([sensor], part, recipe.members, seed + 1) for part in tune], budget.length)
+        updates = max(budget.filter // share, 1)
+        first = filter_stage(recipe, model, frozen, read(), updates, budget.batch, lr=5e-3 * rate)
         head = list(sensor.module["head"].parameters())
         # R knows how wrong the sensor is on new demos; on those that it is now trained on it would forget.
         rest = parameters_without(model, {"noise", "sensor"} & set(model.module.keys()))
-        return [
-            Stage(
-                "filter",
-                objective,
-                lambda generator, _: frozen.sample(generator, budget.batch),
-                max(budget.filter // share, 1),
-                lr=5e-3 * rate,
-                validate=lambda: filter_error(recipe, model, clean),
-            ),
-            Stage(
-                "end_to_end",
-                WithHead(objective, recipe),
-                lambda generator, _: windows.sample(generator, budget.batch, max(budget.length // 2, 2)),
-                max(budget.end_to_end // share, 1),
-                parameters=[*head, *rest],
-                lr=3e-4 * rate,
-                validate=lambda: filter_error(recipe, model, read()),
-            ),
-        ]
 
-    trained = cache(read)  # after training the sensor's head stays as it is
-    settings = {"monitor": "crps", "validate_every": max(budget.filter // share // 4, 1), "save_every": 100}
-    fit_filter(
-        recipe,
-        model,
-        stages,
-        lambda: joint_coverage(run_filter(recipe, model, trained())),
-        out=out,
-        inflations=INFLATIONS,
-        seed=seed,
-        device="cpu",
-        **settings,
-    )
-    return model
+        def sample(generator: torch.Generator, _: int | None) -> TensorDict:
+            return recipe.begun(windows.sample(generator, budget.batch, max(budget.length // 2, 2)), generator)
+
+        second = Stage(
+            "end_to_end",
+            WithHead(first.loss, recipe),
+            sample,
+            max(budget.end_to_end // share, 1),
+            parameters=[*head, *rest],
+            lr=3e-4 * rate,
+            validate=lambda: filter_error(recipe, model, read()),
+        )
+        return [first, second]
+
+    # After training the sensor's head stays as it is.
+    settings = {"inflations": INFLATIONS, "every": budget.filter // share // 4, "out": out, "seed": seed}
+    return fit(recipe, model, stages, cache(read), **settings)

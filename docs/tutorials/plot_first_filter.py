@@ -87,7 +87,7 @@ print(denkf.carry_keys, "goes on from step to step;", sum(p.numel() for p in den
 
 loss = DEnKFLoss(denkf, state_scale=scale)
 optimiser = torch.optim.Adam(denkf.parameters())
-UPDATES, LENGTH = 200, 16
+UPDATES, LENGTH = 150, 16
 schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 6e-3, total_steps=UPDATES)
 history = []
 for _ in range(UPDATES):

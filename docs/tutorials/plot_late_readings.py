@@ -141,10 +141,10 @@ for hidden in (("laser", "gps"), ("laser",), ("gps",), ()):
 weights = SensorAttention(dict.fromkeys(SENSORS, 1))
 learning = fuse(delay=0, weights=weights)  # faster: weights do not depend on when a fix comes
 loss = GaussianLoss(learning, transition=0.0, sensor=0.0)
-optimiser, updates = torch.optim.Adam(weights.parameters()), 40
+optimiser, updates = torch.optim.Adam(weights.parameters()), 30
 schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 1e-2, total_steps=updates)
 for update in range(updates):
-    value = loss(in_time(drive(32, steps=60, reflected=0.5)))["loss_state"]
+    value = loss(in_time(drive(32, steps=40, reflected=0.5)))["loss_state"]
     optimiser.zero_grad()
     value.backward()
     optimiser.step()

@@ -177,10 +177,10 @@ rest = [*denkf["transition"].parameters(), *denkf["noise"].parameters()]
 sensor_loss = SensorLoss(denkf, noise=0.1, observation_scale=scale[:1])
 filter_loss = DEnKFLoss(denkf, sensor=0.0, nll=0.1, state_scale=scale)
 stages = [
-    Stage("sensor", sensor_loss, pictures, updates=160, lr=4e-3, validate=sensor_error),
-    Stage("filter", filter_loss, slices, updates=100, lr=1e-2, parameters=rest, validate=filter_error),
+    Stage("sensor", sensor_loss, pictures, updates=120, lr=4e-3, validate=sensor_error),
+    Stage("filter", filter_loss, slices, updates=60, lr=1e-2, parameters=rest, validate=filter_error),
 ]
-trainer = FilterTrainer(denkf, stages, out=folder / "out", validate_every=50, device="cpu", progress=False)
+trainer = FilterTrainer(denkf, stages, out=folder / "out", validate_every=30, device="cpu", progress=False)
 for name, best in trainer.fit().items():
     print(f"stage {name}: smallest validation error {best['value']:.3f}, after {best['update']} updates")
 

@@ -29,7 +29,7 @@ from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, 
 from torch_denkf.plots import plot_path
 
 torch.manual_seed(0)
-DT, EVERY, STEPS, MEMBERS = 0.1, 40, 241, 200  # s; steps between two markers; steps of a drive; members
+DT, EVERY, STEPS, MEMBERS = 0.1, 40, 241, 100  # s; steps between two markers; steps of a drive; members
 SLIP = torch.tensor([0.02, 0.02])  # standard deviations of what the wheels do not notice in a step: m, rad
 MARKER = 0.05  # m
 
@@ -57,12 +57,12 @@ def drive(robots: int) -> TensorDict:
     return TensorDict(entries, [robots, STEPS])
 
 
-drives = drive(40)
+drives = drive(20)
 
 # %%
 # The filter
 # ----------
-# The motion is known, so no network is trained here. What the filter knows, its *belief*, is an *ensemble* of 200
+# The motion is known, so no network is trained here. What the filter knows, its *belief*, is an *ensemble* of 100
 # members: possible states, which the motion moves on. Each member slips by an amount of its own. In this way the
 # ensemble spreads, and shows how the error of the heading becomes an error of the place.
 #

@@ -2,18 +2,10 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch.testing import assert_close
 
-from tests.filters.factories import (
-    NoisyLinear,
-    assert_equal,
-    linear_denkf,
-    linear_kalman,
-    linear_system,
-    random_draws,
-)
-from tests.filters.gaussian_for_tests import directional_check, known_process_noise
+from tests.filters.factories import NoisyLinear, assert_equal, linear_denkf, linear_kalman, linear_system, random_draws
+from tests.filters.gaussian_for_tests import known_process_noise
 from tests.smoothers.joint import COV, MEAN, drive
 from torch_denkf.baselines import IEnKS
 from torch_denkf.baselines.iterated_smoothing import iterated_smoothing
@@ -116,26 +108,6 @@ def test_gradients_are_those_of_finite_differences(float64):
         )
 
     assert torch.autograd.gradcheck(smooth, [value.requires_grad_() for value in inputs])
-
-
-def test_a_learned_motion_learns(float64):
-    smoother = IEnKS(
-        LearnedTransition(StochasticMLP(2, 2, (8,), layer="none", output_gain=0.5)),
-        None,
-        Select([0]),
-        ConstantNoise([0.3], in_key="reading"),
-        initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=5),
-        iterations=3,
-        process_noise=0.1,
-        observation_key="reading",
-    )
-    frames = smoother.draw_noise(TensorDict({"reading": torch.randn(2, 4, 1)}, [2, 4]))
-    directional_check(
-        lambda: smoother.sequence(frames.copy())["smoothed", "ensemble"].square().sum(),
-        [p for p in smoother.parameters() if p.requires_grad],
-        step=1e-6,
-        rtol=1e-4,
-    )
 
 
 def test_what_it_cannot_do_it_says():

@@ -112,30 +112,3 @@ def test_the_sensor_of_other_filters_is_trained_through_the_memory():
 
 
 # ------------------------------------------------------------------------------------------------------- a memory
-
-
-def test_it_learns_to_remember():
-    """A cue of +-1 is shown once, then noise alone: without a memory the best answer is 0, with an error of 1."""
-
-    def draw(rows, steps=8):
-        cue = torch.randint(2, (rows, 1, 1)) * 2.0 - 1
-        shown = torch.cat([torch.zeros(rows, 1, 1), cue, torch.randn(rows, steps - 2, 1)], 1)
-        is_cue = torch.zeros(rows, steps, 1).index_fill(1, torch.tensor([1]), 1.0)
-        return TensorDict(
-            {"features": torch.cat([shown, is_cue], -1), "state": cue.expand(rows, steps, 1)}, [rows, steps]
-        )
-
-    filter = LSTMFilter(None, features=2, state_dim=1, hidden_size=16, encoding_key="features")
-    loss = GaussianLoss(filter, transition=0.0, sensor=0.0)
-    optimiser = torch.optim.Adam(filter.parameters(), lr=0.02)
-    for _ in range(120):
-        optimiser.zero_grad()
-        loss(draw(64))["loss_state"].backward()
-        optimiser.step()
-    unseen = draw(500)
-    with torch.no_grad():
-        belief = filter.sequence(unseen.copy())["belief"]
-    errors = (belief["mean"] - unseen["state"]).square().mean((0, 2))
-    assert errors[0] == 1, "the first belief is the prior"
-    assert (errors[1:] < 0.02).all()
-    assert (belief["var"][:, 1:] < 0.05).all(), "and knows that it knows"

@@ -3,9 +3,10 @@
 import torch
 from tensordict import TensorDict
 
+from benchmarks.common.arm import JOINTS
 from benchmarks.control import latency
 from benchmarks.control.latency import TwoLinks, best_policy, moved, read_grid
-from benchmarks.g1.later import JOINTS, Motion, looked, scores
+from benchmarks.g1.later import Motion, looked, scores
 from torch_denkf import NoisyPendulumEnv
 
 
@@ -71,7 +72,7 @@ def test_the_fit_finds_a_linear_motion_and_the_belief_ahead_follows_it(float64):
     motion = Motion.fitted(data)
     half = 0.5 * torch.eye(JOINTS)
     torch.testing.assert_close(motion.weight[:, 2 * JOINTS :], half, atol=5e-3, rtol=0)
-    out = looked(motion, data, "EKF", 1.0, 4, 0)
+    out = looked(motion, data, "EKF", 1.0, 4)
     now, later, inside = scores(motion, data, out, 4)
     assert later < 0.05 * now
     assert 0.8 < inside <= 1.0

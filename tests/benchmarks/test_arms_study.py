@@ -1,5 +1,6 @@
 """Oracles: episodes that must be alike, actions and scores worked out by hand, and a sensor of known errors."""
 
+import pandas as pd
 import pytest
 import torch
 from tensordict import TensorDict
@@ -37,12 +38,11 @@ def test_scores_of_the_end_are_of_the_last_quarter():
 
 
 def test_differences_are_of_the_same_episodes_in_any_order():
-    case = {"task": "reacher", "source": "encoders", "missing": 0.0}
     angles = {"reading": {0: 1.0, 1: 5.0, 2: 3.0}, "belief": {2: 5.0, 1: 7.0, 0: 9.0}}
-    rows = [
-        {**case, "seed": 0, "estimate": estimate, "episode": episode, "angle": angle}
+    rows = pd.DataFrame(
+        {"seed": 0, "estimate": estimate, "episode": episode, "angle": angle}
         for estimate, each in angles.items()
         for episode, angle in each.items()
-    ]
+    )
     # They are 8, 2 and 2, and of three draws 4 % are all 8 and 30 % all 2.
-    assert difference(rows, "angle", **case) == "+4.00 [+2.00, +8.00], +133%"
+    assert difference(rows, "angle") == "+4.00 [+2.00, +8.00], +133%"

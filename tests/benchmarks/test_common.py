@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 
 from benchmarks.common.jobs import once, read_rows
-from benchmarks.common.tables import Columns, head, line, pick
+from benchmarks.common.tables import Columns, head, line, markdown, pick, records, write_table
 
 
 def test_a_job_is_done_once_and_leaves_nothing_half(tmp_path):
@@ -40,3 +40,20 @@ def test_rows_survive_their_file_sorted_and_with_five_digits(tmp_path):
     ]
     assert pick(rows, name="a") == rows[1:]
     assert [*head("a", 5), line(1, "x")] == ["| a | 5 |", "|---|---|", "| 1 | x |"]
+
+
+def test_a_table_of_mixed_columns_comes_back_as_it_was_written(tmp_path):
+    rows = [{"name": "b", "seed": 2, "error": 1 / 3, "count": 123456}, {"name": "a", "seed": 1}]
+    frame = write_table(rows, tmp_path / "table.csv", ("name",))
+    assert (tmp_path / "table.csv").read_text() == "name,seed,error,count\na,1,,\nb,2,0.33333,123456\n"
+    assert markdown(frame.set_index("name")) == [
+        "| name | seed | error | count |",
+        "|---|---|---|---|",
+        "| a | 1 |  |  |",
+        "| b | 2 | 0.33333 | 123456.0 |",
+    ]
+    assert records(tmp_path / "table.csv") == [
+        {"name": "a", "seed": 1},
+        {"name": "b", "seed": 2, "error": 0.33333, "count": 123456},
+    ]
+    assert records(tmp_path / "none.csv") == []

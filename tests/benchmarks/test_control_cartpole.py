@@ -8,9 +8,8 @@ from tensordict import TensorDict
 
 from benchmarks.control import cartpole
 from benchmarks.control.arms import ARMS, Inputs
-from benchmarks.control.run import make_env
+from benchmarks.control.run import make_env, told
 from benchmarks.control.sac import SAC, Settings
-from benchmarks.control.shift import told
 from benchmarks.control.tasks import TASKS
 from tests.filters.factories import FixedEnsemble
 

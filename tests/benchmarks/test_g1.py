@@ -1,4 +1,4 @@
-"""The parts of the G1 study that a wrong table could come from: roles and scores."""
+"""The parts of the G1 study that a wrong table could come from: roles, failing cameras and scores."""
 
 import math
 
@@ -6,35 +6,22 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from benchmarks.g1.motion import with_rates
-from benchmarks.g1.recordings import JOINTS, Recordings, Roles, drawn_recording
-from benchmarks.g1.scores import scores
+from benchmarks.common.arm import JOINTS, Roles
+from benchmarks.common.arm.readings import BLACK, Windows, fail
+from benchmarks.common.arm.scores import estimated
+from benchmarks.g1.recordings import NAMES, Recordings, drawn_recording
+from benchmarks.g1.study import score_row
 from torch_denkf.data import LeRobotReplay
 
-COUNT, STEPS, MEMBERS, FEATURES = 4, 60, 8, 5
 
-
-def readings(error=0.0, spread=0.01):
-    """A sensor that is wrong by ``error`` everywhere, of sines."""
-    generator = torch.Generator().manual_seed(0)
-    phase = torch.rand(COUNT, 1, JOINTS, generator=generator)
-    truth = (torch.arange(STEPS).view(1, -1, 1) / 10 + 6.3 * phase).sin()
-    samples = truth.unsqueeze(-2) + error + spread * torch.randn(COUNT, STEPS, MEMBERS, JOINTS, generator=generator)
-    seen = torch.ones(COUNT, STEPS, 1, dtype=torch.bool)
-    encoding = torch.randn(COUNT, STEPS, FEATURES, generator=generator)
-    out = TensorDict(
-        {
-            "observed": seen,
-            "valid": seen.clone(),
-            "arrived": seen.clone(),
-            "state": truth,
-            "start": torch.zeros_like(truth),
-        },
-        [COUNT, STEPS],
-    )
-    out["sensor"] = TensorDict({"ensemble": samples, "encoding": encoding}, [COUNT, STEPS])
-    out["motion"] = torch.stack([with_rates(one) for one in truth])
-    return out
+def readings(count=4, steps=60):
+    """A sensor that is right, of episodes of which the others are shorter than the first."""
+    valid = torch.ones(count, steps, 1, dtype=torch.bool)
+    valid[1:, 30:] = False
+    truth = torch.randn(count, steps, JOINTS, generator=torch.Generator().manual_seed(0))
+    sensor = {"ensemble": truth.unsqueeze(-2), "encoding": truth}
+    masks = {"valid": valid, "observed": valid.clone(), "arrived": valid.clone()}
+    return TensorDict({**masks, "state": truth, "sensor": sensor}, [count, steps])
 
 
 # Roles ----------------------------------------------------------------------------------------------------------------
@@ -52,16 +39,40 @@ def test_no_episode_has_two_roles(tmp_path):
     assert first.sensor != second.sensor
 
 
-# Scores and tables ----------------------------------------------------------------------------------------------------
+# Failing cameras ------------------------------------------------------------------------------------------------------
+
+
+def test_of_black_frames_nothing_is_left():
+    clean = readings()
+    dark = fail(clean, "black20")
+    assert fail(clean, "clean")["observed"].equal(clean["observed"])
+    lost = (clean["observed"] & ~dark["observed"]).squeeze(-1)
+    assert int(lost[0].sum()) == BLACK
+    assert (lost[0].nonzero().flatten().diff() == 1).all()  # one after the other
+    assert (dark["sensor", "ensemble"][lost] == 0).all()
+    kept = ~lost & clean["valid"].squeeze(-1)
+    assert dark["sensor", "ensemble"][kept].equal(clean["sensor", "ensemble"][kept])
+
+
+def test_windows_stay_within_an_episode_and_lose_no_first_frame():
+    clean = readings()
+    windows = Windows([clean, clean], 20, (0.9, 0.1)).sample(torch.Generator().manual_seed(0), 500)
+    assert windows["valid"].all()
+    assert windows["observed"][:, 0].all()
+    lost = 1 - windows["observed"].float().mean().item()
+    assert 0.125 < lost < 0.25  # half of up to half; a third of up to 20
+    with pytest.raises(ValueError, match="windows of 31 rows do not fit in a sequence of 30"):
+        Windows([clean], 31)
+
+
+# Scores ---------------------------------------------------------------------------------------------------------------
 
 
 def test_scores_leave_out_what_does_not_count():
     clean = readings()
-    clean["valid"][1:, 30:] = False
     mean = clean["state"] + torch.tensor([0.01] * 6 + [0.08])
     mean[:, 0], mean[2, 40:] = 99.0, 99.0
-    row = scores(mean, torch.full_like(mean, 0.03**2), clean)
-    assert row["joint_mae_deg"] == pytest.approx(math.degrees(0.02), rel=1e-4)
-    assert row["wrist_yaw_deg"] == pytest.approx(math.degrees(0.08), rel=1e-4)
+    row = score_row(estimated(clean, mean, torch.full_like(mean, 0.03**2)), "clean")
+    assert row["joint_mae_deg"] == pytest.approx(math.degrees(0.02), rel=1e-3)
+    assert row[f"{NAMES[-1]}_deg"] == pytest.approx(math.degrees(0.08), rel=1e-3)
     assert row["coverage90"] == pytest.approx(6 / 7)  # 0.08 is outside of 1.645 x 0.03
-    assert row["wrist_yaw_coverage90"] == 0.0

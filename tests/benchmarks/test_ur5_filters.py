@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 
-from benchmarks.ur5.glimpse import project
-from benchmarks.ur5.motion import ArmMotion, open_loop, with_rates
-from benchmarks.ur5.sensors import TurnedWrist, side_of, wrist_of
+from benchmarks.ur5.motion import Motion
+from benchmarks.ur5.sensors import TurnedWrist, project, side_of, wrist_of
 from tests.benchmarks.ur5_for_tests import FACTS, states
 from torch_denkf.applications.ur5.simulation.domains import Domain
 
@@ -42,7 +41,7 @@ def test_a_clear_picture_decides_the_half_turn_and_an_open_one_leaves_it_to_the_
 
 def test_the_place_follows_the_joints_and_keeps_a_share_of_its_difference():
     torch.manual_seed(0)
-    motion = ArmMotion(FACTS)
+    motion = Motion(FACTS)
     state = torch.cat([states(6), 0.01 * torch.randn(6, 14)], -1)
     moved = motion(state)
     torch.testing.assert_close(moved[:, :7], state[:, :7] + moved[:, 10:17])
@@ -51,20 +50,6 @@ def test_the_place_follows_the_joints_and_keeps_a_share_of_its_difference():
     torch.testing.assert_close(moved[:, 17:], moved[:, 10:17] - state[:, 10:17])
     expected = motion.place(moved[:, :7]) + 0.5 * (state[:, 7:10] - motion.place(state[:, :7]))
     torch.testing.assert_close(moved[:, 7:10], expected)
-
-
-def test_open_loop_errors_are_those_of_a_constant_acceleration():
-    motion = ArmMotion(FACTS).double()
-    motion.damping.data.fill_(30.0)
-    motion.lasting.data.fill_(30.0)  # what moves goes on for ever
-    time = torch.arange(30.0, dtype=torch.double)
-    states = torch.cat([1e-5 * time.pow(3).unsqueeze(-1).expand(30, 7), torch.zeros(30, 3)], -1).unsqueeze(0)
-    found = open_loop(motion, states, ahead=(1, 5))
-    start = with_rates(states)[0, :25, [0, 10, 17]]
-    for n in (1, 5):
-        expected = start[:, 0] + n * start[:, 1] + n * (n + 1) / 2 * start[:, 2]
-        error = (states[0, n : n + 25, 0] - expected).abs().mean().rad2deg()
-        assert found[f"after_{n}_deg"] == pytest.approx(float(error), rel=1e-6)
 
 
 # ------------------------------------------------------------------------------------------------ sensors, filters

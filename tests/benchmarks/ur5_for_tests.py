@@ -2,7 +2,7 @@
 
 import torch
 
-from benchmarks.ur5.sensors import Statistics
+from benchmarks.common.arm.sensors import Statistics
 
 FACTS = Statistics(
     loc=torch.linspace(-1, 1, 10),
@@ -12,7 +12,7 @@ FACTS = Statistics(
     jerk=torch.full((7,), 0.001),
     pixel_loc=torch.full((3,), 0.5),
     pixel_scale=torch.full((3,), 0.2),
-    size=32,
+    size=(32, 32),
 )
 
 

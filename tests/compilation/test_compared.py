@@ -15,11 +15,9 @@ from tests.filters.gaussian_for_tests import linear_filter, linear_frames
 from tests.filters.test_contract import particles
 from torch_denkf.compilation import check_same_numbers, compared
 from torch_denkf.filters import EKF, Filter, KalmanFilter
-from torch_denkf.fusion import FusedFilter, FusedSensor
-from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, LinearTransition, MomentPrior, Select
+from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, MomentPrior, Select
 from torch_denkf.running import named_modules_of
 
-VERSION = tuple(map(int, torch.__version__.split(".")[:2]))
 needs_compiler = pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
 
 
@@ -65,25 +63,6 @@ def rounded(graph, inputs):
 # -------------------------------------------------------------------------------------------- errors of inductor
 
 
-def rows_of_a_jacobian(state):
-    _, pull_back = torch.func.vjp(lambda s: s.index_select(-1, torch.tensor([0, 1])), state[None])
-    return torch.func.vmap(lambda v: pull_back(v)[0])(torch.eye(2)[:, None]).squeeze(1)
-
-
-@needs_compiler
-@pytest.mark.slow
-@pytest.mark.skipif(VERSION >= (2, 15), reason="right in torch 2.15; Select avoids it for torch 2.13")
-def test_torch_still_adds_up_the_rows_of_a_jacobian_of_index_select():
-    """Tells when torch 2.13 is no longer supported: then `Select` may use index_select again, and this test may go."""
-    state = torch.zeros(4)
-    assert rows_of_a_jacobian(state).equal(torch.eye(4)[:2])
-    found = torch.compile(rows_of_a_jacobian)(state)
-    assert found.equal(torch.tensor([[1.0, 1.0, 0.0, 0.0]] * 2)), (
-        f"torch {torch.__version__} compiles vmap over the backward pass of index_select to {found.tolist()}; if these "
-        "are the first two rows of the identity, let modules.Select use index_select again, and delete this test"
-    )
-
-
 def ekf():
     """Four numbers that stand still, of which two are read."""
     return EKF(
@@ -97,26 +76,16 @@ def ekf():
     )
 
 
-def fused():
-    """Makes numbers that forget each step what they were, and are drawn again with a variance of .1."""
-    motion = LinearTransition(0.0 * torch.eye(4), 0.1 * torch.eye(4))
-    sensor = FusedSensor(Select([0, 1]), [0.5, 0.5], observation_key="observation")
-    return FusedFilter(motion, {"gps": sensor}, initial=MomentPrior(torch.zeros(4), torch.eye(4)))
-
-
 @needs_compiler
-@pytest.mark.parametrize(
-    ("make", "forecast"), [(ekf, 1.01), pytest.param(fused, 0.1, marks=pytest.mark.slow)], ids=["EKF", "FusedFilter"]
-)
 @pytest.mark.parametrize(
     "options", [{}, pytest.param({"backend": "inductor"}, marks=pytest.mark.slow)], ids=["passes", "plain"]
 )
-def test_two_of_four_numbers_are_read(make, forecast, options):
-    filter, reading = make(), torch.tensor([1.0, -2.0])
+def test_two_of_four_numbers_are_read(options):
+    filter, reading = ekf(), torch.tensor([1.0, -2.0])
     row = filter.initialise(TensorDict({"observation": reading}))
     with torch.no_grad():
         mean = filter.compile(**options).step(row)["belief", "mean"]
-    expected = torch.cat([forecast / (forecast + 0.25) * reading, torch.zeros(2)])
+    expected = torch.cat([1.01 / (1.01 + 0.25) * reading, torch.zeros(2)])
     torch.testing.assert_close(mean, expected, rtol=1e-6, atol=1e-7)
 
 
@@ -193,12 +162,7 @@ def precise():
     sums = torch.tensor([[1.0, 1.0, 1.0]])
     cov = 1e4 * torch.ones(3, 3) + torch.diag(torch.tensor([1.0, 2.0, 3.0]))
     filter = KalmanFilter(
-        torch.eye(3),
-        sums,
-        process_noise_cov=0 * torch.eye(3),
-        noise=[1e-2],
-        mean=torch.zeros(3),
-        cov=cov,
+        torch.eye(3), sums, process_noise_cov=0 * torch.eye(3), noise=[1e-2], mean=torch.zeros(3), cov=cov
     )
     return filter, filter.initialise(TensorDict({"observation": 100 * torch.randn(2, 1)}, [2]))
 
@@ -249,37 +213,37 @@ def test_it_draws_no_number_of_the_users():
     assert states[0].equal(states[1])
 
 
+NAMES = {"names": ["x"], "outputs": ["y"], "frames": [], "what": "thing", "cure": ""}
+
+
 def test_what_has_no_value_in_both_is_equal_and_in_one_is_not():
-    names = {"names": ["x"], "outputs": ["y"], "frames": [], "what": "thing", "cure": ""}
     nan = torch.tensor([1.0, torch.nan, torch.inf])
-    check_same_numbers(lambda x: 1 * x, lambda x: x, (nan,), **names)
+    check_same_numbers(lambda x: 1 * x, lambda x: x, (nan,), **NAMES)
     with pytest.raises(RuntimeError, match="'y' is up to inf off"):
-        check_same_numbers(lambda x: x.nan_to_num(), lambda x: x, (nan,), **names)
+        check_same_numbers(lambda x: x.nan_to_num(), lambda x: x, (nan,), **NAMES)
     with pytest.raises(RuntimeError, match="'y' is up to 1 off"):  # of marks, too
-        check_same_numbers(lambda x: x > 2, lambda x: x > 0, (nan,), **names)
+        check_same_numbers(lambda x: x > 2, lambda x: x > 0, (nan,), **NAMES)
 
 
 def test_half_precision_inside_rounds_as_such():
     """A compiler keeps more digits between two layers than the eager code, which writes them to memory in bfloat16."""
-    names = {"names": ["x"], "outputs": ["y"], "frames": [], "what": "thing", "cure": ""}
     x, weight = torch.randn(20, 50), torch.randn(50, 3)
 
     def half(x):
         return (x.bfloat16() @ weight.bfloat16()).float()
 
     assert (half(x) - x @ weight).abs().max() > 1e-3 * half(x).abs().max()
-    check_same_numbers(lambda x: x @ weight, half, (x,), **names)
+    check_same_numbers(lambda x: x @ weight, half, (x,), **NAMES)
     with pytest.raises(RuntimeError, match="'y' is up to"):
-        check_same_numbers(half, lambda x: x @ weight, (x,), **names)
+        check_same_numbers(half, lambda x: x @ weight, (x,), **NAMES)
 
 
 def test_numbers_drawn_inside_by_another_generator_are_no_error():
-    names = {"names": ["x"], "outputs": ["y"], "frames": [], "what": "thing", "cure": ""}
     own = torch.Generator().manual_seed(1)
     x = torch.zeros(100)
-    check_same_numbers(lambda x: x + torch.randn(100, generator=own), lambda x: x + torch.randn(100), (x,), **names)
+    check_same_numbers(lambda x: x + torch.randn(100, generator=own), lambda x: x + torch.randn(100), (x,), **NAMES)
     with pytest.raises(RuntimeError, match="'y' is up to"):
-        check_same_numbers(lambda x: x + 50, lambda x: x + torch.randn(100), (x,), **names)
+        check_same_numbers(lambda x: x + 50, lambda x: x + torch.randn(100), (x,), **NAMES)
 
 
 def test_running_means_are_those_of_the_step_alone():

@@ -17,7 +17,7 @@ from tests.filters.factories import (
     toy_denkf,
     toy_frames,
 )
-from torch_denkf.modules import ConstantNoise, LearnedObservation, StochasticMLP
+from torch_denkf.modules import EnsembleAnalysis, LearnedObservation, MomentPrior, StochasticMLP
 
 #: float32: a few roundings through eight steps; float64 likewise.
 TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
@@ -51,8 +51,8 @@ def test_compiled_is_eager_forward_and_backward(dtype):
 @pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
 @pytest.mark.parametrize("dtype", [torch.float32, pytest.param(torch.float64, marks=pytest.mark.slow)])
 def test_inductor_gives_the_eager_sequence_and_gradients_for_a_seed(dtype):
-    filter, frames, out = toy_denkf(action=False).to(dtype), toy_frames((2, 2), masks=0, resets=False), []
-    frames["measurement"] = frames["measurement"].to(dtype)
+    filter = linear_denkf("perturbed", noisy=True).with_modules(observation=LearnedObservation(nn.Linear(2, 2)))
+    filter, frames, out = filter.to(dtype), TensorDict({"observation": torch.randn(2, 2, 2, dtype=dtype)}, [2, 2]), []
     for chunk in (0, 1):
         torch.manual_seed(1)
         sequence = filter.compile(chunk=chunk).sequence(frames.copy())
@@ -86,16 +86,13 @@ def test_what_changes_after_compiling_is_noticed(monkeypatch):
         for model in (filter, compiled):
             change(model)
             sequence = model.sequence(frames.copy())
-            step = model.step(sequence[:, 1].copy())
             parameters = [p for p in model.parameters() if p.requires_grad]
-            loss = sequence["belief", "mean"].square().sum() + step["belief", "mean"].square().sum()
-            outs.append((sequence, step, torch.autograd.grad(loss, parameters)))
-        (eager, one, gradients), (ours, other, others) = outs
+            outs.append((sequence, torch.autograd.grad(sequence["belief", "mean"].square().sum(), parameters)))
+        (eager, gradients), (ours, others) = outs
         assert_close(ours, eager, filter.out_keys, torch.float32)
-        assert_close(other, one, filter.out_keys, torch.float32)
         for value, expected in zip(others, gradients, strict=True):
             torch.testing.assert_close(value, expected, rtol=2e-4, atol=2e-4)
-        means.append(torch.cat([eager["belief", "mean"], one["belief", "mean"].unsqueeze(1)], 1).detach())
+        means.append(eager["belief", "mean"].detach())
 
     def freeze(model, frozen):
         next(model["observation"].parameters()).requires_grad_(not frozen)
@@ -112,30 +109,23 @@ def test_what_changes_after_compiling_is_noticed(monkeypatch):
     assert means[-1].dtype == torch.double
 
 
-@pytest.mark.slow
 def test_a_new_filter_of_other_modules_or_options_compiles_its_own(float64):
-    frames = toy_frames((2, 3), masks=0, resets=False)
-    filter = toy_denkf().double().eval()
-    compiled = toy_denkf().double().eval().compile(chunk=2, backend="eager")
-    compiled.load_state_dict(filter.state_dict())
-    noise, means = ConstantNoise([1.0, 2.0], in_key="measurement"), []
+    frames = TensorDict({"observation": torch.randn(2, 3, 2)}, [2, 3])
+    compiled = linear_kalman().compile(chunk=2, backend="eager")
+    compiled.sequence(frames.copy())
     for change in (
-        lambda one: one,
-        lambda one: one.with_modules(noise=noise),
+        lambda one: one.with_modules(initial=MomentPrior(torch.zeros(2), torch.eye(2))),
         lambda one: one.with_options(update_at_reset=True),
     ):
-        outs = []
-        for model in map(change, (filter, compiled)):
-            torch.manual_seed(1)
-            out = model.sequence(frames.copy())
-            outs.append(torch.cat([out["belief", "mean"], model.step(out[:, 1].copy())["belief", "mean"][:, None]], 1))
-        torch.testing.assert_close(outs[1], outs[0], rtol=0, atol=1e-12)
-        assert model.compiled is not None
-        assert {kind[0] for kind in model.compiled._functions} == {"chunk", "step"}
-        means.append(outs[0])
-    assert model.compiled is not compiled.compiled
-    for other in means[1:]:
-        assert not torch.allclose(other, means[0])
+        other = change(compiled)
+        assert_close(
+            other.sequence(frames.copy()),
+            change(linear_kalman()).sequence(frames.copy()),
+            other.out_keys,
+            torch.float64,
+        )
+        assert {kind[0] for kind in other.compiled._functions} == {"chunk"}
+        assert other.compiled is not compiled.compiled
 
 
 def test_a_policys_data_go_on_from_what_is_stored(float64):
@@ -159,27 +149,18 @@ def test_a_policys_data_go_on_from_what_is_stored(float64):
     assert_close(eager[1, 0], step, filter.belief_keys, torch.float64)
 
 
-def test_a_stochastic_analysis_of_a_users_own_compiles(float64):
-    """And gives what the library's own gives for the same seed, compiled or not."""
+def test_a_stochastic_analysis_of_a_users_own_is_the_librarys(float64):
     frames, outs = TensorDict({"observation": torch.randn(3, 5, 2)}, [3, 5]), []
-    for analysis, chunk in ((None, 0), (Perturbed(), 0), (Perturbed(), 2)):
-        filter = random_draws(linear_denkf("perturbed", noisy=True))
-        if analysis is not None:
-            filter = filter.with_modules(analysis=analysis)
-        filter.compile(chunk=chunk, backend="eager")
+    for analysis in (EnsembleAnalysis("perturbed", observation_key="observation"), Perturbed()):
+        filter = random_draws(linear_denkf("perturbed", noisy=True).with_modules(analysis=analysis))
         torch.manual_seed(1)
-        out = filter.sequence(frames.copy())
-        step = filter.step(out[:, -1].copy())
-        outs.append(torch.cat([out["belief", "mean"], step["belief", "mean"].unsqueeze(1)], 1))
-    assert {kind[0] for kind in filter.compiled._functions} == {"chunk", "step"}
-    for out in outs[1:]:
-        torch.testing.assert_close(out, outs[0], rtol=0, atol=1e-12)
+        outs.append(filter.sequence(frames.copy())["belief", "mean"])
+    torch.testing.assert_close(*outs, rtol=0, atol=1e-12)
 
 
 def test_a_compiled_step_draws_its_noise_outside_and_anew():
-    filter = toy_denkf("perturbed").compile(chunk=1, backend="eager")
-    td = filter.initialise(toy_frames((2,), masks=0, resets=False))
-    means: list[torch.Tensor] = []
+    filter, means = linear_denkf("perturbed", noisy=True).compile(chunk=1, backend="eager"), []
+    td = filter.initialise(TensorDict({"observation": torch.randn(2, 2)}, [2]))
     for seed in (1, 1, 2):
         torch.manual_seed(seed)
         means.append(filter.step(td.copy())["belief", "mean"])

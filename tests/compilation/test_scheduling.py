@@ -30,6 +30,7 @@ def compiled(count, *arguments):
     return out, code[0].count("\nvoid ") + code[0].count('extern "C"  void')
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
 def test_twice_the_steps_need_no_more_functions(layers):
     x = torch.randn(1, 8)

@@ -15,7 +15,6 @@ from torch_denkf.data.episodes import hashed_share
 from torch_denkf.data.lerobot.rows import recording_from_rows
 from torch_denkf.filters import DEnKF
 from torch_denkf.objectives import DEnKFLoss
-from torch_denkf.training import FilterTrainer, Stage
 
 ROWS = 12
 
@@ -239,25 +238,14 @@ def test_episodes_that_do_not_fit_their_rows():
     fails(ValueError, "each of at least a row", rows, Episode("a", 0, 0), Episode("b", 0, 6))
 
 
-def test_losses_and_trainers_take_a_sample_as_it_is(tmp_path):
-    rows = TensorDict(
-        {
-            "observation": {
-                "image": torch.randint(256, (60, 3, 24, 24), dtype=torch.uint8),
-                "state": torch.rand(60, 2),
-            },
-            "episode": torch.arange(5).repeat_interleave(12),
-        },
-        batch_size=[60],
-    )
+def test_losses_take_a_sample_as_it_is():
+    pictures = torch.randint(256, (60, 3, 24, 24), dtype=torch.uint8)
+    rows = TensorDict({"observation": {"image": pictures, "state": torch.rand(60, 2)}}, [60])
+    rows["episode"] = torch.arange(5).repeat_interleave(12)
     data = LeRobotReplay(recording_from_rows(rows, fps=10.0), num_slices=3, slice_len=4)
     denkf = DEnKF.paper(state_dim=2, observation_dim=2, image_shape=(3, 24, 24), ensemble_size=4)
-    loss = DEnKFLoss(denkf, transition=0.0, sensor=0.0)
-    losses = loss(data.sample())
+    losses = DEnKFLoss(denkf, transition=0.0, sensor=0.0)(data.sample())
     sum(value for key, value in losses.items() if key.startswith("loss")).backward()
     gradients = [p.grad for p in denkf.parameters() if p.grad is not None]
     assert gradients
     assert all(g.isfinite().all() for g in gradients)
-    stage = Stage("fit", loss, lambda generator, length: data.sample(), updates=2)
-    trainer = FilterTrainer(denkf, [stage], out=tmp_path, device="cpu", progress=False)
-    assert trainer.fit()["fit"]["skipped"] == 0

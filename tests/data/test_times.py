@@ -8,13 +8,7 @@ import pytest
 
 from tests.data.recordings.own_files import write_csv
 from torch_denkf.data import Recording, RecordingReplay, Table
-from torch_denkf.data.times import interpolate, last_reading
-
-
-def test_a_reading_that_is_too_old_is_none_and_not_observed():
-    index, new = last_reading(np.array([0.0, 4.0]), np.arange(6.0), 1.0)
-    assert index.tolist() == [0, 0, -1, -1, 1, 1]
-    assert new.tolist() == [True, False, False, False, True, False]
+from torch_denkf.data.times import interpolate
 
 
 def test_no_line_across_a_gap_that_is_longer_than_the_tolerance():

@@ -12,10 +12,9 @@ from tests.deployment.test_export import needs_compiler
 from tests.filters.gaussian_for_tests import learned_filter, learned_frames
 from torch_denkf.baselines import IEnKS, LSTMFilter
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import EKF, DEnKF
+from torch_denkf.filters import EKF
 from torch_denkf.modules import (
     ConstantNoise,
-    EnsembleAnalysis,
     GaussianPrior,
     LearnedTransition,
     MomentPrior,
@@ -30,13 +29,6 @@ def bend(states):
     """A known motion that is not linear."""
     x, y, z = states.unbind(-1)
     return torch.stack([x + 0.3 * y.sin(), 0.9 * y - 0.1 * x**3, z.cos() * x], -1)
-
-
-class Downhill(nn.Module):
-    """A user's network that differentiates inside: each member goes down an energy."""
-
-    def forward(self, states):
-        return states - 0.1 * torch.func.grad(lambda x: (x.cos() * x.flip(-1)).sum())(states)
 
 
 def parts(motion):
@@ -65,10 +57,6 @@ def iterated():
     return IEnKS(**moved, initial=members(), iterations=2, observation_key="reading")
 
 
-def of_a_user():
-    return DEnKF(**parts(Downhill()), analysis=EnsembleAnalysis("etkf", observation_key="reading"), initial=members())
-
-
 def lstm():
     return LSTMFilter(None, observation_dim=2, state_dim=STATES, observation_key="reading", hidden_size=4, num_layers=2)
 
@@ -78,7 +66,6 @@ FILTERS = {
     "dEKF whose Jacobian is a constant": lambda: learned_filter("EKF", stop_jacobian_gradient=True),
     "EKF of a known motion": known_ekf,
     "IEnKS": iterated,
-    "DEnKF with a user's gradient": of_a_user,
     "LSTMFilter": lstm,
 }
 

@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from torch_denkf.compilation import trace_below_autograd
-from torch_denkf.deployment import export, export_step, load_step
+from torch_denkf.deployment import export, export_step, load_step, onnx_model
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, LearnedTransition, Select, StochasticMLP
 
@@ -103,24 +104,63 @@ def test_noise_drawn_inside_follows_the_seed_and_differs_from_step_to_step(tmp_p
     assert not first[0].equal(other[0])
 
 
-def test_errors(tmp_path, monkeypatch):
-    filter = small_filter()
-    example = TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)})
-    with pytest.raises(ValueError, match=r"ends in \.pt2"):
-        export_step(filter, example, tmp_path / "step.pt")
-    with pytest.raises(ValueError, match="does not write"):
-        export_step(filter, example, tmp_path / "step.pt2", out_keys=["nothing"], compiled=False)
-    with pytest.raises(KeyError, match="the example lacks"):
-        export_step(filter, example.exclude("reading"), tmp_path / "step.pt2", compiled=False)
-    with pytest.raises(FileNotFoundError, match="export_step"):
-        load_step(tmp_path / "none.pt2")
-    (tmp_path / "cut.pt2").write_bytes(b"PK")
-    with pytest.raises(ValueError, match="was cut"):
-        load_step(tmp_path / "cut.pt2")
-    other = torch.export.export(torch.nn.Linear(1, 1), (torch.zeros(1),))
-    torch.export.save(other, tmp_path / "other.pt2")
-    with pytest.raises(ValueError, match="not one of export_step"):
-        load_step(tmp_path / "other.pt2")
+def exported(folder, name="step.pt2", lacks=(), **options):
+    example = TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)}).exclude(*lacks)
+    return export_step(small_filter(), example, folder / name, **options)
+
+
+def loaded(name, content=None):
+    def load(folder):
+        if content is not None:
+            (folder / name).write_bytes(content)
+        return load_step(folder / name)
+
+    return load
+
+
+def others_program(folder):
+    torch.export.save(torch.export.export(nn.Linear(1, 1), (torch.zeros(1),)), folder / "other.pt2")
+    return load_step(folder / "other.pt2")
+
+
+def wrong_entry(folder):
+    step = load_step(exported(folder, compiled=False))
+    return step({**{name: torch.zeros(shape) for name, (shape, _) in step.inputs.items()}, "reading": torch.zeros(3)})
+
+
+ERRORS = {
+    "another suffix": (partial(exported, name="step.pt"), ValueError, r"ends in \.pt2"),
+    "another format": (partial(exported, format="tflite"), ValueError, 'format is "pt2" or "onnx"'),
+    "a suffix of another format": (partial(exported, format="onnx"), ValueError, r"ends in \.onnx"),
+    "no such output": (partial(exported, out_keys=["nothing"], compiled=False), ValueError, "does not write"),
+    "no reading": (partial(exported, lacks=["reading"], compiled=False), KeyError, "the example lacks"),
+    "no file": (loaded("none.pt2"), FileNotFoundError, "export_step"),
+    "a cut file": (loaded("cut.pt2", b"PK"), ValueError, "was cut"),
+    "a file that is no model": (
+        loaded("a.onnx", b"no model"),
+        ValueError,
+        r"a\.onnx is no ONNX model, or it is damaged",
+    ),
+    "another program": (others_program, ValueError, "not one of export_step"),
+    "another shape": (wrong_entry, ValueError, r"'reading' must be torch.float32 \[2\], got torch.float32 \[3\]"),
+}
+
+
+@pytest.mark.parametrize(("call", "error", "match"), ERRORS.values(), ids=ERRORS)
+def test_errors(call, error, match, tmp_path):
+    if "onnx" in match.lower():
+        pytest.importorskip("onnxruntime")
+    with pytest.raises(error, match=match):
+        call(tmp_path)
+
+
+def test_packages_that_are_not_installed_are_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ImportError, match=r"torch_denkf\[onnx\]"):
+        loaded("a.onnx", b"no model")(tmp_path)
+    monkeypatch.setattr(onnx_model, "find_spec", lambda name: None if name == "onnxscript" else 1)
+    with pytest.raises(ImportError, match=r"onnxscript.*torch_denkf\[onnx\]"):
+        exported(tmp_path, "step.onnx", format="onnx")
 
 
 class Wrong(nn.Module):

@@ -4,15 +4,13 @@ import json
 import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
-from torch import nn
 
 from tests.deployment.killed_saves import line, save
-from torch_denkf.deployment import folder as module
-from torch_denkf.deployment.folder import load_folder, save_folder
+from torch_denkf.compilation.lock import locked
+from torch_denkf.deployment.folder import load_folder
 
 ROOT = Path(__file__).parents[2]
 FILES = ["config.json", "weights.safetensors"]
@@ -32,43 +30,12 @@ def test_a_killed_save_leaves_the_old_model_or_the_new_one(tmp_path):
     assert all(each["later"] == FILES for each in found), "what a kill left goes with the next save"
 
 
-def test_two_savers_at_a_time(tmp_path, monkeypatch):
-    """The second is told to wait, and does not mix its weights into the first one's folder."""
-    inside, go_on = threading.Event(), threading.Event()
-    write = module.write_text
-
-    def slowly(*args):
-        inside.set()
-        go_on.wait()
-        write(*args)
-
-    monkeypatch.setattr(module, "write_text", slowly)
-    first = threading.Thread(target=save, args=(tmp_path, 3))
-    first.start()
-    inside.wait()
-    with pytest.raises(OSError, match=rf"cannot use {tmp_path}: another process is saving to it"):
-        save_folder(nn.Linear(2, 1), tmp_path, builder="line", settings={"size": 2})
-    go_on.set()
-    first.join()
-    assert load_folder(tmp_path, {"line": line}).in_features == 3
-
-
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
-def test_a_description_with_a_flipped_bit_is_told_of(tmp_path, share):
-    """Each bit of it counts, of numbers, names and the record alike; white space does not."""
-    save(tmp_path, 2)
-    file = tmp_path / "config.json"
-    text = file.read_text()
-    numbers = [place for place, letter in enumerate(text) if letter.isdigit() or letter == "."]
-    place = numbers[int(share * len(numbers))]
-    flipped = text[:place] + chr(ord(text[place]) ^ 1) + text[place + 1 :]
-    file.write_text(flipped)
-    with pytest.raises(
-        ValueError, match=r"config\.json (is damaged, or was changed by hand|is not JSON|does not describe)"
+def test_two_savers_at_a_time(tmp_path):
+    with (
+        locked(tmp_path, ".saving", "is saving to it"),
+        pytest.raises(OSError, match=rf"cannot use {tmp_path}: another process is saving to it"),
     ):
-        load_folder(tmp_path, {"line": line})
-    file.write_text(json.dumps(json.loads(text)))
-    assert load_folder(tmp_path, {"line": line}).in_features == 2
+        save(tmp_path, 2)
 
 
 @pytest.mark.parametrize(
@@ -90,3 +57,10 @@ def test_a_description_that_was_changed_is_told_of(tmp_path, change):
     (tmp_path / "config.json").write_text(json.dumps(config))
     with pytest.raises(ValueError, match=r"config\.json is damaged, or was changed by hand"):
         load_folder(tmp_path, {"line": line})
+
+
+def test_white_space_of_a_description_does_not_count(tmp_path):
+    save(tmp_path, 2)
+    file = tmp_path / "config.json"
+    file.write_text(json.dumps(json.loads(file.read_text())))
+    assert load_folder(tmp_path, {"line": line}).in_features == 2

@@ -7,22 +7,6 @@ import sys
 import time
 from pathlib import Path
 
-import pytest
-
-STUDY = """
-import os, signal, time
-from functools import partial
-from pathlib import Path
-from benchmarks.common.jobs import side_by_side
-
-def work(folder):
-    (Path(folder) / str(os.getpid())).touch()
-    time.sleep(600)
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs ignore it
-    side_by_side([partial(work, os.environ["FOLDER"])] * 2, 2, "study")
-"""
 PROGRAM = """
 import os, time
 from concurrent.futures import ProcessPoolExecutor
@@ -60,31 +44,5 @@ def test_workers_of_a_killed_parent_end(tmp_path):
         run.send_signal(signal.SIGKILL)
     until = time.monotonic() + 20
     while any(running(pid) for pid in workers):
-        assert time.monotonic() < until
-        time.sleep(0.05)
-
-
-@pytest.mark.parametrize(
-    "how", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)], ids=["killed", "interrupted"]
-)
-def test_workers_of_a_study_end_with_it(tmp_path, how):
-    file, folder = tmp_path / "study.py", tmp_path / "begun"
-    file.write_text(STUDY)
-    folder.mkdir()
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "FOLDER": str(folder)}
-    with subprocess.Popen([sys.executable, str(file)], stderr=subprocess.DEVNULL, env=environment) as run:
-        until = time.monotonic() + 120
-        while len(workers := [int(path.name) for path in folder.iterdir()]) < 2:
-            assert run.poll() is None
-            assert time.monotonic() < until
-            time.sleep(0.05)
-        assert all(map(running, workers))
-        run.send_signal(how)
-        try:
-            run.wait(60)
-        finally:
-            run.kill()
-    until = time.monotonic() + 20
-    while any(map(running, workers)):
         assert time.monotonic() < until
         time.sleep(0.05)

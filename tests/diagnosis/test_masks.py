@@ -65,13 +65,7 @@ def test_a_mask_that_the_analysis_does_not_read_is_said_once(way):
 
 
 @pytest.mark.parametrize(
-    "make",
-    [
-        linear_denkf,
-        linear_kalman,
-        lambda: bootstrap(20),
-        lambda: with_analysis(Perturbed(masked=True)),
-    ],
+    "make", [linear_denkf, linear_kalman, lambda: bootstrap(20), lambda: with_analysis(Perturbed(masked=True))]
 )
 def test_no_false_alarm_where_the_mask_is_read(make):
     filter = make()
@@ -112,6 +106,12 @@ def test_no_false_alarm_where_held_readings_are_hidden(case):
         filter.sequence(frames)
 
 
+def identity(**options):
+    one = torch.eye(2)
+    noises = {"process_noise": [1.0, 1.0], "noise": [1.0, 1.0]}
+    return KalmanFilter(one, one, **noises, mean=torch.zeros(2), cov=one, **options)
+
+
 class TestMasksThatNothingReads:
     def test_misspelt_mask_is_named_once(self):
         frames = readings(3, 5).set("obsrved", torch.zeros(3, 5, 1, dtype=torch.bool))
@@ -132,30 +132,18 @@ class TestMasksThatNothingReads:
     def test_mask_of_another_entry_is_left_alone(self):
         mask = torch.zeros(3, 5, 1, dtype=torch.bool)
         frames = readings(3, 5).update({"gps2": torch.zeros(3, 5, 1), "gps2_observed": mask})
-        matrices = {
-            "transition": torch.eye(2),
-            "observation": torch.eye(2),
-            "cov": torch.eye(2),
-            "mean": torch.zeros(2),
-        }
-        filter = KalmanFilter(**matrices, process_noise=[1.0, 1.0], noise=[1.0, 1.0], observed_key="gps_observed")
+        filter = identity(observed_key="gps_observed")
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             filter.sequence(frames)
         frames = frames.exclude("gps2")
-        filter = KalmanFilter(**matrices, process_noise=[1.0, 1.0], noise=[1.0, 1.0], observed_key="gps_observed")
+        filter = identity(observed_key="gps_observed")
         with pytest.warns(UserWarning, match="'gps2_observed'"):
             filter.sequence(frames)
 
     @pytest.mark.parametrize(("mask", "warns"), [("seen", True), ("observed", False)])
     def test_frames_that_go_missing_under_another_mask(self, mask, warns):
-        matrices = {
-            "transition": torch.eye(2),
-            "observation": torch.eye(2),
-            "cov": torch.eye(2),
-            "mean": torch.zeros(2),
-        }
-        filter = KalmanFilter(**matrices, process_noise=[1.0, 1.0], noise=[1.0, 1.0])
+        filter = identity()
         world = LinearGaussianEnv(torch.eye(2), torch.eye(2), transition_std=[1.0, 1.0], observation_std=[1.0, 1.0])
         env = TransformedEnv(world, MissingFrames(0.5, in_keys=["observation"], observed_key=mask))
         with warnings.catch_warnings(record=True) as said:

@@ -7,7 +7,6 @@ import torch
 
 from tests.diagnosis.noises_for_tests import AT, B, Given, Made, T, attitude, filter_of, run, sound_frames
 from tests.filters.factories import linear_system
-from torch_denkf import RejectReadings
 
 NAN = torch.nan
 R, Q = ("sensor", "noise"), ("forecast", "noise")
@@ -100,18 +99,6 @@ def test_the_noise_of_an_initial_belief_is_not_read(first):
     filter, frames = filter_and_frames("EKF", "R", "entry", "vector", [0.5, 0.3])
     frames["r"][:, 0] = first
     assert filter.sequence(frames)["belief", "mean"].isfinite().all()
-
-
-@pytest.mark.parametrize("wrong", [[-1.0, 0.3], [-0.02, 0.3], [[1.0, 2.0], [2.0, 1.0]], [[1.0, 50.0], [0.0, 1.0]]])
-@pytest.mark.parametrize("name", ["KalmanFilter", "EKF", "UKF"])
-def test_such_a_reading_is_missing_behind_reject_readings(name, wrong):
-    kind = "vector" if isinstance(wrong[0], float) else "matrix"
-    filter, frames = filter_and_frames(name, "R", "entry", kind, wrong)
-    hidden = frames.clone()
-    hidden["observed"][AT] = False
-    out = run(filter, RejectReadings({"observation": "observed"}, noises={"observation": "r"})(frames), "sequence")
-    assert out["info", "rejected"].sum() == 1
-    assert out["belief", "mean"].equal(run(filter, hidden, "sequence")["belief", "mean"])
 
 
 @pytest.mark.parametrize("name", SAMPLED)

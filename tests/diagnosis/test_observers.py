@@ -65,9 +65,10 @@ def run(filter, way):
     return 4
 
 
-@pytest.mark.parametrize("make", [linear_kalman, linear_denkf])
-@pytest.mark.parametrize("chunk", [0, 2])
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    ("make", "chunk", "way"),
+    [(make, 0, way) for make in (linear_kalman, linear_denkf) for way in WAYS] + [(linear_kalman, 2, "sequence")],
+)
 def test_a_run_is_seen_once(make, chunk, way):
     filter, seen = make().compile(chunk=chunk, backend="eager"), Seen()
     filter.observers.append(seen)

@@ -28,29 +28,6 @@ def by_hand(data):
     return held
 
 
-def frames(*entries):
-    """Frames of one reading each, ``[1]``."""
-    return [
-        TensorDict({"observation": torch.tensor([reading]), "observed": torch.tensor([seen])})
-        for reading, seen in entries
-    ]
-
-
-def test_values():
-    """Zero before the first reading; what a masked entry holds, NaN or a number, is never taken."""
-    hold = HoldReading()
-    first, *further = frames((NAN, False), (7.0, False), (2.0, True), (NAN, False), (0.0, False), (-1.0, True))
-    last = hold._reset(first, first)
-    values = [last["held"].item()]
-    for frame in further:
-        last = hold._step(last, frame)
-        values.append(last["held"].item())
-    assert values == [0.0, 0.0, 2.0, 2.0, 2.0, -1.0]
-    again = hold._reset(last, frames((NAN, False))[0])
-    assert again["held"].item() == 0
-    assert hold._reset(last, frames((5.0, True))[0])["held"].item() == 5
-
-
 def test_episodes_that_end_apart():
     """Rows of 3, 5 and 4 steps: each begins anew, and the others keep what they hold."""
     env = held_env(batch_size=[3], max_steps=[3, 5, 4])
@@ -61,6 +38,12 @@ def test_episodes_that_end_apart():
     began = data["step"].squeeze(-1).eq(0) & ~data["observed"].squeeze(-1)
     assert began.any()
     assert data["held"][began].eq(0).all()
+
+
+def test_a_reset_forgets_what_was_held():
+    for reading, seen, held in ((NAN, False, 0.0), (5.0, True, 5.0)):
+        frame = TensorDict({"observation": torch.tensor([reading]), "observed": torch.tensor([seen])})
+        assert HoldReading()._reset(TensorDict({"held": torch.tensor([2.0])}), frame)["held"].item() == held
 
 
 def test_environments_that_reset_by_themselves():

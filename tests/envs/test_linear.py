@@ -59,12 +59,3 @@ def test_seeds():
     state = torch.get_rng_state()
     make().reset()
     assert torch.get_rng_state().equal(state), "its own generator"
-
-
-def test_missing_readings():
-    rollout = make(batch_size=[200], missing=0.3).rollout(100)
-    observed = rollout["observed"].squeeze(-1)
-    n = observed.numel()
-    assert abs((~observed).sum() - 0.3 * n) < 5 * (n * 0.3 * 0.7) ** 0.5
-    assert rollout["observation"].isnan().all(-1).equal(~observed)
-    assert rollout["observation"].isnan().any(-1).equal(~observed)

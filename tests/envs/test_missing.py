@@ -21,12 +21,6 @@ def test_rate_mask_and_zeros(p):
         assert out[key][observed].equal(td[key][observed])
 
 
-def test_frames_are_dropped_independently():
-    observed = MissingFrames(0.5)(TensorDict({"pixels": torch.ones(100_001, 1, 1, 1)}, [100_001]))["observed"]
-    both = (observed[1:] & observed[:-1]).float().mean()
-    assert abs(both - 0.25) < 5 * (3 * 0.25 * 0.75 / 100_000) ** 0.5  # overlapping pairs: at most three times
-
-
 @pytest.mark.parametrize("width", [1, 2])
 def test_what_is_missing_already_stays_missing(width):
     before = torch.rand(5000, width) < 0.5

@@ -9,13 +9,13 @@ from torch_denkf.envs import NoisyPendulumEnv
 
 
 def test_motion_and_reward_are_those_of_gymnasium():
-    env = NoisyPendulumEnv(batch_size=[64])
+    env = NoisyPendulumEnv(batch_size=[16])
     torch.manual_seed(0)
     rollout = env.rollout(200)
     states, torques, rewards = rollout["state"], rollout["action"], rollout["next", "reward"]
-    for row in range(64):
+    for row in range(16):
         th, thdot = math.atan2(states[row, 0, 1], states[row, 0, 0]), states[row, 0, 2].item()
-        for step in range(40):
+        for step in range(20):
             u = torques[row, step].item()
             costs = ((th + math.pi) % (2 * math.pi) - math.pi) ** 2 + 0.1 * thdot**2 + 0.001 * u**2
             assert rewards[row, step].item() == pytest.approx(-costs, abs=2e-3)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.applications.ur5.data.ur5_demos import ten_demos
@@ -16,10 +16,6 @@ from torch_denkf.data import Episode, EpisodeReplay, LeRobotReplay
 from torch_denkf.data.lerobot.rows import recording_from_rows
 from torch_denkf.envs import ReplayEnv
 from torch_denkf.envs.replay import RecordedPolicy
-from torch_denkf.filters import DEnKF
-from torch_denkf.modules import ConstantNoise, GaussianPrior, LinearObservation
-from torch_denkf.submodel import SubModel
-from torch_denkf.transforms import DEnKFTransform
 
 LENGTHS = [6, 9, 4, 7]
 
@@ -158,45 +154,3 @@ def test_batched_environments(data, kind):
     finally:
         if not env.is_closed:
             env.close()
-
-
-# Actions --------------------------------------------------------------------------------------------------------------
-
-
-class Driven(SubModel):
-    """The state's second number becomes what was commanded."""
-
-    def __init__(self):
-        super().__init__(torch.nn.Identity(), [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
-
-    def compute(self, ensemble, action):
-        return torch.cat([ensemble[..., :1], action.unsqueeze(-2).expand(*ensemble.shape[:-1], 1)], -1)
-
-
-def test_a_filter_is_driven_by_what_the_policy_commands():
-    filter = DEnKF(
-        transition=Driven(),
-        sensor=None,
-        observation=LinearObservation(torch.eye(2)),
-        noise=ConstantNoise([1e6, 1e6], in_key="wheel"),
-        initial=GaussianPrior([0.0, 0.0], [1e-6, 1e-6], ensemble_size=8),
-        observation_key="wheel",
-    )
-    env = TransformedEnv(ReplayEnv(make(), batch_size=[2]), DEnKFTransform(filter))
-    recorded = env.rollout(4)
-    expected = 10.0 * torch.tensor([[0], [1]]) + torch.arange(4)
-    torch.testing.assert_close(recorded["next", "belief", "mean"][..., 1], expected, atol=1e-2, rtol=0)
-
-    def policy(tensordict: TensorDict) -> TensorDict:
-        return tensordict.set("action", torch.full((2, 1), -7.0))
-
-    env.set_seed(0)  # the first two episodes again
-    other = env.rollout(4, policy)
-    torch.testing.assert_close(other["next", "belief", "mean"][..., 1], torch.full((2, 4), -7.0), atol=1e-2, rtol=0)
-    # What was recorded goes on all the same.
-    assert (other["next", "state"][..., 1] == torch.arange(1, 5)).all()
-    now = env.reset()
-    assert env.base_env.policy(now)["action"].equal(now["recorded", "action"])
-
-
-# Errors ---------------------------------------------------------------------------------------------------------------

@@ -6,12 +6,10 @@ from tensordict import TensorDict
 from torchrl.envs import RenameTransform, TransformedEnv, check_env_specs
 from torchrl.modules.utils import get_env_transforms_from_module
 
-from tests.data.lerobot.lerobot_folder import actions, joints, write_version_2
 from tests.filters.factories import assert_equal, linear_system, toy_denkf
 from tests.objectives.test_kept_noise import log_ratio, make_policy, toy_fused, toy_particles
 from tests.transforms.envs_for_tests import toy_base_env
 from torch_denkf import DEnKF, DEnKFTransform, KalmanFilter, LinearGaussianEnv
-from torch_denkf.data import LeRobotReplay
 from torch_denkf.envs import LateActions
 from torch_denkf.functional.manifolds import SE2, SE3
 from torch_denkf.fusion import BeliefAhead, FusedFilter, FusedSensor
@@ -163,31 +161,6 @@ def test_a_pose_goes_on_along_its_screw(space, start):
     torch.testing.assert_close(out["ahead", "belief", "var"][0, -1], wide, rtol=tolerance, atol=0)
 
 
-def test_a_recorded_chunk_runs_after_the_inference_delay(tmp_path):
-    """The joints go half of the way to their command; a policy's chunk runs from two rows after its picture on."""
-    pytest.importorskip("pyarrow")
-    write_version_2(tmp_path, [9] * 5)
-    data = LeRobotReplay(tmp_path, dims=[0, 1], size=(8, 8), cache=None, split="all", num_slices=2, slice_len=9)
-    rows = torch.stack([data[9 * number : 9 * number + 9] for number in (0, 1)])
-    one = torch.eye(2)
-    start = {"mean": torch.zeros(2), "cov": one}
-    filter = KalmanFilter(0.5 * one, one, process_noise=[0.1] * 2, noise=[1e-6] * 2, control=0.5 * one, **start)
-    commands = rows["action"].unfold(1, K, 1).mT  # of rows t, t + 1 and t + 2
-    rows = TensorDict({key: rows[key][:, : 9 - K + 1].double() for key in ("state", "action")}, [2, 9 - K + 1])
-    rows = rows.update({"observation": rows["state"], NEXT: commands.double()})
-    out = filter.sequence(rows)
-    found = BeliefAhead(filter, K, each=True)(out.copy())["ahead", "belief", "mean"]
-    for episode in (0, 1):
-        by_hand = joints(episode, 9)[:, :2].astype("float64")
-        for t in range(1, 9 - K + 1):
-            state = by_hand[t]
-            for k in range(K):
-                state = 0.5 * state + 0.5 * actions(episode, 9)[t + k]
-                torch.testing.assert_close(found[episode, t, k], torch.from_numpy(state), rtol=0, atol=1e-5)
-    late = BeliefAhead(filter, "delay", most=K)(out.set("delay", torch.full((2, 9 - K + 1, 1), 2)))
-    torch.testing.assert_close(late["ahead", "belief", "mean"], found[:, :, 1])
-
-
 def late_world(filter, **transform):
     F, Q, H, R = linear_system()
     stds = Q.diagonal().sqrt(), R.sqrt()
@@ -221,11 +194,6 @@ def test_the_transform_looks_ahead_as_a_sequence_does(options):
     keys = [("ahead", *filter.outer(("belief", name))) for name in ("mean", "var")]
     assert_equal(data, expected, keys, atol=1e-12)
     assert_equal(data[1:, :-1]["next"], expected[1:, 1:], keys, atol=1e-12)
-
-
-def test_members_need_not_be_stored():
-    data = late_world(ensemble(), store_ensemble=False).rollout(4)
-    assert data["ahead", "belief", "mean"].isfinite().all()
 
 
 @pytest.mark.parametrize("make", [toy_denkf, toy_particles, toy_fused])
@@ -270,11 +238,3 @@ def test_what_is_missing_is_named():
         BeliefAhead(filter, "delay", most=2)(out.set("delay", torch.full((4, 6, 1), 3)))
     with pytest.raises(KeyError, match="keep names"):
         BeliefAhead(filter, K, keep=["ensemble"])
-
-
-def test_an_analysis_of_samples_can_do_without_them():
-    """``predict`` with the scheme ``"sensor"``: the belief is the forecast."""
-    filter = toy_denkf()
-    row = filter.initialise(TensorDict({"measurement": torch.randn(3, 4), "action": torch.randn(3, 2)}, [3]))
-    out = filter.predict(row)
-    torch.testing.assert_close(out["belief", "ensemble"], out["forecast", "ensemble"], rtol=0, atol=0)

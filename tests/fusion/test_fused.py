@@ -1,5 +1,7 @@
 """Several sensors in one filter: one Kalman filter of all readings in their order is the oracle."""
 
+import copy
+import pickle
 from dataclasses import replace
 from functools import partial
 
@@ -14,12 +16,12 @@ from torch.testing import assert_close
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check
-from torch_denkf.filters import EKF, DEnKF, Filter, KalmanFilter
+from torch_denkf.filters import EKF, DEnKF, KalmanFilter
 from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.manifolds import Circle, Euclidean
-from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
+from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.fusion.parts import JoinedReading
-from torch_denkf.imperfect import FadingBias, RejectReadings
+from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import (
     CholeskyNoise,
     ConstantNoise,
@@ -178,20 +180,6 @@ def test_late_readings_of_an_ensemble_whose_motion_is_known(float64, joint, patt
             assert_close(out["belief", name][:, now], expected["belief", name][:, -1], rtol=0, atol=1e-10)
 
 
-def test_late_readings_of_a_noisy_ensemble_within_the_error_of_its_members(float64):
-    """With process noise, members are only a sample of its covariance with the past: 1 / sqrt(E)."""
-    frames, late = readings(), PATTERNS["three steps late"]
-    errors = []
-    for count in (500, 8000):
-        torch.manual_seed(2)
-        members = torch.tensor([1.0, -1.0]) + torch.tensor([1.0, 2.0]).sqrt() * torch.randn(count, 2)
-        out = fused("ensemble", delay=DELAY, members=members).sequence(arriving(frames, late))
-        expected = fused("Kalman", delay=DELAY).sequence(arriving(frames, late))
-        errors.append((out["belief", "mean"] - expected["belief", "mean"]).square().mean().sqrt())
-    assert errors[1] < 0.02
-    assert errors[1] < 0.5 * errors[0]
-
-
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
 def test_what_belongs_to_the_time_before_an_episode_is_not_observed(float64, kind):
     frames = readings()
@@ -286,17 +274,6 @@ def inflated(frames, factor, *, noise=1.0, mean=None, cov=None):
     return means, covs, moved
 
 
-def test_inflation_is_that_of_readings_in_their_order_when_they_are_filtered_again(float64):
-    frames, late = readings(), PATTERNS["out of order"]
-    lately = {"late": ("second", "second_observed")}
-    out = Refiltering(fused("Kalman", analysis=SPREAD["Kalman"]), lately, DELAY).sequence(arriving(frames, late))
-    start = {"mean": torch.tensor([1.0, -1.0]), "cov": torch.diag(torch.tensor([1.0, 2.0]))}
-    for now in range(T):
-        means, covs, _ = inflated(arrived(frames, late, now), 1.3, **start)
-        assert_close(out["belief", "mean"][:, now], means[-1], rtol=0, atol=1e-10)
-        assert_close(out["belief", "cov"][:, now], covs[-1], rtol=0, atol=1e-10)
-
-
 def test_inflation_spreads_the_present_and_the_past_follows_where_a_lag_is_put_around(float64):
     """The smoother of Rauch, Tung and Striebel, by hand: it takes the inflated belief of the present for the belief."""
     frames, lag, F = readings(), 3, linear_system()[0]
@@ -343,51 +320,6 @@ def test_inflation_that_would_spread_the_past_is_refused(joint):
         FusedFilter(NoisyLinear(linear_system()[0]), own, initial=FixedEnsemble(members))
 
 
-@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
-def test_an_update_at_reset_sees_the_first_frame_and_no_late_one(float64, kind):
-    frames = readings()
-    for name in ("first", "second"):
-        frames[f"{name}_observed"][:] = True
-    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
-    given = {"members": members, "noisy": False} if kind == "ensemble" else {}
-    plain = fused(kind, **given)
-    late, order = arriving(frames, PATTERNS["three steps late"]), frames.copy()
-    order["second_observed"] = order["second_observed"].clone()
-    order["second_observed"][:, -DELAY:] = False
-    plain = plain.with_options(update_at_reset=True)
-    expected = plain.sequence(order)
-    F, Q, _, _ = linear_system()
-    motion = LinearTransition(F, Q) if kind == "Kalman" else NoisyLinear(F)
-    filter = FusedFilter(motion, sensors(delay=DELAY), initial=plain.initial, update_at_reset=True)
-    out = filter.sequence(late)
-    assert_close(out["belief", "mean"][:, -1], expected["belief", "mean"][:, -1], rtol=0, atol=1e-10)
-    first = filter.initialise(late[:, 0].select(*filter.structure.needed, *filter.structure.optional, strict=False))
-    assert_close(first["belief", "mean"], out["belief", "mean"][:, 0])
-
-
-@pytest.mark.parametrize("joint", [False, True])
-@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
-@pytest.mark.parametrize("delay", [0, DELAY])
-def test_readings_that_cannot_be_true_count_once_and_change_nothing(float64, kind, joint, delay):
-    frames = readings()
-    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
-    given = {"members": members, "noisy": False} if kind == "ensemble" else {}
-    filter = fused(kind, joint=joint, delay=delay, **given)
-    reject = RejectReadings({"first": "first_observed", "second": "second_observed"})
-    broken = frames.copy()
-    broken["second"] = frames["second"].clone()
-    broken["second_observed"][:, 4:6] = True
-    broken["second"][:, 4:6] = torch.nan
-    hidden = frames.copy()
-    hidden["second_observed"] = frames["second_observed"].clone()
-    hidden["second_observed"][:, 4:6] = False
-    outs = [filter.sequence(value.copy()) for value in (reject(broken), hidden)]
-    assert_close(outs[0]["belief", "mean"], outs[1]["belief", "mean"], rtol=0, atol=0)
-    count = outs[0]["info", "rejected"]
-    assert (count[:, 4:6] == 1).all()
-    assert count.sum() == 2 * B
-
-
 @pytest.mark.parametrize("joint", [False, True])
 @pytest.mark.parametrize("gaussian", [True, False])
 def test_the_gradient_reaches_everything_through_late_readings(float64, gaussian, joint):
@@ -417,57 +349,6 @@ def test_the_gradient_reaches_everything_through_late_readings(float64, gaussian
         lambda: sum(filter.sequence(frames.copy())["belief", key].square().sum() for key in ("mean", "var")),
         filter.parameters(),
     )
-
-
-def test_a_fused_filter_is_what_one_would_compose_by_hand(float64):
-    torch.manual_seed(0)
-    F, _, _, _ = linear_system()
-
-    def lamps(**keys):
-        torch.manual_seed(3)
-        return VectorSensor(4, 2, ensemble_size=8, num_cells=(8,), in_key="lamps", **keys)
-
-    start = FixedEnsemble(torch.randn(8, 2))
-    by_hand = Filter(
-        {
-            "camera_sensor": lamps(),
-            "camera_noise": ConstantNoise([0.3, 0.4]),
-            "wheel_noise": ConstantNoise([0.2], in_key="wheel", out_key="wheel_noise"),
-            "transition": NoisyLinear(F),
-            "camera_observation": Select([0, 1]),
-            "camera": EnsembleAnalysis("sensor", belief_prefix="middle", observed_key="camera_observed"),
-            "wheel_observation": Select([1], in_key=("middle", "ensemble"), out_key="wheel_predicted"),
-            "wheel": EnsembleAnalysis(
-                "etkf",
-                forecast_key=("middle", "ensemble"),
-                predicted_key="wheel_predicted",
-                observation_key="wheel",
-                noise_variance_key="wheel_noise",
-                observed_key="wheel_observed",
-            ),
-        },
-        initial=start,
-    )
-    built = FusedFilter(
-        NoisyLinear(F),
-        {
-            "camera": FusedSensor(
-                Select([0, 1]),
-                [0.3, 0.4],
-                sensor=lamps(),
-                analysis=lambda **keys: EnsembleAnalysis("sensor", **keys),
-            ),
-            "wheel": FusedSensor(Select([1]), [0.2]),
-        },
-        initial=start,
-    )
-    frames = TensorDict({"lamps": torch.randn(B, T, 4), "wheel": torch.randn(B, T, 1)}, [B, T])
-    frames["camera_observed"] = torch.rand(B, T, 1) < 0.5
-    frames = by_hand.draw_noise(frames)
-    expected = by_hand.sequence(frames.copy())
-    out = built.sequence(frames.copy())
-    assert out["belief", "ensemble"].equal(expected["belief", "ensemble"])
-    assert out["info", "wheel", "nis"].equal(expected["info", "wheel", "nis"])
 
 
 def test_angles_side_by_side(float64):
@@ -504,10 +385,7 @@ def test_covariances_of_readings_side_by_side(float64):
         def compute(self, like, *, batch_size):
             return cov.expand(*batch_size, 2, 2)
 
-    both = {
-        "pair": FusedSensor(LinearObservation(H), Constant([1.0, 1.0])),
-        "one": FusedSensor(Select([1]), [0.7]),
-    }
+    both = {"pair": FusedSensor(LinearObservation(H), Constant([1.0, 1.0])), "one": FusedSensor(Select([1]), [0.7])}
     frames = TensorDict({"pair": torch.randn(4, 2), "one": torch.randn(4, 1)}, [4])
     outs = []
     for joint in (False, True):
@@ -517,29 +395,22 @@ def test_covariances_of_readings_side_by_side(float64):
     assert_close(outs[0]["belief", "mean"], outs[1]["belief", "mean"], rtol=0, atol=1e-10)
 
 
-def with_lasting_errors(members=None, *, joint=False, delay=0, kind=None):
+def with_lasting_errors(*, joint=False, delay=0, kind=None):
     """Two sensors of the linear system, each with lasting errors, around one that has none."""
     F, Q, H, R = linear_system()
+    errors = [FadingBias([std], time, trainable=False) for std, time in ((0.8, 6.0), (1.5, 1e6))]
     sensors = {
-        "first": FusedSensor(
-            LinearObservation(H[:1]), R[:1].sqrt(), sensor_error=FadingBias([0.8], 6.0, trainable=False)
-        ),
+        "first": FusedSensor(LinearObservation(H[:1]), R[:1].sqrt(), sensor_error=errors[0]),
         "wheel": FusedSensor(LinearObservation(H[:1]), R[:1].sqrt()),
-        "second": FusedSensor(
-            LinearObservation(H[1:]), R[1:].sqrt(), delay=delay, sensor_error=FadingBias([1.5], 1e6, trainable=False)
-        ),
+        "second": FusedSensor(LinearObservation(H[1:]), R[1:].sqrt(), delay=delay, sensor_error=errors[1]),
     }
-    cov = torch.diag(torch.tensor([1.0, 2.0]))
-    if members is None:
-        noise, initial = known_noise(), MomentPrior(torch.tensor([1.0, -1.0]), cov)
-    else:
-        noise, initial = Q.diagonal().sqrt(), GaussianPrior([1.0, -1.0], cov.diagonal().sqrt(), ensemble_size=members)
+    options = {"initial": MomentPrior(torch.tensor([1.0, -1.0]), torch.diag(torch.tensor([1.0, 2.0]))), "joint": joint}
+    if kind is None:
+        return FusedFilter(NoisyLinear(F), sensors, process_noise=known_noise(), **options)
     if kind == "Kalman":
-        return FusedFilter(LinearTransition(F, Q), sensors, initial=initial, joint=joint)
-    if kind is not None:
-        motion = {"EKF": EKFTransition, "UKF": UKFTransition}[kind](NoisyLinear(F), noise)
-        return FusedFilter(motion, sensors, initial=initial, joint=joint)
-    return FusedFilter(NoisyLinear(F), sensors, initial=initial, process_noise=noise, joint=joint)
+        return FusedFilter(LinearTransition(F, Q), sensors, **options)
+    motion = {"EKF": EKFTransition, "UKF": UKFTransition}[kind](NoisyLinear(F), known_noise())
+    return FusedFilter(motion, sensors, **options)
 
 
 def lasting_errors_in_numpy(frames, Q):
@@ -612,15 +483,6 @@ def test_what_an_error_and_a_linear_motion_learn(float64, noise):
         directional_check(loss, [parameter])
 
 
-def test_errors_that_last_in_an_ensemble(float64):
-    frames = lasting_readings()
-    mean, cov = lasting_errors_in_numpy(frames, linear_system()[1].diagonal().diag())
-    torch.manual_seed(0)
-    out = with_lasting_errors(20000).sequence(frames)["belief"][:, -1]
-    assert_close(out["mean"], mean, rtol=0, atol=0.03)
-    assert_close(out["var"], cov.diagonal(dim1=-2, dim2=-1), rtol=0.05, atol=0)
-
-
 def test_each_component_of_a_reading_has_its_own_error(float64):
     """Puts the second sensor behind the error of the first: one Kalman filter of all three readings is the oracle."""
     F, Q, H, _ = linear_system()
@@ -642,46 +504,37 @@ def test_each_component_of_a_reading_has_its_own_error(float64):
 
 def test_what_is_refused():
     F, Q, H, R = linear_system(torch.float32)
-    moments, members = MomentPrior(torch.zeros(2), torch.eye(2)), GaussianPrior([0.0] * 2, [1.0] * 2, ensemble_size=4)
-    one = {"a": FusedSensor(LinearObservation(H), R.sqrt())}
-    with pytest.raises(ValueError, match="at least one sensor"):
-        FusedFilter(LinearTransition(F, Q), {}, initial=moments)
-    with pytest.raises(TypeError, match="sensors is a dict"):
-        FusedFilter(LinearTransition(F, Q), [one["a"]], initial=moments)
-    still, update = LearnedTransition(torch.nn.Identity(), residual=False), EnsembleAnalysis("etkf")
-    read, owned = (FusedSensor(Select([0]), [0.1], analysis=own) for own in (None, update))
-    for sensor, options in ((read, {"analysis": update}), (read, {"analysis": update, "joint": True}), (owned, {})):
-        with pytest.raises(TypeError, match=r"pass partial\(EnsembleAnalysis, \.\.\.\), not a module"):
-            FusedFilter(still, {"a": sensor}, initial=members, process_noise=[0.1] * 2, **options)
-    late = FusedFilter(
-        LinearTransition(F, Q), {"a": FusedSensor(LinearObservation(H), R.sqrt(), delay=1)}, initial=moments
-    )
+    moments = {"initial": MomentPrior(torch.zeros(2), torch.eye(2))}
+    members = {"initial": GaussianPrior([0.0] * 2, [1.0] * 2, ensemble_size=4)}
+    linear, noiseless, update = LinearTransition(F, Q), NoisyLinear(F), EnsembleAnalysis("etkf")
+
+    def one(**options):
+        return {"a": FusedSensor(LinearObservation(H), R.sqrt(), **options)}
+
+    module, lasting = r"pass partial\(EnsembleAnalysis, \.\.\.\), not a module", FadingBias([1.0] * 2, 5.0)
+    cases = [
+        (ValueError, "at least one sensor", linear, {}, moments),
+        (TypeError, "sensors is a dict", linear, [one()["a"]], moments),
+        (TypeError, module, noiseless, one(), {**members, "process_noise": 0.1, "analysis": update}),
+        (TypeError, module, noiseless, one(), {**members, "process_noise": 0.1, "analysis": update, "joint": True}),
+        (TypeError, module, noiseless, one(analysis=update), {**members, "process_noise": 0.1}),
+        (ValueError, "beyond lag=2", noiseless, one(delay=3), {**members, "lag": 2}),
+        (ValueError, "how late", noiseless, one(late_key="age"), members),
+        (TypeError, "is a FadingBias, or None; got float", noiseless, one(sensor_error=1.0), members),
+        (ValueError, "analysis of their own", noiseless, one(analysis=EKF), {**members, "joint": True}),
+    ]
+    for sensors in (one(), one(sensor_error=lasting)):
+        cases.append((ValueError, "writes an ensemble", linear, sensors, members))
+        cases.append((ValueError, "process noise already", linear, sensors, {**moments, "process_noise": 0.1}))
+        cases.append((ValueError, "need process_noise", noiseless, sensors, moments))
+    for error, match, motion, sensors, options in cases:
+        with pytest.raises(error, match=match):
+            FusedFilter(motion, sensors, **options)
+    wrong = TensorDict({"a": torch.zeros(3, len(H)), "a_observed": torch.ones(3, 1)}, [3])
     with pytest.raises(TypeError, match=r"a_observed.* must be boolean"):
-        late.sequence(TensorDict({"a": torch.zeros(3, len(H)), "a_observed": torch.ones(3, 1)}, [3]))
-    with pytest.raises(ValueError, match="writes an ensemble"):
-        FusedFilter(LinearTransition(F, Q), one, initial=members)
-    with pytest.raises(ValueError, match="process noise already"):
-        FusedFilter(LinearTransition(F, Q), one, initial=moments, process_noise=0.1)
-    with pytest.raises(ValueError, match="need process_noise"):
-        FusedFilter(NoisyLinear(F), one, initial=moments)
-    with pytest.raises(ValueError, match="beyond lag=2"):
-        FusedFilter(NoisyLinear(F), {"a": FusedSensor(LinearObservation(H), R, delay=3)}, initial=members, lag=2)
-    with pytest.raises(ValueError, match="how late"):
-        FusedFilter(NoisyLinear(F), {"a": FusedSensor(LinearObservation(H), R, late_key="age")}, initial=members)
+        FusedFilter(linear, one(delay=1), **moments).sequence(wrong)
     with pytest.raises(TypeError, match="carries a past already"):
-        FixedLag(FusedFilter(LinearTransition(F, Q), one, initial=moments, lag=3), 2)
-    lasting = {"a": FusedSensor(LinearObservation(H), R, sensor_error=FadingBias([1.0] * 2, 5.0))}
-    with pytest.raises(ValueError, match="writes an ensemble"):
-        FusedFilter(LinearTransition(F, Q), lasting, initial=members)
-    with pytest.raises(ValueError, match="process noise already"):
-        FusedFilter(LinearTransition(F, Q), lasting, initial=moments, process_noise=0.1)
-    with pytest.raises(ValueError, match="need process_noise"):
-        FusedFilter(NoisyLinear(F), lasting, initial=moments)
-    with pytest.raises(TypeError, match="is a FadingBias, or None; got float"):
-        FusedFilter(NoisyLinear(F), {"a": replace(lasting["a"], sensor_error=1.0)}, initial=members)
-    own = {"a": FusedSensor(LinearObservation(H), R, analysis=EKF)}
-    with pytest.raises(ValueError, match="analysis of their own"):
-        FusedFilter(NoisyLinear(F), own, initial=members, joint=True)
+        FixedLag(FusedFilter(linear, one(), **moments, lag=3), 2)
 
 
 @pytest.mark.parametrize(
@@ -696,3 +549,13 @@ def test_a_mask_that_the_sensor_would_not_read_is_refused(marker, observed):
             {"camera": FusedSensor(Select([0]), [1.0], sensor=camera, observed_key=observed)},
             initial=GaussianPrior([0.0], [1.0], ensemble_size=4),
         )
+
+
+def test_a_sensor_is_copied_pickled_and_changed_and_names_wrong_arguments():
+    with pytest.raises(TypeError, match=r"FusedSensor takes no argument 'dealy'; it takes .*delay, late_key"):
+        FusedSensor(Select([0]), [0.1], dealy=3)
+    with pytest.raises(TypeError, match="late_key of FusedSensor is a key"):
+        FusedSensor(Select([0]), [0.1], delay=3, late_key=5)
+    sensor = FusedSensor(Select([0]), [0.1], delay=3)
+    assert copy.deepcopy(sensor).delay == pickle.loads(pickle.dumps(sensor)).delay == 3
+    assert replace(sensor, delay=2).delay == 2

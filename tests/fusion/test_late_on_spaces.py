@@ -3,8 +3,6 @@
 import pytest
 import torch
 
-from tests.filters.beliefs_for_tests import close
-from tests.filters.factories import stepwise
 from tests.filters.test_spaces import (
     MEAN,
     SPACE,
@@ -106,16 +104,3 @@ def test_a_turned_world_turns_the_belief_and_nothing_else(kind, turn):
     data, turn = arriving(log(), LATE), SO3().exp(torch.tensor(turn))
     here, there = turned_beliefs(filter, turn, data)
     assert_turned(here, there, turn, 1e-9)
-
-
-@pytest.mark.slow
-def test_steps_and_compiled_steps_are_the_sequence_and_gradients_are_finite():
-    filter, data = orientations("EKF", late_key="late"), arriving(log(), LATE)
-    data["is_init"] = (torch.arange(T) % 8 == 0).reshape(1, T, 1).expand(B, T, 1).clone()
-    data["start"].requires_grad_()
-    out = filter.sequence(data.clone())
-    close(stepwise(filter, data.clone().detach()), out.detach(), filter.belief_keys, atol=1e-10)
-    (out[VAR].sum() + SPACE.minus(out[MEAN], data["state"]).square().sum()).backward()
-    assert data["start"].grad.isfinite().all()
-    filter.compile(chunk=2, backend="aot_eager")
-    close(filter.sequence(data.clone().detach()), out.detach(), filter.belief_keys, atol=1e-10)

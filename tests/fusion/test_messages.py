@@ -62,15 +62,6 @@ def test_a_log_gives_what_a_filter_gives_that_goes_from_message_to_message(float
     assert_close(out["belief", "cov"][-1].numpy(), cov, rtol=1e-9, atol=1e-11)
 
 
-@pytest.mark.slow
-def test_compiled(float64):
-    rows = message_rows(irregular_log(), start=0.0)
-    eager, compiled = (
-        each.sequence(rows.copy()) for each in (glider(), glider().compile(chunk=2, backend="aot_eager"))
-    )
-    assert_close(compiled["belief", "cov"], eager["belief", "cov"], rtol=1e-9, atol=1e-11)
-
-
 def test_delays_in_seconds_put_messages_where_they_belong(float64):
     log = irregular_log()
     late = [(stamp + 0.45 * (name == "speed"), name, *rest) for stamp, name, *rest in log]
@@ -159,6 +150,9 @@ def test_stamps_of_a_clock_that_counts_from_1970_keep_their_steps():
     assert_close(message_rows(log)["dt"][2:], torch.full((100, 1), 0.01), rtol=0, atol=1e-6)
 
 
+GPS = [(float(k), "gps", [0.1 * (k % 7)]) for k in range(20)]
+
+
 @pytest.mark.parametrize(
     ("log", "options", "message"),
     [
@@ -183,6 +177,18 @@ def test_stamps_of_a_clock_that_counts_from_1970_keep_their_steps():
         ([(0.0, "gps", [1.0])], {"driving": ["imu"]}, r"driving names \['imu'\]"),
         ([(0.0, "gps", [1.0])], {"delays": {"imu": 0.1}}, r"delays names \['imu'\]"),
         ([(0.0, "gps", [1.0])], {"delays": {"gps": float("nan")}}, "delay of 'gps'"),
+        (GPS, {"start": 19.5}, "start=19.5 is behind the last message, 19 s"),
+        (GPS, {"start": 1.7e9}, "start=1700000000.0 is behind the last message"),
+        (GPS, {"origin": {"imu": 1.0}}, r"origin names \['imu'\]"),
+        (GPS, {"origin": {"gps": [1.0, 2.0]}}, "origin of 'gps' must be a finite number, or 1 of them"),
+        (GPS, {"origin": {"gps": float("nan")}}, "origin of 'gps' must be a finite number"),
+        ([(0.0, "gps", np.ma.masked_equal([1.0, 2.0], 2.0))], {}, "Message 0, of 'gps', has masked"),
+        ([(0.0, "gps", [1.0], np.ma.masked_equal([2.0], 2.0))], {}, "Message 0, of 'gps', has masked"),
+        ([(np.ma.masked, "gps", [1.0])], {}, "Message 0, of 'gps', has masked"),
+        ([("now", "gps", [1.0])], {}, "Message 0, of 'gps', has a stamp that is no number: 'now'"),
+        ([(0.0, "gps", ["north"])], {}, "Message 0, of 'gps', has a value that is no number"),
+        ([(0.0, "gps", None)], {}, "Message 0, of 'gps', has a value that is no number"),
+        ([(0.0, "gps", [1.0], ["wide"])], {}, "Message 0, of 'gps', has a noise that is no number"),
     ],
 )
 def test_a_log_that_makes_no_sense_is_refused(log, options, message):

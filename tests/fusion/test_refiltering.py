@@ -138,54 +138,41 @@ def test_noise_that_is_not_given_is_drawn_once_and_actions_drive_the_next_step(f
 
 
 def test_what_is_refused(float64):
-    filter = fused("Kalman")
-    with pytest.raises(ValueError, match="lag"):
-        Refiltering(filter, LATE, 0)
-    frames = arriving(readings(), PATTERNS["out of order"])
-    with pytest.raises(KeyError, match="late"):
-        Refiltering(filter, LATE, DELAY).sequence(frames.copy().exclude("late"))
-    frames["is_init"][:, 4] = True
-    with pytest.raises(ValueError, match="cut it there"):
-        Refiltering(filter, LATE, DELAY).sequence(frames)
-    filter = filter.with_options(update_at_reset=True)
-    with pytest.raises(ValueError, match="update_at_reset"):
-        Refiltering(filter, LATE, DELAY)
-
-
-def test_an_entry_or_a_filter_that_would_be_misread_is_refused(float64):
     filter, frames = fused("Kalman"), arriving(readings(), PATTERNS["out of order"])
-    for late in ({"late": "second"}, {"late": ("second_observed",)}):
-        with pytest.raises(ValueError, match="last, of its mask"):
-            Refiltering(filter, late, DELAY)
-    for keys in (("second", "late"), ("third", "second_observed")):
-        with pytest.raises(ValueError, match="does not read"):
-            Refiltering(filter, {"late": keys}, DELAY)
-    for options in ({"delay": DELAY}, {"delay": DELAY, "late_key": "late"}):
-        for kind, joint in (("Kalman", False), ("Kalman", True), ("ensemble", False)):
-            with pytest.raises(ValueError, match="late twice"):
-                Refiltering(fused(kind, members=MEMBERS, joint=joint, **options), LATE, DELAY)
+    late = {"delay": DELAY}, {"delay": DELAY, "late_key": "late"}
+    twice = [fused("Kalman", joint=joint, **options) for options in late for joint in (False, True)]
+    twice += [fused("ensemble", members=MEMBERS, **options) for options in late]
+    for match, made, keys, lag in (
+        ("lag", filter, LATE, 0),
+        ("update_at_reset", filter.with_options(update_at_reset=True), LATE, DELAY),
+        ("last, of its mask", filter, {"late": "second"}, DELAY),
+        ("last, of its mask", filter, {"late": ("second_observed",)}, DELAY),
+        ("does not read", filter, {"late": ("second", "late")}, DELAY),
+        ("does not read", filter, {"late": ("third", "second_observed")}, DELAY),
+        *(("late twice", each, LATE, DELAY) for each in twice),
+    ):
+        with pytest.raises(ValueError, match=match):
+            Refiltering(made, keys, lag)
     refiltering = Refiltering(filter, LATE, DELAY)
-    with pytest.raises(ValueError, match=r"second_observed\.bool"):
-        refiltering.sequence(frames.copy().update({"second_observed": frames["second_observed"].double()}))
-    for dtype in (torch.float64, torch.bool):
-        with pytest.raises(ValueError, match=r"late\.long"):
-            refiltering.sequence(frames.copy().update({"late": frames["late"].to(dtype)}))
+    with pytest.raises(KeyError, match="late"):
+        refiltering.sequence(frames.copy().exclude("late"))
+    middle, ends = frames["is_init"].clone(), torch.zeros(B, T, 1, dtype=torch.bool)
+    middle[:, 4] = ends[1, 5] = True
     flat = TensorDict({**frames[0].to_dict(), "late": frames["late"][0, :, 0]}, [T])
-    with pytest.raises(ValueError, match=r"\[\*B, 1\]"):
-        refiltering.sequence(flat)
-
-
-def test_a_row_that_begins_another_episode_is_refused(float64):
-    refiltering, frames = Refiltering(fused("Kalman"), LATE, DELAY), arriving(readings(), PATTERNS["out of order"])
+    for match, wrong in (
+        ("cut it there", frames.copy().set("is_init", middle)),
+        ("cut it there", frames.exclude("is_init").set(("next", "done"), ends)),
+        (r"second_observed\.bool", frames.copy().set("second_observed", frames["second_observed"].double())),
+        (r"late\.long", frames.copy().set("late", frames["late"].double())),
+        (r"late\.long", frames.copy().set("late", frames["late"].bool())),
+        (r"\[\*B, 1\]", flat),
+    ):
+        with pytest.raises(ValueError, match=match):
+            refiltering.sequence(wrong)
+    refiltering.sequence(frames.exclude("is_init").set(("next", "done"), torch.zeros_like(ends)))
     rows = frames.unbind(1)
     with pytest.raises(ValueError, match="is_init"):
         refiltering.step(refiltering.start(rows[0]), rows[1].copy().update({"is_init": torch.ones(B, 1).bool()}))
-    frames = frames.exclude("is_init")
-    frames["next", "done"] = torch.zeros(B, T, 1, dtype=torch.bool)
-    refiltering.sequence(frames.copy())
-    frames["next", "done"][1, 5] = True
-    with pytest.raises(ValueError, match="cut it there"):
-        refiltering.sequence(frames)
 
 
 def test_a_dictionary_is_a_row_of_one_robot(float64):

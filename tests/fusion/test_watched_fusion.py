@@ -9,7 +9,6 @@ from tensordict.nn import TensorDictSequential
 from torch.testing import assert_close
 
 from tests.filters.factories import linear_kalman, linear_system
-from torch_denkf.deployment import export_step, load_step
 from torch_denkf.deployment.package import PackagedStep
 from torch_denkf.filters import Filter
 from torch_denkf.fusion import FusedFilter, FusedSensor
@@ -154,18 +153,6 @@ def test_two_analyses_in_one_place_have_gates_of_their_own(float64):
     out, expected = (each.sequence(readings(2, 9)) for each in (gated, Gated(fused(), rate=0.2)))
     assert (out["gate_u_1", "factor"] > 1).any()
     assert_close(out["belief", "mean"], expected["belief", "mean"])
-
-
-def test_a_package_reads_entries_that_are_parts_of_others(float64, tmp_path):
-    filter = fused(delay=2, update_at_reset=True)
-    row = filter.initialise(readings(2))
-    entries = {".".join(key) if isinstance(key, tuple) else key: value for key, value in row.items(True, True)}
-    joint = entries["belief.joint_mean"]
-    entries["belief.joint_mean"] = torch.stack([joint, joint], -1)[..., 0]
-    assert not all(value.is_contiguous() for value in entries.values())
-    step = load_step(export_step(filter, row.copy(), tmp_path / "step.pt2", compiled=False))
-    expected = filter.step(row.copy())
-    assert_close(step(entries)["belief.mean"], expected["belief", "mean"])
 
 
 def test_a_package_hands_its_code_entries_as_they_lay_in_the_example():

@@ -5,7 +5,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.baselines import BackpropKF, IEnKS
+from tests.filters.factories import linear_kalman
+from tests.filters.gaussian_for_tests import linear_filter
+from torch_denkf.baselines import IEnKS
 from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter, ParticleFilter
 from torch_denkf.imperfect import FadingBias
 from torch_denkf.imperfect.bias import BiasedBelief, BiasedNoise, BiasedObservation, BiasedTransition
@@ -79,29 +81,6 @@ def beside_the_oracle(filter):
     readings = simulate()[1]
     out = filter.sequence(TensorDict({"reading": torch.tensor(readings).unsqueeze(-1)}, [STEPS]))
     return out, *map(torch.tensor, augmented_kalman_filter(readings, START))
-
-
-@pytest.mark.parametrize("kind", [EKF, UKF])
-def test_gaussian_filters_are_the_augmented_kalman_filter(kind):
-    _, transition, q, observation, r = parts()
-    initial = MomentPrior(torch.zeros(4, dtype=torch.double), torch.tensor(START, dtype=torch.double).square().diag())
-    filter = kind(transition, None, observation, r, process_noise=q, initial=initial, observation_key="reading")
-    out, mean, cov = beside_the_oracle(filter)
-    torch.testing.assert_close(out["belief", "mean"], mean, atol=1e-9, rtol=1e-7)
-    torch.testing.assert_close(out["belief", "cov"], cov, atol=1e-9, rtol=1e-7)
-
-
-def test_an_ensemble_comes_close_to_it():
-    _, transition, q, observation, r = parts()
-    initial = GaussianPrior(
-        torch.zeros(4, dtype=torch.double), torch.tensor(START, dtype=torch.double), ensemble_size=20000
-    )
-    analysis = EnsembleAnalysis("etkf", observation_key="reading")
-    filter = DEnKF(NoisyTransition(transition, q), None, observation, r, analysis, initial=initial)
-    out, mean, cov = beside_the_oracle(filter)
-    std = cov.diagonal(dim1=1, dim2=2).sqrt()
-    assert ((out["belief", "mean"] - mean).abs() / std).max() < 0.08  # members say it to 0.7 % a step
-    assert (out["belief", "var"].sqrt() / std - 1).abs().max() < 0.05
 
 
 def test_biases_stay_as_large_and_are_correlated_as_said():
@@ -239,15 +218,9 @@ def test_the_option_of_particles_comes_close_to_it():
     std = cov.diagonal(dim1=1, dim2=2).sqrt()
     assert ((out["belief", "mean"] - mean).abs() / std).max() < 0.1
     assert (out["belief", "var"].sqrt() / std - 1).abs().max() < 0.1
+    moved = particles["transition"]
     with pytest.raises(ValueError, match="ResampledTransition holds its motion"):
-        ParticleFilter(
-            particles["transition"],
-            None,
-            Select([0]),
-            initial=particles.initial,
-            sensor_error=known_bias(),
-            observation_key="reading",
-        )
+        ParticleFilter(moved, None, Select([0]), initial=particles.initial, sensor_error=known_bias())
 
 
 def test_the_option_of_an_iterated_smoother_is_its_parts():
@@ -263,44 +236,7 @@ def test_the_option_of_an_iterated_smoother_is_its_parts():
             option.sequence(td.clone())["belief", key], by_hand.sequence(td.clone())["belief", key]
         )
     with pytest.raises(TypeError, match="BackpropKF takes no sensor_error"):
-        BackpropKF(
-            torch.eye(2),
-            None,
-            torch.eye(1, 2),
-            ConstantNoise([R], in_key="reading"),
-            process_noise_cov=torch.eye(2),
-            initial=MomentPrior(torch.zeros(2), torch.eye(2)),
-            sensor_error=known_bias(),
-            observation_key="reading",
-        )
-
-
-def test_steps_are_the_sequence_and_all_learns():
-    torch.manual_seed(0)
-    bias = FadingBias([0.5], time=4.0)
-    initial = GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=6)
-    r = ConstantNoise([R], in_key="reading")
-    filter = DEnKF(
-        motion().float(),
-        None,
-        Select([0]),
-        r,
-        initial=initial,
-        process_noise=0.1,
-        sensor_error=bias,
-        observation_key="reading",
-    )
-    td = filter.draw_noise(TensorDict({"reading": torch.randn(2, 5, 1)}, [2, 5]))
-    whole, belief = filter.sequence(td.copy()), None
-    assert whole["belief", "mean"].shape == (2, 5, 3)
-    for t in range(5):
-        row = td[:, t].copy()
-        belief = (filter.initialise(row) if belief is None else filter.step(row.update(belief))).select(
-            *filter.belief_keys
-        )
-        torch.testing.assert_close(belief["belief", "ensemble"], whole["belief", "ensemble"][:, t])
-    (whole["belief", "mean"].square().sum() + whole["belief", "var"].sum()).backward()
-    assert all(parameter.grad.abs() > 0 for parameter in (bias.log_std, bias.log_time))
+        linear_filter("BackpropKF", sensor_error=known_bias())
 
 
 def test_errors_of_a_factor():
@@ -310,17 +246,8 @@ def test_errors_of_a_factor():
     torch.testing.assert_close(read["forecast", "observation"], torch.tensor([[2.2, 2.0]]))
     read = BiasedObservation(Select([0, 1]), FadingBias([1.0] * 2, time=2.0, factor=True), dims=[1, 1])(td)
     torch.testing.assert_close(read["forecast", "observation"], torch.tensor([[2.0, 4 * 0.6]]))
-    one = torch.eye(1)
     with pytest.raises(ValueError, match="no factors"):
-        KalmanFilter(
-            one,
-            one,
-            process_noise=[1.0],
-            noise=[1.0],
-            mean=one[0],
-            cov=one,
-            sensor_error=FadingBias([1.0], 1.0, factor=True),
-        )
+        linear_kalman(sensor_error=FadingBias([1.0], 1.0, factor=True))
 
 
 def residuals(runs, steps, *, std=(2.0, 0.5), time=(10.0, 3.0), white=(0.5, 1.0), seed=0):
@@ -371,8 +298,5 @@ def test_white_residuals_and_few_are_refused():
         FadingBias.from_residuals(residuals(2, 20))
     with pytest.raises(ValueError, match=r"\[N, T, K\]"):
         FadingBias.from_residuals(torch.randn(50, 100))
-
-
-def test_of_one_run_nothing_is_the_runs_own():
     with pytest.raises(ValueError, match="about ten; got one"):
         FadingBias.from_residuals(residuals(1, 300), per_run=True)

@@ -9,7 +9,20 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torch.testing import assert_close
 
-from tests.imperfect.test_visible import BELIEF, KEY, MEAN, SEVERAL, STD, R, forecast, several
+from tests.filters.gaussian_for_tests import directional_check
+from tests.imperfect.test_visible import (
+    BELIEF,
+    KEY,
+    MEAN,
+    SEVERAL,
+    STD,
+    VISIBLE,
+    R,
+    around,
+    forecast,
+    hidden_in_part,
+    several,
+)
 from torch_denkf.functional.manifolds import SO3, Circle, Euclidean, Product
 from torch_denkf.imperfect import Contaminated, Visible
 from torch_denkf.imperfect.mixture import mix_moments
@@ -240,8 +253,7 @@ def test_shares_of_zero_and_of_one(name, dtype):
     """No outliers are the plain update bit for bit; nothing but wide outliers is the forecast."""
     inner = "particles" if name == "particles" else SEVERAL[name]().to(dtype)
     td = several(samples=name == "sensor", dtype=dtype)
-    likelihood = GaussianLikelihood(observation_key=KEY)
-    plain = TensorDictSequential(likelihood, ParticleAnalysis(likelihood)) if name == "particles" else inner
+    plain = around(name).to(dtype)
     alone = plain(td.clone())
     none = update_of(inner, 0.0).to(dtype)(td.clone())
     for key in [("belief", name) for name in BELIEF] + [("info", name) for name in SCORES]:
@@ -273,10 +285,7 @@ def test_masks_are_heeded(name):
     """Nothing observed is the forecast bit for bit; one component is a reading of one; NaN spoils no gradient."""
     inner = "particles" if name == "particles" else SEVERAL[name]()
     update = update_of(inner, "share", noise=[2.0, 1.5])
-    td = several(samples=name == "sensor")
-    td["observed"] = torch.tensor([[True, True], [False, False], [True, False]])
-    shown = td["observed"].unsqueeze(-2) if name == "sensor" else td["observed"]
-    td[KEY] = torch.where(shown, td[KEY], torch.nan)
+    td = hidden_in_part(name)
     td["sensor", "noise"] = torch.where(td["observed"], td["sensor", "noise"], torch.nan)
     share = torch.tensor([[0.4], [torch.nan], [0.3]], dtype=torch.float64, requires_grad=True)
     out = update(td.clone().set("share", share))
@@ -284,6 +293,7 @@ def test_masks_are_heeded(name):
     assert_close(out["belief", key][1], td["forecast", key][1], rtol=0, atol=1e-14)
     for score in ("nis", "log_likelihood", "outlier"):
         assert out["info", score][1].item() == 0
+    assert update_of(inner, 0.3)(td.clone())["info", "outlier"][1].item() == 0
     loss = out["belief", "mean"].sum() + out["info", "log_likelihood"].sum() + out["info", "nis"].sum()
     (gradient,) = torch.autograd.grad(loss, share)
     assert gradient.isfinite().all()
@@ -302,7 +312,7 @@ def test_masks_are_heeded(name):
 def test_gradients_are_those_of_finite_differences(name, reading):
     """Checks the gradients of belief and scores by logit of the share and logarithm of width or noise."""
     torch.manual_seed(0)
-    perturbation, step = torch.randn(40, 1, dtype=torch.float64), 1e-5
+    perturbation = torch.randn(40, 1, dtype=torch.float64)
     for wide in ({"width": 4.0}, {"noise": [1.7]}):
         update = update_of(ONE[name](), 0.3, trainable=True, **wide)
         parameters = list(update.parameters())
@@ -314,33 +324,7 @@ def test_gradients_are_those_of_finite_differences(name, reading):
             scores = td["info", "nis"].sum() + td["info", "log_likelihood"].sum() + td["info", "outlier"].sum()
             return td["belief", "mean"].sum() + 2 * td["belief", "var"].sum() + scores
 
-        gradients = torch.autograd.grad(value(), parameters)
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            with torch.no_grad():
-                differences = []
-                for sign in (1, -2):
-                    parameter += sign * step
-                    differences.append(value().item())
-                parameter += step
-            found = (differences[0] - differences[1]) / (2 * step)
-            assert gradient.sum().item() == pytest.approx(found, rel=1e-5, abs=1e-8)
-
-
-@pytest.mark.parametrize("name", ["etkf", "Kalman", "UKF", "particles"])
-def test_gradients_are_finite_far_out(name):
-    """Readings of NIS up to 1e6, in single precision, past the forecast and at it."""
-    inner = "particles" if name == "particles" else SEVERAL[name]()
-    update = update_of(inner, 0.2, width=10.0, trainable=True).float()
-    td = several(dtype=torch.float32)
-    td[KEY] = td["forecast", "mean"][:, :2] + torch.tensor([[0.0, 0.0], [20.0, 0.0], [1300.0, 0.0]])
-    ensemble = td["forecast", "ensemble"].requires_grad_()
-    out = update(td)
-    loss = out["belief", "mean"].square().sum() + out["belief", "var"].sum() - out["info", "log_likelihood"].sum()
-    loss = loss + out["info", "nis"].sum()
-    parameters = [*update.parameters(), *([ensemble] if name in ("etkf", "particles") else [])]
-    for gradient in torch.autograd.grad(loss, parameters):
-        assert gradient.isfinite().all()
-        assert (gradient != 0).any()
+        directional_check(value, parameters, rtol=1e-5)
 
 
 def sum_of(keys, out_key):
@@ -353,9 +337,7 @@ def test_share_and_width_come_from_entries_and_from_heads(name):
     """A head reads the plain update's innovation and an entry of the frame: the same as what it writes, as entries."""
     inner = "particles" if name == "particles" else SEVERAL[name]()
     td = several(samples=name == "sensor").set("light", torch.tensor([[0.1], [-1.0], [0.5]]).double())
-    likelihood = GaussianLikelihood(observation_key=KEY)
-    plain = TensorDictSequential(likelihood, ParticleAnalysis(likelihood)) if name == "particles" else inner
-    innovation = plain(td.clone())["info", "innovation"]
+    innovation = around(name)(td.clone())["info", "innovation"]
     share = (innovation.sum(-1, keepdim=True) + td["light"]).sigmoid()
     width = TensorDictModule(lambda light: 3 + light.exp(), ["light"], ["width"])
     heads = update_of(inner, sum_of([("info", "innovation"), "light"], "share"), width=width)
@@ -371,46 +353,6 @@ def test_share_and_width_come_from_entries_and_from_heads(name):
     for row in range(3):
         number = update_of(inner, share[row].item(), width=(3 + td["light"].exp())[row].item())
         assert_close(number(td[row].clone())["belief", "mean"], by_entry["belief", "mean"][row], rtol=0, atol=1e-6)
-
-
-def test_likelihoods_of_readings_find_share_and_width(float64):
-    """Readings of a forecast that is known, by their likelihood alone."""
-    torch.manual_seed(0)
-    count = 20_000
-    error = torch.randn(count, 1) * torch.where(torch.rand(count, 1) < 0.2, 2.0, 0.4)
-    td = TensorDict({"forecast": {"mean": torch.zeros(count, 1), "cov": 0.09 * torch.ones(count, 1, 1)}}, [count])
-    td["observation"] = 0.3 * torch.randn(count, 1) + error
-    update = Contaminated(KalmanAnalysis(EYE, 0.16 * EYE[0]), 0.5, width=2.0, trainable=True)
-    optimizer = torch.optim.LBFGS(update.parameters(), max_iter=30, line_search_fn="strong_wolfe")
-
-    def closure():
-        optimizer.zero_grad()
-        loss = -update(td.clone())["info", "log_likelihood"].mean()
-        loss.backward()
-        return loss
-
-    optimizer.step(closure)
-    logit, log_width = update.parameters()
-    assert logit.sigmoid().item() == pytest.approx(0.2, abs=0.01)
-    assert log_width.exp().item() == pytest.approx(5, abs=0.2)
-
-
-@pytest.mark.parametrize("name", ["etkf", "UKF", "particles"])
-def test_a_turn_more_is_the_same_reading(name):
-    space = Circle() * Euclidean(1)
-    likelihood = GaussianLikelihood(observation_key=KEY, reading_space=space)
-    inner = {
-        "etkf": lambda: EnsembleAnalysis("etkf", observation_key=KEY, reading_space=space),
-        "UKF": lambda: UKFAnalysis(Select([0, 1]), observation_key=KEY, reading_space=space),
-        "particles": lambda: ParticleAnalysis(likelihood),
-    }[name]()
-    update = TensorDictSequential(*([likelihood] if name == "particles" else []), Contaminated(inner, 0.4, width=3.0))
-    td = several()
-    turned = td.clone()
-    turned[KEY][..., 0] += 2 * math.pi
-    out, other = update(td), update(turned)
-    for key in (("belief", "mean"), ("belief", "var"), ("info", "outlier"), ("info", "log_likelihood")):
-        assert_close(out[key], other[key])
 
 
 def test_what_cannot_be_raises():
@@ -449,10 +391,50 @@ def test_a_head_learns_from_what_is_seen(name):
         assert_close(found, expected)
 
 
+#: An update around another, by the share that it writes.
+AROUND = {"visible": Visible, "outlier": lambda inner: Contaminated(inner, 0.4, width=10.0, trainable=True)}
+BOTH = pytest.mark.parametrize("share", AROUND)
+
+
+@BOTH
+@pytest.mark.parametrize("name", ["etkf", "Kalman", "UKF", "particles"])
+def test_gradients_are_finite_far_out(name, share):
+    """Readings of NIS up to 1e6, in single precision, past the forecast and at it."""
+    update = around(name, AROUND[share]).float()
+    td = several(dtype=torch.float32)
+    td[KEY] = td["forecast", "mean"][:, :2] + torch.tensor([[0.0, 0.0], [20.0, 0.0], [1300.0, 0.0]])
+    leaves = [td["forecast", "ensemble"].requires_grad_()] if name in ("etkf", "particles") else []
+    leaves += [td[VISIBLE].requires_grad_()] if share == "visible" else [*update.parameters()]
+    out = update(td)
+    assert out["info", "nis"].max() > (5e5 if share == "visible" else 5e4)
+    loss = out["belief", "mean"].square().sum() + out["belief", "var"].sum() - out["info", "log_likelihood"].sum()
+    for gradient in torch.autograd.grad(loss + out["info", "nis"].sum(), leaves):
+        assert gradient.isfinite().all()
+        assert (gradient != 0).any()
+
+
+@BOTH
+@pytest.mark.parametrize("name", ["etkf", "UKF", "particles"])
+def test_a_turn_more_is_the_same_reading(name, share):
+    keys = {"observation_key": KEY, "reading_space": Circle() * Euclidean(1)}
+    likelihood = GaussianLikelihood(**keys)
+    inner = {
+        "etkf": lambda: EnsembleAnalysis("etkf", **keys),
+        "UKF": lambda: UKFAnalysis(Select([0, 1]), **keys),
+        "particles": lambda: ParticleAnalysis(likelihood),
+    }[name]()
+    update = TensorDictSequential(*([likelihood] if name == "particles" else []), AROUND[share](inner))
+    td = several()
+    turned = td.clone()
+    turned[KEY][..., 0] += 2 * math.pi
+    out, other = update(td), update(turned)
+    for key in (("belief", "mean"), ("belief", "var"), ("info", share), ("info", "log_likelihood")):
+        assert_close(out[key], other[key])
+
+
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.3, 0.4])
 def test_particles_of_a_missing_observation_keep_their_weights_bit_for_bit(share):
-    likelihood = GaussianLikelihood(observation_key=KEY)
-    plain = TensorDictSequential(likelihood, ParticleAnalysis(likelihood)).float()
-    both = TensorDictSequential(likelihood, Contaminated(plain[1], share)).float()
-    td = several(samples=False).float().set("observed", torch.zeros(3, 1, dtype=torch.bool))
-    assert both(td.clone())["belief", "log_weight"].equal(plain(td.clone())["belief", "log_weight"])
+    td = several().float().set("observed", torch.zeros(3, 1, dtype=torch.bool))
+    contaminated = around("particles", lambda inner: Contaminated(inner, share)).float()
+    expected = around("particles").float()(td.clone())["belief", "log_weight"]
+    assert contaminated(td.clone())["belief", "log_weight"].equal(expected)

@@ -8,51 +8,13 @@ from tensordict.nn import TensorDictModule
 from torch.testing import assert_close
 
 from tests.filters import test_spaces as spaces
-from tests.filters.factories import FixedEnsemble, linear_denkf, linear_kalman, linear_system
-from tests.imperfect.test_visible_filters import CERTAIN, KINDS, MAKERS, certain, contaminated, frames
+from tests.imperfect.test_visible_filters import KINDS, MAKERS, contaminated, frames, late
 from torch_denkf.functional.manifolds import SO3
-from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
+from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import Contaminated
 from torch_denkf.imperfect.mixture import log_mixture, mix_moments
-from torch_denkf.modules import (
-    AroundState,
-    GaussianAround,
-    LearnedTransition,
-    LinearObservation,
-    LinearTransition,
-    MomentPrior,
-)
+from torch_denkf.modules import AroundState, GaussianAround
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss
-from torch_denkf.smoothers import EnRTS, FixedLag, RTSSmoother
-
-
-@pytest.mark.parametrize("name", CERTAIN)
-@pytest.mark.parametrize("lag", [0, 3])
-def test_certain_outliers_are_missing(float64, name, lag):
-    """A share of 0 is the reading, a share of 1 a missing observation, also for the past of a lag."""
-    told, masked = certain(frames(2, 9))
-    told["visible"] = 1 - told["visible"]
-    outs = []
-    for filter, td in ((contaminated(MAKERS[name](), width=1e6), told), (MAKERS[name](), masked)):
-        filter = FixedLag(filter, lag) if lag else filter
-        torch.manual_seed(3)
-        outs.append(filter.sequence(td.copy()))
-    for key in [*filter.belief_keys, *([("smoothed", "mean"), ("smoothed", "var")] if lag else [])]:
-        assert_close(outs[0][key], outs[1][key], rtol=0, atol=1e-5)
-
-
-def late(kind, r=1.0, *, analysis=None, delay=2):
-    F, Q, H, R = linear_system()
-    sensors = {
-        "late": FusedSensor(LinearObservation(H), r * R.sqrt(), delay=delay, analysis=analysis),
-        "own": FusedSensor(LinearObservation(H), R.sqrt()),
-    }
-    if kind == "ensemble":
-        moves = torch.nn.Linear(2, 2, bias=False)
-        moves.weight.data = F
-        members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
-        return FusedFilter(LearnedTransition(moves, residual=False), sensors, initial=FixedEnsemble(members))
-    return FusedFilter(LinearTransition(F, Q), sensors, initial=MomentPrior(torch.zeros(2), torch.eye(2)))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -91,47 +53,6 @@ def test_late_readings_have_the_moments_of_both_histories(float64, kind, delay):
     if delay and kind != "ensemble":
         ends = [out["smoothed", "mean"] for out in (mixed, sound, wide)]
         assert_close(ends[0], ends[2] + (1 - q) * (ends[1] - ends[2]), rtol=0, atol=1e-7)
-
-
-@pytest.mark.parametrize("name", ["etkf", "Kalman", "particles"])
-def test_late_readings_are_filtered_again(float64, name):
-    """Refiltering, which makes the steps again: the reading where it belongs."""
-    filter, td = contaminated(MAKERS[name](), 0.3, width=4.0), frames(6).exclude("visible", "is_init")
-    td["observed"] = torch.ones(6, 1, dtype=torch.bool)
-    td["observation"] = td["observation"].nan_to_num()
-    td["observed"][3] = False
-    filter.draw_noise(td)
-    delayed = td.copy()
-    delayed["late"] = torch.zeros(6, 1, dtype=torch.int64)
-    delayed["late"][-1] = 2
-    delayed["observation"][-1] = torch.tensor([2.0, -1.0])
-    order = td.copy()
-    order["observation"][3], order["observed"][3], order["observed"][-1] = torch.tensor([2.0, -1.0]), True, False
-    late = Refiltering(filter, {"late": ("observation", "observed")}, lag=2).sequence(delayed)
-    assert_close(late["belief", "mean"][-1], filter.sequence(order)["belief", "mean"][-1], rtol=0, atol=1e-12)
-
-
-def test_one_sensor_of_several_fails(float64):
-    """Each sensor has its own share; the belief stays near the truth where the other's readings are sound."""
-    td = frames(200, 12).rename_key_("observation", "late").exclude("visible", "observed")
-    td["late"], td["own"] = 0.3 * torch.randn(200, 12, 2), 0.3 * torch.randn(200, 12, 2)
-    wrong = torch.rand(200, 12, 1) < 0.3
-    td["late"] = torch.where(wrong, td["late"] + 5 * torch.randn(200, 12, 2), td["late"])
-    whole = late("EKF", delay=0, analysis=lambda *a, **k: Contaminated(KINDS["EKF"](*a, **k), 0.3, noise=[5.0, 5.0]))
-    plain = late("EKF", delay=0)
-    mixed, alone = (filter.sequence(td.copy()) for filter in (whole, plain))
-    assert ("info", "own", "outlier") not in mixed.keys(True, True)
-    found = mixed["info", "late", "outlier"][:, 1:] > 0.5
-    assert (found == wrong[:, 1:]).double().mean() > 0.9
-    errors = [out["belief", "mean"][:, 1:].square().mean() for out in (mixed, alone)]
-    assert errors[0] < 0.2 * errors[1]
-
-
-def test_smoothers_run_behind_it(float64):
-    td = frames(2, 8)
-    for make, smoother in ((linear_denkf, EnRTS), (linear_kalman, RTSSmoother)):
-        out = smoother(contaminated(make()))(td.copy())
-        assert_close(out["smoothed", "mean"][:, -1], out["belief", "mean"][:, -1])
 
 
 @pytest.mark.parametrize("name", MAKERS)

@@ -8,16 +8,14 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import ExcludeTransform, TransformedEnv, check_env_specs
-from torchrl.modules import set_recurrent_mode
 from torchrl.modules.utils import get_env_transforms_from_module
 
 from tests.borders.test_readings import from_sensor
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.transforms.envs_for_tests import base_env, toy_base_env, toy_filter
-from torch_denkf import DEnKF, DEnKFTransform, FusedFilter, FusedSensor, RejectReadings
+from torch_denkf import DEnKFTransform, RejectReadings
 from torch_denkf.functional.manifolds import SE2, SE3, SO3, Circle, Euclidean, Product
-from torch_denkf.modules import EKFAnalysis, LinearTransition, MomentPrior, Select
 
 NAN, INF = torch.nan, torch.inf
 COUNT = ("info", "rejected")
@@ -203,74 +201,6 @@ def drive(*batch, seed=0):
     observed = torch.rand(*batch, 1, generator=generator) < 0.8
     frames = TensorDict({"observation": torch.where(bad, values, clean), "observed": observed}, batch)
     return frames, TensorDict({"observation": torch.where(bad, 0.0, clean), "observed": observed & ~bad}, batch)
-
-
-@pytest.mark.parametrize("make", [linear_kalman, linear_denkf])
-def test_steps_sequences_and_modules_in_sequence(make):
-    frames, masked = drive(3, 12)
-    reject, filter = RejectReadings({"observation": "observed"}, by_component=["observation"]), make()
-    torch.manual_seed(0)
-    expected = filter.sequence(masked.copy())
-    torch.manual_seed(0)
-    both = TensorDictSequential(reject, filter)
-    with set_recurrent_mode(True):
-        out = both(frames.copy())
-    assert both.in_keys[:2] == ["observation", "observed"]
-    torch.manual_seed(0)
-    row, rows = filter.initialise(reject(frames[:, 0])), []
-    for t in range(1, 12):
-        row = filter.step(reject(row.update(frames[:, t])))
-        rows.append(row.clone())
-    for key in filter.belief_keys:
-        assert out[key].equal(expected[key])
-        torch.testing.assert_close(torch.stack([row[key] for row in rows], 1), expected[key][:, 1:])
-    count = (frames["observed"] & ~masked["observed"]).sum(-1, keepdim=True)
-    assert out[COUNT].equal(count)
-    assert torch.stack([row[COUNT] for row in rows], 1).equal(count[:, 1:])
-    assert count.sum() > 5
-
-
-def test_a_pixel_that_is_not_a_number():
-    torch.manual_seed(0)
-    filter, pixels = DEnKF.paper(3, 2, ensemble_size=8), torch.rand(2, 4, 6, 50, 150)
-    masked = TensorDict({"pixels": pixels.clone(), "observed": torch.ones(2, 4, 1, dtype=torch.bool)}, [2, 4])
-    pixels[1, 2, 3, 20, 30] = NAN
-    masked["pixels"][1, 2, 3, 20, 30], masked["observed"][1, 2] = 0.0, False
-    outs = []
-    for frames in (masked, RejectReadings({"pixels": "observed"})(TensorDict({"pixels": pixels}, [2, 4]))):
-        torch.manual_seed(1)
-        outs.append(filter.sequence(frames))
-    assert outs[1]["belief", "ensemble"].equal(outs[0]["belief", "ensemble"])
-    assert outs[1][COUNT].squeeze(-1).tolist() == [[0] * 4, [0, 0, 1, 0]]
-    filter.zero_grad()
-    outs[1]["belief", "mean"].square().sum().backward()
-    assert all(p.grad.isfinite().all() for p in filter.parameters() if p.grad is not None)
-
-
-def test_several_sensors_with_masks_and_noises_of_their_own():
-    one = torch.eye(2)
-    filter = FusedFilter(
-        LinearTransition(one, 0.1 * one),
-        {
-            "gps": FusedSensor(Select([0, 1]), "gps_noise", analysis=EKFAnalysis),
-            "wheel": FusedSensor(Select([1]), [0.3]),
-        },
-        initial=MomentPrior(torch.zeros(2), one),
-    )
-    frames = TensorDict({"gps": torch.randn(2, 6, 2), "wheel": torch.randn(2, 6, 1)}, [2, 6])
-    frames["gps_noise"] = torch.rand(2, 6, 2) + 0.5
-    masked = frames.clone()
-    masked["gps_observed"] = torch.ones(2, 6, 2, dtype=torch.bool)
-    masked["wheel_observed"] = torch.ones(2, 6, 1, dtype=torch.bool)
-    frames["gps"][0, 2, 1], frames["gps_noise"][1, 3, 0], frames["wheel"][1, 4] = NAN, -1.0, INF
-    masked["gps_observed"][0, 2, 1] = masked["gps_observed"][1, 3, 0] = masked["wheel_observed"][1, 4] = False
-    reject = RejectReadings(
-        {"gps": "gps_observed", "wheel": "wheel_observed"}, by_component=["gps"], noises={"gps": "gps_noise"}
-    )
-    out, expected = filter.sequence(reject(frames)), filter.sequence(masked)
-    for key in filter.belief_keys:
-        assert out[key].equal(expected[key])
-    assert out[COUNT].squeeze(-1).tolist() == [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 1, 0]]
 
 
 def test_gradients_of_a_reading_are_finite():

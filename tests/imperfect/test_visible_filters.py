@@ -7,13 +7,11 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch.testing import assert_close
-from torchrl.envs import TransformedEnv
 
-from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import FixedEnsemble, linear_denkf, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.particle_for_tests import bootstrap
-from torch_denkf import EKF, UKF, DEnKF, DEnKFTransform, ParticleFilter
+from torch_denkf import EKF, UKF, DEnKF, ParticleFilter
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.imperfect import Contaminated, Visibility, Visible
@@ -73,6 +71,10 @@ def frames(*batch):
     return td
 
 
+#: One of each. To trace a step takes seconds.
+TRACED = [("etkf", "visible"), ("Kalman", "outlier")]
+
+
 @BOTH
 @pytest.mark.parametrize("name", MAKERS)
 def test_steps_are_the_sequence_and_the_compiled_sequence(float64, name, share):
@@ -87,37 +89,14 @@ def test_steps_are_the_sequence_and_the_compiled_sequence(float64, name, share):
         belief = out.select(*filter.belief_keys)
         for key in filter.belief_keys:
             assert_close(belief[key], whole[key][:, t], rtol=0, atol=1e-12)
+    if (name, share) not in TRACED:
+        return
     compiled = filter.compile(chunk=2, backend="eager").sequence(td.copy())
     for key in filter.out_keys:
         assert_close(compiled[key], whole[key], rtol=0, atol=1e-12)
 
 
-@BOTH
-@pytest.mark.parametrize("name", ["etkf", "Kalman", "EKF"])
-def test_a_start_in_the_middle_is_a_start(float64, name, share):
-    filter, td = WRAPPED[share](MAKERS[name]()), frames(2, 8)
-    td["is_init"][:, 5] = True
-    whole, late = filter.sequence(td.copy()), filter.sequence(td[:, 5:].copy())
-    for key in filter.belief_keys:
-        assert_close(whole[key][:, 5:], late[key], rtol=0, atol=1e-12)
-
-
-@BOTH
-@pytest.mark.parametrize("name", ["etkf", "Kalman"])
-def test_it_goes_through_an_environment(float64, name, share):
-    filter, td = WRAPPED[share](MAKERS[name]()), frames(2, 6)
-    td["action"] = torch.zeros(2, 6, 1)
-    env = TransformedEnv(ReplayedFrames(td), DEnKFTransform(WRAPPED[share](MAKERS[name]())))
-    out = env.rollout(5, auto_reset=True)["next"]
-    whole = filter.sequence(td.copy())
-    for key in (("belief", "mean"), ("belief", "var")):
-        assert_close(out[key], whole[key][:, 1:], rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("share", "name"),
-    [("visible", "etkf"), ("visible", "EKF"), ("visible", "UKF"), ("outlier", "etkf"), ("outlier", "Kalman")],
-)
+@pytest.mark.parametrize(("share", "name"), [("visible", "EKF"), ("outlier", "etkf")])
 def test_a_packaged_step_is_the_step(name, share, tmp_path):
     options = {"share": 0.3, "width": 4.0} if share == "outlier" else {}
     filter, td = WRAPPED[share](MAKERS[name](), **options), frames(4).exclude("is_init")
@@ -138,45 +117,50 @@ def certain(td, key="observed"):
     return td.copy().set("visible", sees.to(torch.float64)), td.copy().set(key, td[key] & sees)
 
 
+@BOTH
 @pytest.mark.parametrize("name", CERTAIN)
 @pytest.mark.parametrize("lag", [0, 3])
-def test_certain_knowledge_is_a_mask(float64, name, lag):
+def test_certain_knowledge_is_a_mask(float64, name, lag, share):
+    """A sensor that does not see, or reads an outlier, for certain: a missing observation, also for a lag's past."""
     told, masked = certain(frames(2, 9))
-    outs = []
-    for filter, td in ((heeds(MAKERS[name]()), told), (MAKERS[name](), masked)):
+    if share == "outlier":
+        told["visible"] = 1 - told["visible"]
+    outs, options = [], {"width": 1e6} if share == "outlier" else {}
+    for filter, td in ((WRAPPED[share](MAKERS[name](), **options), told), (MAKERS[name](), masked)):
         filter = FixedLag(filter, lag) if lag else filter
         torch.manual_seed(3)
         outs.append(filter.sequence(td.copy()))
-    keys = [*filter.belief_keys, *([("smoothed", "mean"), ("smoothed", "var")] if lag else [])]
-    for key in keys:
-        assert_close(outs[0][key], outs[1][key], rtol=0, atol=1e-9)
+    for key in [*filter.belief_keys, *([("smoothed", "mean"), ("smoothed", "var")] if lag else [])]:
+        assert_close(outs[0][key], outs[1][key], rtol=0, atol=1e-5 if share == "outlier" else 1e-9)
 
 
 KINDS = {"ensemble": partial(EnsembleAnalysis, "etkf"), "EKF": EKFAnalysis, "UKF": UKFAnalysis}
 
 
-def late(kind, *, heeding, delay=2, broad=10.0):
+def late(kind, r=1.0, *, analysis=None, delay=2):
+    """A filter of a sensor that is late, and of one that is not."""
     F, Q, H, R = linear_system()
-    analysis = KINDS[kind]
-    if heeding:
-        analysis = lambda *args, **keys: Visible(KINDS[kind](*args, **keys), visible_key="visible", broad=broad)  # noqa: E731
-    sensors = {"late": FusedSensor(LinearObservation(H), R.sqrt(), delay=delay, analysis=analysis)}
+    sensors = {
+        "late": FusedSensor(LinearObservation(H), r * R.sqrt(), delay=delay, analysis=analysis),
+        "own": FusedSensor(LinearObservation(H), R.sqrt()),
+    }
     if kind == "ensemble":
         moves = torch.nn.Linear(2, 2, bias=False)
         moves.weight.data = F
         members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
         return FusedFilter(LearnedTransition(moves, residual=False), sensors, initial=FixedEnsemble(members))
-    initial = MomentPrior(torch.zeros(2), torch.eye(2))
-    return FusedFilter(LinearTransition(F, Q), sensors, initial=initial)
+    return FusedFilter(LinearTransition(F, Q), sensors, initial=MomentPrior(torch.zeros(2), torch.eye(2)))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("delay", [0, 2])
 def test_late_readings_of_which_it_is_certain(float64, kind, delay):
     td = frames(2, 9).rename_key_("observation", "late").rename_key_("observed", "late_observed")
+    td["own"], td["own_observed"] = torch.randn(2, 9, 2), torch.rand(2, 9, 1) < 0.5
     told, masked = certain(td, "late_observed")
-    out = late(kind, heeding=True, delay=delay).sequence(told)
-    expected = late(kind, heeding=False, delay=delay).sequence(masked)
+    heeding = lambda *args, **keys: Visible(KINDS[kind](*args, **keys), visible_key="visible")  # noqa: E731
+    out = late(kind, analysis=heeding, delay=delay).sequence(told)
+    expected = late(kind, analysis=KINDS[kind], delay=delay).sequence(masked)
     for key in (("belief", "mean"), ("belief", "var")):
         assert_close(out[key], expected[key], rtol=0, atol=1e-9)
 
@@ -201,11 +185,11 @@ def test_a_past_and_the_present_have_the_moments_of_one_mixture(float64):
     assert_close(mixed["belief", "ensemble"], Visible(analysis)(td.clone())["belief", "ensemble"], rtol=0, atol=1e-10)
 
 
-def test_smoothers_run_behind_it(float64):
-    td = frames(2, 8)
-    for make, smoother in ((linear_denkf, EnRTS), (linear_kalman, RTSSmoother)):
-        out = smoother(heeds(make()))(td.copy())
-        assert_close(out["smoothed", "mean"][:, -1], out["belief", "mean"][:, -1])
+@BOTH
+@pytest.mark.parametrize(("make", "smoother"), [(linear_denkf, EnRTS), (linear_kalman, RTSSmoother)])
+def test_smoothers_run_behind_it(float64, make, smoother, share):
+    out = smoother(WRAPPED[share](make()))(frames(2, 8))
+    assert_close(out["smoothed", "mean"][:, -1], out["belief", "mean"][:, -1])
 
 
 def test_a_gate_does_not_go_around_it_for_particles():
@@ -279,37 +263,19 @@ def test_labels_of_visibility_have_gaps():
     assert "loss_visible" not in SensorLoss(filter)(td)
 
 
-def test_a_step_without_the_reading_is_the_forecast(float64):
-    filter = learned("EKF").double()
-    td = filter.initialise(TensorDict({"measurement": torch.randn(4)}))
-    hidden = filter.step(td.copy().set("observed", torch.tensor([False])))
-    out = filter.predict(td.exclude("measurement"))
-    for key in filter.belief_keys:
-        assert_close(out[key], hidden[key])
-
-
 def test_a_fused_sensor_has_a_head_of_its_own(float64):
     torch.manual_seed(0)
-    filters = []
-    for heeding in (False, True):
-        torch.manual_seed(1)
-        sensor = VectorSensor(4, 1, ensemble_size=7, layer="none", in_key="measurement")
-        head = Visibility(1, encoding_key=("sensor", "ensemble"))
-        make = (
-            (lambda **keys: Visible(EnsembleAnalysis("etkf", **keys), visible_key=("sensor", "camera", "visible")))
-            if heeding
-            else partial(EnsembleAnalysis, "etkf")
-        )
-        camera = FusedSensor(Select([0]), [0.5], TensorDictSequential(sensor, head), analysis=make)
-        members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
-        moves = LearnedTransition(torch.nn.Linear(2, 2), residual=False)
-        filters.append(
-            FusedFilter(
-                moves, {"camera": camera, "gps": FusedSensor(Select([1]), [0.5])}, initial=FixedEnsemble(members)
-            )
-        )
-    td = TensorDict({"measurement": torch.randn(2, 5, 4), "gps": torch.randn(2, 5, 1)}, [2, 5])
-    plain, heeded = (filter.sequence(td.copy()) for filter in filters)
-    assert_close(heeded["sensor", "camera", "visible"], torch.full((2, 5, 1), 0.9))
-    assert heeded["info", "camera", "visible"].shape == (2, 5, 1)
-    assert (plain["belief", "mean"][:, 1:] != heeded["belief", "mean"][:, 1:]).all()
+    sensor = VectorSensor(4, 1, ensemble_size=7, layer="none", in_key="measurement")
+    head = Visibility(1, encoding_key=("sensor", "ensemble"))
+
+    def heeds_it(**keys):
+        return Visible(EnsembleAnalysis("etkf", **keys), visible_key=("sensor", "camera", "visible"))
+
+    sensors = {"gps": FusedSensor(Select([1]), [0.5])}
+    sensors["camera"] = FusedSensor(Select([0]), [0.5], TensorDictSequential(sensor, head), analysis=heeds_it)
+    moves = LearnedTransition(torch.nn.Linear(2, 2), residual=False)
+    filter = FusedFilter(moves, sensors, initial=FixedEnsemble(torch.randn(7, 2)))
+    out = filter.sequence(TensorDict({"measurement": torch.randn(2, 5, 4), "gps": torch.randn(2, 5, 1)}, [2, 5]))
+    assert_close(out["sensor", "camera", "visible"], torch.full((2, 5, 1), 0.9))
+    posterior = out["info", "camera", "visible"][:, 1:]
+    assert ((posterior > 0) & (posterior != 0.9)).all()

@@ -1,12 +1,9 @@
 """Oracles: counts by hand, binomial shares of known distributions, NumPy's quantiles."""
 
-import math
-
 import pytest
 import torch
 
 from tests.functional.checks import assert_refused
-from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.metrics import ensemble_interval_coverage, interval_coverage
 
 
@@ -32,12 +29,6 @@ def test_gaussian_interval_of_a_calibrated_belief(level):
     assert ((share - level).abs() < 5 * (level * (1 - level) / n) ** 0.5).all()
 
 
-def test_gaussian_interval_of_angles():
-    mean, truth = torch.tensor([[3.1, 3.1]]), torch.tensor([[-3.1, -3.1]])
-    share = interval_coverage(mean, torch.full((1, 2), 0.1**2), truth, space=Euclidean(1) * Circle())
-    assert share.tolist() == [0.0, 1.0]
-
-
 @pytest.mark.parametrize(("members", "level"), [(19, 0.9), (32, 0.9), (9, 0.8), (40, 0.5)])
 def test_ensemble_interval_of_a_calibrated_ensemble(members, level):
     n = 40_000
@@ -48,16 +39,6 @@ def test_ensemble_interval_of_a_calibrated_ensemble(members, level):
     exact = (1 - level) / 2 * (members + 1)
     slack = 0.0 if abs(exact - round(exact)) < 1e-9 else 0.005
     assert abs(share - level) < 5 * (level * (1 - level) / n) ** 0.5 + slack
-
-
-def test_ensemble_interval_of_angles():
-    ensemble = torch.linspace(math.pi - 0.1, math.pi + 0.1, 19).unsqueeze(-1)
-    ensemble = torch.remainder(ensemble + math.pi, 2 * math.pi) - math.pi  # on both sides of the cut
-    for truth, inside in ((math.pi - 0.05, 1.0), (-math.pi + 0.05, 1.0), (3 * math.pi, 1.0), (0.0, 0.0), (3.0, 0.0)):
-        share = ensemble_interval_coverage(ensemble, torch.tensor([truth]), space=Circle())
-        assert share.tolist() == [inside]
-    # Taken as numbers, members at both ends of [-pi, pi) span all directions.
-    assert ensemble_interval_coverage(ensemble, torch.tensor([0.0])).tolist() == [1.0]
 
 
 def test_errors_say_what_to_do():

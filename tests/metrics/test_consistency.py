@@ -1,13 +1,10 @@
 """Oracles: SciPy's distributions, and draws from a known Gaussian."""
 
-import math
-
 import pytest
 import torch
 from scipy import stats
 
 from tests.functional.checks import assert_refused
-from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.metrics import nees
 from torch_denkf.metrics.consistency import _chi_square_quantile
 
@@ -17,16 +14,6 @@ def gaussians(count=5, dims=3, seed=0):
     factor = torch.randn(count, dims, dims, generator=rng, dtype=torch.float64)
     mean, truth = torch.randn(2, count, dims, generator=rng, dtype=torch.float64)
     return mean, factor @ factor.mT + 0.1 * torch.eye(dims).double(), truth
-
-
-def test_angles_are_wrapped():
-    mean, truth = torch.tensor([[[0.0, 3.1]], [[0.0, -3.1]]], dtype=torch.float64)
-    turn = 2 * math.pi - 6.2
-    variance = torch.tensor([[1.0, 0.04]], dtype=torch.float64)
-    for covariance in (variance, torch.diag_embed(variance)):
-        torch.testing.assert_close(
-            nees(mean, covariance, truth, space=Euclidean(1) * Circle()).mean.item(), turn**2 / 0.04
-        )
 
 
 def test_nees_by_inverse():

@@ -25,21 +25,7 @@ def test_pit_is_the_normal_distribution_function():
     np.testing.assert_allclose(got.numpy(), stats.norm.cdf(error.numpy()), rtol=1e-12)
 
 
-def test_pit_is_uniform_under_the_right_distribution_and_known_under_a_wrong_one():
-    n, std = 100_000, 0.3
-    truth = 1 + std * torch.randn(n, 1, generator=rng(), dtype=torch.float64)
-    mean = torch.ones_like(truth)
-    assert stats.kstest(pit(mean, 0 * mean + std**2, truth).flatten().numpy(), "uniform").pvalue > 0.01
-    # A spread half as wide: P(pit <= u) = Phi(Phi^-1(u) / 2).
-    narrow = pit(mean, 0 * mean + (std / 2) ** 2, truth)
-    for u in (0.05, 0.3, 0.9):
-        expected = stats.norm.cdf(stats.norm.ppf(u) / 2)
-        assert float((narrow <= u).double().mean()) == pytest.approx(expected, abs=4 * 0.5 / n**0.5)
-
-
-def test_pit_of_angles_and_of_no_spread():
-    got = pit(torch.tensor([[3.1]]), torch.tensor([[1.0]]), torch.tensor([[-3.1]]), space=Circle())
-    assert got.item() == pytest.approx(stats.norm.cdf(2 * math.pi - 6.2), abs=1e-6)
+def test_pit_of_no_spread():
     mean = torch.zeros(3, 1)
     assert pit(mean, mean, torch.tensor([[-1.0], [0.0], [1.0]])).flatten().tolist() == [0.0, 0.5, 1.0]
 
@@ -61,12 +47,6 @@ def test_ranks_by_hand_with_ties():
     counts = rank_histogram(members, torch.tensor([[2.0], [0.0], [9.0]]))
     # A truth between two equal members: a third in each of the three gaps that they bound.
     np.testing.assert_allclose(counts.numpy(), [[1.0, 1 / 3, 1 / 3, 1 + 1 / 3]], atol=1e-12)
-
-
-def test_ranks_of_angles_on_both_sides_of_the_cut():
-    members = torch.tensor([[[3.0], [-3.0], [3.1]]])  # around 3.12
-    assert rank_histogram(members, torch.tensor([[-3.1]]), space=Circle()).tolist() == [[0, 0, 1, 0]]
-    assert rank_histogram(members, torch.tensor([[-3.1]])).tolist() == [[1, 0, 0, 0]]
 
 
 @pytest.mark.parametrize("space", [None, Circle() * Euclidean(1)])

@@ -17,7 +17,7 @@ from torch_denkf.metrics import (
     spread_skill_ratio,
     state_errors,
 )
-from torch_denkf.plots.histograms import histogram_band, rank_histogram, spread_error
+from torch_denkf.plots.histograms import rank_histogram, spread_error
 
 COUNT, E = 600, 9
 
@@ -82,25 +82,6 @@ def test_a_turn_of_the_world_changes_nothing(space, turn):
     for name, metric in (METRICS | RATIO).items():
         found, expected = metric(there, space=space), metric(here, space=space)
         torch.testing.assert_close(found, expected, msg=lambda m, n=name: f"{n}: {m}")
-
-
-@pytest.mark.parametrize("space", [SO3(), SE3()], ids=repr)
-def test_a_belief_that_is_drawn_like_its_truth_is_calibrated(space):
-    size = space.tangent_dim
-    factor = 0.3 * torch.eye(size) + torch.tril(0.1 * torch.ones(size, size), -1)
-    center = space.exp(torch.randn(COUNT, size))
-    truth = space.plus(center, torch.randn(COUNT, size) @ factor.mT)
-    members = space.plus(center.unsqueeze(-2), torch.randn(COUNT, E, size) @ factor.mT)
-    low, high = histogram_band(COUNT, E + 1, level=0.999)
-    ranks = rank_histogram(members, truth, space=space)
-    assert ((low <= ranks) & (ranks <= high)).all()
-    cov = factor @ factor.mT
-    result = nees(center, cov.expand(COUNT, -1, -1), truth, space=space, level=0.999)
-    assert result.lower < result.mean < result.upper
-    assert (nees(center, 0.8 * cov.expand(COUNT, -1, -1), truth, space=space, level=0.999).mean) > result.upper
-    inside = interval_coverage(center, cov.diagonal().expand(COUNT, -1), truth, space=space)
-    assert ((inside - 0.9).abs() < 4 * (0.09 / COUNT) ** 0.5).all()
-    assert (ensemble_interval_coverage(members, truth, level=0.8, space=space) - 0.8).abs().max() < 0.066  # 4 sigma
 
 
 def test_angles_between_orientations_are_those_of_scipy():

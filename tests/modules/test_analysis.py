@@ -79,16 +79,6 @@ def test_rotation_given_and_drawn(float64):
     assert not drawn.allclose(plain)
 
 
-@pytest.mark.parametrize("scheme", ["perturbed", "etkf"])
-def test_bulk_noise_is_what_a_step_would_use(float64, scheme):
-    module = EnsembleAnalysis(scheme, rotate=scheme == "etkf", draws="random")
-    td = inputs()
-    noise = module.draw_noise([3], members=E, observation_dim=OBS, dtype=torch.float64)
-    first = module(td.copy().set(("noise", "self"), noise))["belief", "ensemble"]
-    kwargs = {"rotation": noise} if scheme == "etkf" else {"perturbation": noise}
-    assert first.equal(expected(td, scheme, **kwargs).ensemble)
-
-
 def test_inflation_multiplies_the_components_that_it_is_told(float64):
     td = inputs()
     plain = EnsembleAnalysis("sensor")(td.clone())["belief"]

@@ -15,7 +15,7 @@ from torch_denkf.monitoring import GatedAnalysis
 from torch_denkf.running import random_parts
 from torch_denkf.smoothers import FixedLag
 from torch_denkf.smoothers.past import LaggedAnalysis, lagged
-from torch_denkf.submodel import Call, SubModel
+from torch_denkf.submodel import Call
 
 E, S, WIDTH = 6, 2, 2
 OWN = {"updates_ensemble", "aligned", "on_aligned"}  # of what goes around, a past and angles know nothing
@@ -142,11 +142,3 @@ def test_a_wrapper_in_a_filter_and_in_its_fixed_lag(float64):
         start = one.initialise(frames[:, 0].copy())
         moved = [filter.predict(start.copy())["belief", "mean"].shape for filter in (one, other)]
         assert moved[0] == moved[1]
-
-
-def test_a_sub_model_declares_no_more_than_every_part_needs():
-    attributes = [name for name, value in vars(SubModel).items() if not callable(value) and not name.startswith("_")]
-    assert [name for name in attributes if not isinstance(vars(SubModel)[name], property)] == [
-        "noise_names",
-        "tangents_of",
-    ]

@@ -87,10 +87,6 @@ class TestFromSensor:
         with pytest.raises(KeyError, match="FromSensor reads 'readng', which is missing"):
             filter.sequence(frames)
 
-    def test_missing_noise_is_named(self):
-        with pytest.raises(KeyError, match="'sensor', 'noise'"):
-            self.start()(TensorDict({("sensor", "ensemble"): torch.zeros(2)}))
-
 
 def test_noise_given(float64):
     noise = torch.randn(3, 4, 2)

@@ -6,10 +6,12 @@ from tensordict import TensorDict
 from torch import nn
 from torch.testing import assert_close
 
+from tests.filters.factories import has_compiler
 from tests.motions.steps_for_tests import MOTIONS, frame, random_points
 from tests.motions.test_readings import DEEP, READINGS
 from torch_denkf.applications.legged.motion import LeggedMotion, LeggedSpace
 from torch_denkf.applications.legged.readings import FeetInBody, FeetRates
+from torch_denkf.compilation import options_for_processors
 from torch_denkf.functional.jacobians import jacobian_of_network
 from torch_denkf.functional.manifolds import SO3, Euclidean, Opposite
 from torch_denkf.fusion.parts import JoinedObservation, LinearMembers, OfOwnErrors, StateObservation
@@ -25,9 +27,12 @@ from torch_denkf.modules import (
     LinearTransition,
     Select,
     StochasticMLP,
+    UKFAnalysis,
+    UKFTransition,
 )
 from torch_denkf.motions import AttitudeMotion, Gravity
-from torch_denkf.submodel import SubModel
+from torch_denkf.running import run_module
+from torch_denkf.submodel import Call, SubModel
 
 ACTIVATIONS = {
     "relu": nn.ReLU,
@@ -137,18 +142,50 @@ def test_a_transition_knows_its_jacobian_and_its_gradient(float64, monkeypatch, 
     assert_close(*both, rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize("batch", [(), (4,)])
-@pytest.mark.parametrize("name", OBSERVATIONS)
-def test_an_observation_knows_its_jacobian_and_its_gradient(float64, monkeypatch, name, batch):
+def reading(name, *batch, kind=EKFAnalysis):
+    """An update of an observation, and what it reads."""
     observation = OBSERVATIONS[name]()
     size = {"errors of others": 6}.get(name, 3)
     outputs = {"select": 3, "biased": 1, "biased factor": 2}.get(name, 2)
     mask = torch.rand(*batch, 1 if name == "side by side" else outputs) > 0.3
     td = entries(size, *batch, reading=torch.randn(*batch, outputs), noise=torch.rand(*batch, outputs), observed=mask)
     masks = {"observed_key": ("forecast", "observed")} if name == "side by side" else {}
-    update = EKFAnalysis(observation, observation_key="reading", noise_variance_key="noise", **masks)
-    both = known_and_differentiated(monkeypatch, update, td, parameters=list(observation.parameters()))
+    return kind(observation, observation_key="reading", noise_variance_key="noise", **masks), td
+
+
+@pytest.mark.parametrize("batch", [(), (4,)])
+@pytest.mark.parametrize("name", OBSERVATIONS)
+def test_an_observation_knows_its_jacobian_and_its_gradient(float64, monkeypatch, name, batch):
+    update, td = reading(name, *batch)
+    both = known_and_differentiated(monkeypatch, update, td, parameters=list(update.parameters()))
     assert_close(*both, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
+@pytest.mark.parametrize("kinds", [(EKFTransition, EKFAnalysis), (UKFTransition, UKFAnalysis)], ids=["EKF", "UKF"])
+@pytest.mark.parametrize("known", [True, False])
+def test_inductor_gives_the_eager_numbers_and_gradients(float64, monkeypatch, kinds, known):
+    """All in one graph, with their Jacobians and without: mapped backward passes meet errors of inductor's own."""
+    if not known:
+        monkeypatch.setattr("torch_denkf.modules.ekf.linearise", lambda *_: None)
+    noise = ConstantNoise([0.3] * 3, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    td = entries(3, 4, action=torch.randn(4, 2), dt=torch.rand(4, 1))
+    parts = [(kinds[0](make(), noise), td) for make in TRANSITIONS.values()]
+    parts += [reading(name, 4, kind=kinds[1]) for name in OBSERVATIONS]
+    rows = [dict(row.items(True, True)) for _, row in parts]
+    parameters = [parameter for module, _ in parts for parameter in module.parameters()]
+
+    def run():
+        pairs = zip(parts, rows, strict=True)
+        return [[*run_module(module, row, Call(torch.Size([4]))).values()] for (module, _), row in pairs]
+
+    found = []
+    for function in (run, torch.compile(run, fullgraph=True, dynamic=False, options=options_for_processors())):
+        values = [value for written in function() for value in written if value.is_floating_point()]
+        loss = sum(value.sin().sum() for value in values)
+        found.append([*values, *torch.autograd.grad(loss, parameters, materialize_grads=True)])
+    assert_close(*found, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ACTIVATIONS)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.modules import CholeskyNoise, GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
+from torch_denkf.modules import CholeskyNoise, GaussianAround, KalmanAnalysis, LinearTransition
 
 
 @pytest.fixture
@@ -25,23 +25,6 @@ def system(float64):
 
 def tensors(*arrays):
     return [torch.from_numpy(array) for array in arrays]
-
-
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_prior(system, batch):
-    m, P = tensors(system["m"], system["P"])
-    td = MomentPrior(m, P)(TensorDict({}, batch))
-    assert td["belief", "mean"].equal(m.expand(*batch, 3))
-    assert td["belief", "cov"].equal(P.expand(*batch, 3, 3))
-    assert td["belief", "var"].equal(P.diagonal().expand(*batch, 3))
-
-
-def test_transition(system):
-    F, Q, m, P = (system[name] for name in "FQmP")
-    td = TensorDict({"belief": dict(zip(("mean", "cov"), tensors(m, P), strict=True))})
-    out = LinearTransition(*tensors(F, Q))(td)
-    np.testing.assert_allclose(out["forecast", "mean"], F @ m, rtol=1e-13)
-    np.testing.assert_allclose(out["forecast", "cov"], F @ P @ F.T + Q, rtol=1e-13)
 
 
 @pytest.mark.parametrize("mask", [None, [True, False], [False, True], [False], [True]])

@@ -101,13 +101,6 @@ def test_learned_likelihood_of_what_is_observed():
     torch.testing.assert_close(out[1], model(at_mean)["forecast", "log_likelihood"])
 
 
-def test_learned_likelihood_takes_the_mean_of_members():
-    model = LearnedLikelihood(OBS, OBS, encoding_key=("sensor", "ensemble"))
-    td = reading((4,), members=3)
-    mean = td.clone().set(("sensor", "ensemble"), td["sensor", "ensemble"].mean(-2))
-    torch.testing.assert_close(model(td)["forecast", "log_likelihood"], model(mean)["forecast", "log_likelihood"])
-
-
 def test_learned_likelihood_sees_the_innovation():
     """By hand: the encoding, and the compressed innovation of the mean reading; nothing where not observed."""
     scale = torch.tensor([0.5, 3.0])

@@ -1,25 +1,16 @@
-"""Oracles: the global transform, the scalar Kalman update, torch's Normal, and the truth of a Lorenz-96 run."""
+"""Oracles: the global transform, the scalar Kalman update, torch's Normal, finite differences."""
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
-from benchmarks.common.lorenz96 import lorenz96_step
 from tests.filters.gaussian_for_tests import directional_check
 from tests.functional.checks import assert_refused
-from torch_denkf.filters import DEnKF
 from torch_denkf.functional import neighbours
 from torch_denkf.functional.inflation import relax_to_prior_spread
 from torch_denkf.functional.localisation import Neighbours, gaspari_cohn, neighbours_of_taper
-from torch_denkf.modules import (
-    AroundState,
-    ConstantNoise,
-    EnsembleAnalysis,
-    LearnedTransition,
-    LocalEnsembleAnalysis,
-    Select,
-)
+from torch_denkf.modules import EnsembleAnalysis, LocalEnsembleAnalysis
 
 E, S = 6, 12
 PLACES = torch.arange(S, dtype=torch.float64).unsqueeze(-1)
@@ -121,55 +112,12 @@ def test_only_what_an_observation_reaches_is_inflated_and_rotated(float64):
     torch.testing.assert_close(relaxed[:2], relax_to_prior_spread(plain, forecast, 0.7)[:2])
 
 
-def lorenz_filter(variables, members, **noise):
-    places = torch.arange(float(variables)).unsqueeze(-1)
-    return DEnKF(
-        LearnedTransition(lorenz96_step, residual=False),
-        None,
-        Select(range(variables)),
-        ConstantNoise(torch.ones(variables), in_key="reading", **noise),
-        LocalEnsembleAnalysis.around(
-            places, places, 4.0, period=[float(variables)], inflation=1.04, rotate=True, observation_key="reading"
-        ),
-        initial=AroundState(torch.ones(variables), ensemble_size=members),
-    )
-
-
-def lorenz_run(variables, batch, steps):
-    """A truth on the attractor, and all of it read with unit noise."""
-    state = 8 + torch.randn(batch, variables)
-    for _ in range(200):
-        state = lorenz96_step(state)
-    states = [state]
-    for _ in range(steps - 1):
-        states.append(lorenz96_step(states[-1]))
-    truth = torch.stack(states, 1)
-    return TensorDict({"state": truth, "reading": truth + torch.randn_like(truth)}, truth.shape[:2])
-
-
-def test_seven_members_follow_forty_variables(float64):
-    """Readings err by 1.0, long runs by 0.22 (benchmarks/lorenz96/results/schemes.md), without localisation by 4."""
-    run = lorenz_run(40, batch=4, steps=120)
-    with torch.no_grad():
-        out = lorenz_filter(40, members=7).sequence(run.clone())
-    error = (out["belief", "mean"] - run["state"])[:, 60:].square().mean().sqrt()
-    spread = out["belief", "var"][:, 60:].mean().sqrt()
-    assert error < 0.33
-    assert 0.7 < spread / error < 1.5
-    nis = out["info", "nis"][:, 60:].mean() / 40  # by itself each observation is consistent
-    assert 0.85 < nis < 1.15
-
-
 def test_gradients_equal_finite_differences(float64):
-    """Differentiates the error after three steps by log R, through the module and the dynamics."""
-    run, filter = lorenz_run(6, batch=2, steps=3), lorenz_filter(6, members=4, trainable=True)
-    run["noise", "initial"] = torch.randn(2, 3, 4, 6)
-    run = filter.draw_noise(run)
-
-    def loss():
-        return (filter.sequence(run.clone())["belief", "mean"] - run["state"]).square().mean()
-
-    directional_check(loss, [filter["noise"].log_variance])
+    """By all that is read."""
+    module, td = LocalEnsembleAnalysis.around(PLACES, PLACES, 1.0, inflation=1.1), inputs((2,))
+    keys = [(prefix, name) for prefix in ("forecast", "sensor") for name in td[prefix].keys()]  # noqa: SIM118
+    leaves = [td[key].requires_grad_() for key in keys]
+    directional_check(lambda: module(td.copy())["belief", "ensemble"].square().sum(), leaves)
 
 
 def test_what_would_never_be_trained_is_refused_by_name(float64):

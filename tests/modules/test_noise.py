@@ -57,13 +57,6 @@ def test_gradient_at_the_start(float64, r):
     assert model.module.layers[-1].weight.grad.abs().sum() > 0
 
 
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_constant(float64, batch):
-    out = variance(ConstantNoise([0.1, 2.0]), torch.randn(*batch, 8, 2), batch)
-    torch.testing.assert_close(out, torch.tensor([0.01, 4.0]).expand(*batch, 2), rtol=1e-14, atol=0)
-    assert not list(ConstantNoise([0.1]).parameters())
-
-
 def test_constant_in_the_finer_of_the_two_precisions():
     """1e-5 squared is zero in float16, which a camera or a log may use."""
     noise = ConstantNoise([1e-5], in_key="reading")
@@ -104,18 +97,3 @@ def test_scaled_variances_and_covariances(float64, batch):
         expected = expected if after.ndim == len(batch) + 1 else expected.diag_embed()
         torch.testing.assert_close(before, expected)
         torch.testing.assert_close(after, expected / 4)
-
-
-def test_scaled_noise_keeps_the_gain_and_scales_the_covariance(float64):
-    """K of (c^2 P, c^2 R) is K of (P, R); the analysis' covariance is c^2 times as large."""
-    forecast = torch.tensor([[2.0, 0.5], [0.5, 1.0]])
-    noise = ScaledNoise(ConstantNoise([0.3, 0.7]))
-
-    def analysis(factor):
-        noise.factor = factor
-        r = variance(noise, torch.zeros(2)).diag_embed()
-        gain = factor**2 * forecast @ torch.linalg.inv(factor**2 * forecast + r)
-        return gain, (torch.eye(2) - gain) @ (factor**2 * forecast)
-
-    for one, other, ratio in zip(analysis(1.0), analysis(3.0), (1.0, 9.0), strict=True):
-        torch.testing.assert_close(other, ratio * one)

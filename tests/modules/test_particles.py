@@ -6,7 +6,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
 from torch_denkf.functional.manifolds import Circle
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
@@ -102,17 +101,6 @@ def test_motion_noise_is_drawn_in_bulk_where_its_size_is_known():
     assert some.draw_noise([4, 2], state_dim=S) is None
     td = belief((4,)).set(("noise", "self"), torch.randn(4, E, S))
     torch.testing.assert_close(every(td)["forecast", "ensemble"], td["belief", "ensemble"] + 1 + td["noise", "self"])
-
-
-def test_motion_noise_before_the_motion_moves_the_pose():
-    noise = ConstantNoise([1.0, 0.1], in_key=("belief", "ensemble"))
-    td = TensorDict({("belief", "ensemble"): torch.zeros(50, 5)})
-    still = UnicycleTransition(torch.zeros_like, dt=0.1)
-    after = NoisyTransition(still, noise, [3, 4])(td.copy())["forecast", "ensemble"]
-    assert (after[:, :3] == 0).all()
-    before = NoisyTransition(still, noise, [3, 4], before=True)(td.copy())["forecast", "ensemble"]
-    torch.testing.assert_close(before[:, 2], 0.1 * before[:, 4])
-    torch.testing.assert_close(before[:, 0], 0.1 * before[:, 3] * (0.05 * before[:, 4]).cos())
 
 
 @pytest.mark.parametrize("weights", [False, True])

@@ -59,17 +59,6 @@ def test_infinite_scale_hides_a_feature(float64):
     assert first != other
 
 
-def test_the_mean_of_an_ensemble_is_read(float64):
-    keys = {"in_key": ("sensor", "ensemble"), "out_key": ("sensor", "noise")}
-    noise = CholeskyNoise(2, constant=False, **keys)
-    torch.nn.init.normal_(noise.module.layers[-1].weight)
-    samples = torch.randn(4, 7, 2)
-    many = noise(TensorDict({("sensor", "ensemble"): samples}, [4]))["sensor", "noise"]
-    mean = noise(TensorDict({("sensor", "ensemble"): samples.mean(1)}, [4]))["sensor", "noise"]
-    assert many.shape == (4, 2, 2)
-    torch.testing.assert_close(many, mean, rtol=1e-12, atol=0)
-
-
 @pytest.mark.parametrize(
     "inner", [CholeskyNoise(2, r=[0.5, 2.0], in_features=3), ConstantNoise([0.5, 2.0], **FORECAST)]
 )

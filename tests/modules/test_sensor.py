@@ -55,16 +55,6 @@ def test_members_are_separate_forwards_of_one_trunk(float64, layer, batch):
     assert not out[..., 0, :].equal(out[..., 1, :])  # members differ
 
 
-@pytest.mark.parametrize("layer", LAYERS)
-def test_noise_given_is_noise_drawn(layer):
-    sensor, frames = image_sensor(layer=layer), torch.rand(3, *SHAPE)
-    torch.manual_seed(1)
-    drawn = sensor(TensorDict({"pixels": frames}, [3]))["sensor", "ensemble"]
-    torch.manual_seed(1)
-    noise = draw(sensor, [3])
-    assert sensor(TensorDict({"pixels": frames, ("noise", "self"): noise}, [3]))["sensor", "ensemble"].equal(drawn)
-
-
 def test_uint8_is_divided_by_255():
     sensor = image_sensor(layer="none")
     frames = torch.randint(0, 256, (3, *SHAPE), dtype=torch.uint8)

@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from tests.filters.gaussian_for_tests import directional_check
 from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import UnicycleMotion, UnicycleNoise, UnicycleTransition
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
@@ -92,26 +93,11 @@ def test_unicycle_velocity_changes_before_the_pose_moves(float64):
     torch.testing.assert_close(out, moved(state[:, :3], velocity, 0.5), rtol=0, atol=1e-13)
 
 
-class Forecast(nn.Module):
-    """A transition as a function of tensors."""
-
-    def __init__(self, transition):
-        super().__init__()
-        self.transition = transition
-
-    def forward(self, state):
-        return forecast(self.transition, state)
-
-
 def test_unicycle_gradients(float64):
-    model = Forecast(UnicycleTransition(nn.Linear(2, 2), 0.1, loc=[1.0, 0.1], scale=[2.0, 0.3]))
-
-    def step(state, weight, bias):
-        parameters = {"transition.module.weight": weight, "transition.module.bias": bias}
-        return torch.func.functional_call(model, parameters, (state,))
-
-    inputs = [torch.randn(*shape, requires_grad=True) for shape in ((3, 5), (2, 2), (2,))]
-    assert torch.autograd.gradcheck(step, inputs)
+    net = nn.Linear(2, 2)
+    transition = UnicycleTransition(net, 0.1, loc=[1.0, 0.1], scale=[2.0, 0.3])
+    state = torch.randn(3, 5, requires_grad=True)
+    directional_check(lambda: forecast(transition, state).sin().sum(), [state, *net.parameters()])
 
 
 @pytest.mark.parametrize("batch", BATCHES)

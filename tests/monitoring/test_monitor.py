@@ -8,11 +8,10 @@ from scipy.stats import f as f_distribution
 from scipy.stats import norm
 from tensordict import TensorDict
 
-from torch_denkf import DEnKFTransform, LinearGaussianEnv
 from torch_denkf.filters import KalmanFilter
 from torch_denkf.functional import analyse
 from torch_denkf.monitoring import InnovationMonitor, Monitored, MonitoredSensor
-from torch_denkf.monitoring.change_detection import cusum_run_length, cusum_threshold
+from torch_denkf.monitoring.change_detection import cusum_threshold
 
 STATE, READ = 2, 2
 F = torch.tensor([[1.0, 0.1], [-0.1, 0.9]])
@@ -59,7 +58,7 @@ def test_false_alarms_of_one_step_come_at_their_rate(rate):
 
 
 def test_false_alarms_of_windows_come_at_their_rate():
-    out = Monitored(kalman(), monitor(window=5)).sequence(simulate(2000, 256))
+    out = Monitored(kalman(), monitor(window=5)).sequence(simulate(5000, 106))
     tests = out["monitor", "gps"][:, 5::5]  # windows that do not overlap; the first step sees no reading
     count = tests.numel()
     assert count > 1e5
@@ -82,19 +81,6 @@ def test_all_tests_of_all_sensors_share_the_false_alarms_equally(whiteness, nois
     for limit in (watch.p_limit, watch.whiteness_limit):
         assert limit.tolist() == pytest.approx([rate / tests] * 2)
     assert watch.cusum_limit.tolist() == pytest.approx([cusum_threshold(tests / rate)] * 2)
-
-
-@pytest.mark.slow
-def test_alarms_of_the_sum_come_after_its_run_length():
-    rate = 0.01
-    watch = monitor(false_alarm_rate=rate)
-    threshold = cusum_threshold(2 / rate)  # half of the rate is its own
-    assert watch.cusum_limit.item() == pytest.approx(threshold, rel=1e-6)
-    out = Monitored(kalman(), watch).sequence(simulate(1500, 1500))
-    passed = (out["monitor", "gps", "cusum"] > threshold).squeeze(-1)
-    length = torch.where(passed.any(1), passed.double().argmax(1), 1500).double()
-    expected = cusum_run_length(threshold)  # 200; run lengths are nearly exponential, and the scores are normal
-    assert length.mean().item() == pytest.approx(expected, rel=4 / 1500**0.5)
 
 
 def test_a_bias_of_the_reported_size_is_found_with_the_reported_power():
@@ -140,18 +126,18 @@ def test_calibration_finds_the_distribution_of_few_members():
     draws = torch.randn(count, members + 1, dim, generator=generator, dtype=torch.float64)
     noise = torch.full((count, dim), 1e-12, dtype=torch.float64)
     result = analyse(draws[:, 1:], draws[:, 1:], draws[:, 0], noise, scheme="etkf", space="observation")
-    clean = TensorDict({"info": {"innovation": result.innovation, "nis": result.nis}}, [count]).reshape(600, 100)
+    clean = TensorDict({"info": {"innovation": result.innovation, "nis": result.nis}}, [count]).reshape(1200, 50)
     watch = InnovationMonitor({"gps": MonitoredSensor("info", dim)}, window=1).double()
     naive = (watch.replay(clean)["monitor", "gps", "p_value"] < 0.01).double().mean()
     assert naive > 0.08  # eight times as many as promised
-    watch.calibrate([clean[:300]])
+    watch.calibrate([clean[:600]])
     for rate in (0.2, 0.01):
         # The value that Hotelling's distribution exceeds at this rate gets this p-value.
         factor = (members - 1) * dim / (members - dim) * (1 + 1 / members)
         value = torch.tensor([[factor * f_distribution.isf(rate, dim, members - dim)]], dtype=torch.float64)
         one = TensorDict({"info": {"innovation": value.sqrt().expand(1, dim), "nis": value}}, [1])
         assert watch.replay(one)["monitor", "gps", "p_value"].item() == pytest.approx(rate, rel=0.1)
-    fresh = watch.replay(clean[300:])["monitor", "gps", "p_value"]
+    fresh = watch.replay(clean[600:])["monitor", "gps", "p_value"]
     assert within_binomial_error((fresh < 0.01).double().mean().item(), 0.01, 30_000, 6.0)  # both sides are samples
 
 
@@ -190,26 +176,6 @@ def test_single_components_count_as_many_degrees_as_are_observed():
     assert within_binomial_error((p < 0.05).double().mean().item(), 0.05, 20_000)
 
 
-def test_steps_sequences_and_environments_agree():
-    runs, steps = 3, 25
-    env = LinearGaussianEnv(F, torch.eye(2), [0.2, 0.2], R.sqrt().tolist(), batch_size=[runs], seed=0)
-    watched = Monitored(kalman(), monitor(window=4))
-    rollout = env.append_transform(DEnKFTransform(watched)).rollout(steps)
-    found = rollout["next", "monitor"]
-    stream = torch.cat([rollout["observation"][:, :1], rollout["next", "observation"]], 1)
-    mask = torch.ones(runs, steps + 1, 1, dtype=torch.bool)
-    data = TensorDict({"observation": stream, "observed": mask}, [runs, steps + 1])
-    sequence = watched.sequence(data.clone())["monitor"][:, 1:]
-    td, later = watched.initialise(data[:, 0].clone()), []
-    for t in range(1, steps + 1):
-        td.update(data[:, t])
-        td = watched.step(td)
-        later.append(td["monitor"].clone())
-    for key in (("gps", "p_value"), ("gps", "cusum"), ("gps", "whiteness"), "alarm", "sensor"):
-        assert torch.allclose(found[key].double(), sequence[key].double(), atol=1e-5), key
-        assert torch.allclose(torch.stack(later, 1)[key].double(), sequence[key].double(), atol=1e-5), key
-
-
 def test_a_marked_beginning_forgets():
     data = simulate(2, 30)
     data["observation"][:, :15] += 40.0
@@ -228,17 +194,17 @@ def test_a_marked_beginning_forgets():
 def test_a_claimed_noise_that_jumps_raises_the_alarm():
     """A sensor that says itself that it sees nothing has innovations that are too small, not too large."""
     generator = torch.Generator().manual_seed(0)
-    noise = torch.exp(0.3 * torch.randn(4, 300, 1, generator=generator))
-    innovation = noise.sqrt() * torch.randn(4, 300, 1, generator=generator)
+    noise = torch.exp(0.3 * torch.randn(12, 100, 1, generator=generator))
+    innovation = noise.sqrt() * torch.randn(12, 100, 1, generator=generator)
     nis = innovation.square() / noise
-    data = TensorDict({"info": {"innovation": innovation, "nis": nis}, "sensor": {"noise": noise}}, [4, 300])
+    data = TensorDict({"info": {"innovation": innovation, "nis": nis}, "sensor": {"noise": noise}}, [12, 100])
     sensor = MonitoredSensor("info", 1, noise_key=("sensor", "noise"))
     watch = InnovationMonitor({"camera": sensor}).calibrate([data])
     blind = data.clone()
-    blind["sensor", "noise"][:, 200:] *= 50
-    blind["info", "nis"][:, 200:] /= 50
-    assert not watch.replay(data)["monitor", "alarm"][:, 200:].any()
-    assert watch.replay(blind)["monitor", "alarm"][:, 202:].all()
+    blind["sensor", "noise"][:, 60:] *= 50
+    blind["info", "nis"][:, 60:] /= 50
+    assert not watch.replay(data)["monitor", "alarm"][:, 60:].any()
+    assert watch.replay(blind)["monitor", "alarm"][:, 62:].all()
 
 
 def test_wrong_arguments_are_named():

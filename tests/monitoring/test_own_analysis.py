@@ -14,22 +14,13 @@ from torch_denkf.smoothers import EnRTS, FixedLag
 
 
 class Own(Update):
-    def __init__(
-        self,
-        observation_key="observation",
-        *,
-        forecast_key=("forecast", "ensemble"),
-        predicted_key=("forecast", "observation"),
-        noise_variance_key=("sensor", "noise"),
-        observed_key="observed",
-        belief_prefix="belief",
-    ):
-        writes = [(belief_prefix, name) for name in ("ensemble", "mean", "var")]
+    def __init__(self):
+        writes = [("belief", name) for name in ("ensemble", "mean", "var")]
         writes += [("info", name) for name in ("innovation", "nis", "log_likelihood")]
-        reads = [forecast_key, predicted_key, observation_key, noise_variance_key]
-        super().__init__(nn.Identity(), reads, writes, optional_keys=[observed_key])
+        reads = [("forecast", "ensemble"), ("forecast", "observation"), "observation", ("sensor", "noise")]
+        super().__init__(nn.Identity(), reads, writes, optional_keys=["observed"])
         self.predicted_key, self.reading_keys = self.in_keys[1], self.in_keys[2:]
-        self.observed_key, self.info_prefix = observed_key, "info"
+        self.observed_key, self.info_prefix = "observed", "info"
 
     def compute(self, forecast, predicted, reading, variance, observed=None):
         ensemble, *scores = analyse(forecast, predicted, reading, variance, scheme="etkf", observed=observed)

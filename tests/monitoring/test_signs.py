@@ -46,7 +46,7 @@ def test_a_monitor_shares_its_rate_with_signs_and_sees_them_in_blind_steps():
     sensor = MonitoredSensor("info", 1, sign_key="signs", signs=2)
     monitor = InnovationMonitor({"camera": sensor}, window=3, reference=1.5, false_alarm_rate=0.01)
     assert monitor.share == pytest.approx(0.01 / 3)  # window, cumulative sum, signs
-    monitor.calibrate([watched(200, 500, 0)])
+    monitor.calibrate([watched(1000, 100, 0)])
     quantile = math.exp(-torch.special.ndtri(torch.tensor(0.01 / 6, dtype=torch.float64)).item())
     assert monitor.sign_limit_camera.tolist() == pytest.approx([quantile] * 2, rel=0.08)
     fresh = watched(200, 100, 1)

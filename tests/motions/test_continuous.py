@@ -125,18 +125,3 @@ def test_a_covariance_per_second_grows_with_the_seconds(float64):
     td = TensorDict({"dt": torch.tensor([[0.0], [0.2], [3.0]]), "belief": {"mean": torch.zeros(3, 2)}}, [3])
     found = NoisePerSecond(MappedNoise(walk, root))(td)["forecast", "noise"]
     assert_close(found, torch.tensor([0.0, 0.2, 3.0]).reshape(3, 1, 1) * (root @ root.mT))
-
-
-def test_the_drift_is_learned(float64):
-    motion = ContinuousMotion(torch.zeros(2, 2), trainable=True)
-    noise = ContinuousNoise(motion, torch.eye(2))
-    filter = FusedFilter(
-        motion,
-        {"reading": FusedSensor(Select([0]), [R])},
-        initial=MomentPrior(torch.zeros(2), torch.eye(2)),
-        process_noise=noise,
-    )
-    frames = drives(3)
-    filter.sequence(frames)["info", "log_likelihood"].sum().backward()
-    assert len(list(filter.parameters())) == 1
-    assert (motion.drift.grad != 0).any()

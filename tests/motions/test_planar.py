@@ -64,12 +64,3 @@ def test_a_twist_in_the_plane_is_one_in_space():
     assert_close(in_space[:, 4:6], in_plane[:, 1:3], rtol=0, atol=1e-13)
     turned = SO3().exp(torch.cat([zeros, zeros, in_plane[:, :1]], -1))
     assert_close(SO3().distance(in_space[:, :4], turned), torch.zeros(6), rtol=0, atol=1e-12)
-
-
-def test_a_twist_is_the_limit_of_small_straight_moves():
-    state = random_points(ConstantTwist(SE3(), 1.0).space, 3)
-    fine = state[..., :7]
-    for _ in range(2000):
-        ahead = torch.cat([SO3().exp(state[..., 7:10] / 2000), state[..., 10:] / 2000], -1)
-        fine = SE3().compose(fine, ahead)
-    assert SE3().distance(step(ConstantTwist(SE3(), 1.0), state)[..., :7], fine).max() < 2e-3

@@ -8,8 +8,6 @@ from torch.testing import assert_close
 
 from tests.motions.steps_for_tests import INERTIAL, observe, random_points
 from torch_denkf.functional.manifolds import SE2, SE3, SE23, SO3, Circle, Euclidean, Product, rotation_matrix
-from torch_denkf.fusion import FusedFilter, FusedSensor
-from torch_denkf.modules import LearnedTransition, MomentPrior
 from torch_denkf.motions import Gravity, Magnetic, PoseOf, PositionInBody, RangeBearing
 
 LANDMARKS = [[1.0, 2.0, 3.0], [-4.0, 5.0, 6.0]]
@@ -142,30 +140,6 @@ def test_landmarks_that_stand_in_the_data(float64, kind):
         assert_close(kind(SE2(), posts[row].reshape(3, 2))(one)[key], found[row])
     with pytest.raises(ValueError, match=r"'posts' is \[\*B, 4\], 2 landmarks of 2 numbers; got \[5, 6\]"):
         kind(SE2(), landmark_key="posts", count=2)(td)
-
-
-def test_a_robot_that_recognises_landmarks(float64):
-    """Filters of one landmark a row by its entry, and of all with a mask, believe the same, and find the robot."""
-    posts = torch.tensor([[4.0, 0.0], [0.0, 5.0], [-3.0, -2.0]])
-    true, noise = torch.tensor([0.4, 0.5, -0.3]), [0.1, 0.02]
-    seen = RangeBearing(SE2(), posts)(TensorDict({("forecast", "ensemble"): true.unsqueeze(0)}))
-    seen = seen["forecast", "observation"].reshape(3, 2)
-    which = torch.arange(12) % 3
-    data = TensorDict({"each": seen[which], "post": posts[which], "all": seen.reshape(1, 6).expand(12, 6)}, [12])
-    data["all_observed"] = torch.nn.functional.one_hot(which, 3).bool().repeat_interleave(2, -1)
-    data["each_observed"] = torch.ones(12, 1, dtype=torch.bool)
-    initial = MomentPrior(torch.zeros(3), torch.eye(3), space=SE2())
-    still = LearnedTransition(torch.nn.Identity(), residual=False)
-    means = []
-    for name, model, deviations in (
-        ("each", RangeBearing(SE2(), landmark_key="post"), noise),
-        ("all", RangeBearing(SE2(), posts), noise * 3),
-    ):
-        sensor = FusedSensor(model, deviations, reading_space=model.reading_space)
-        filter = FusedFilter(still, {name: sensor}, initial=initial, process_noise=[1e-3] * 3)
-        means.append(filter.sequence(data.clone())["belief", "mean"])
-    assert_close(means[0], means[1])
-    assert_close(means[0][-1], true, rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize("kind", [PositionInBody, RangeBearing])

@@ -3,7 +3,6 @@
 import math
 
 import torch
-from scipy.stats import norm
 from torch.distributions import MultivariateNormal
 
 from tests.filters.factories import S, toy_denkf
@@ -81,9 +80,3 @@ def gaps():
     some[:, ::2] = False  # elements without any
     some[:, 1] = torch.tensor([True, False, True])  # there is a part
     return whole, some
-
-
-def normal_crps(mean, std, y):
-    """Scores a Gaussian by scipy."""
-    z = (y - mean) / std
-    return std * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - math.pi**-0.5)

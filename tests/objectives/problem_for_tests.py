@@ -22,16 +22,3 @@ def stepped(frames):
     mask = ~frames["is_init"].squeeze(-1)
     mask[..., 0] = False
     return mask
-
-
-def train(loss, frames, rate, steps=60):
-    """Minimises ``loss_state`` by Adam; its value before each step."""
-    optimiser = torch.optim.Adam(loss.parameters(), rate)
-    values = []
-    for _ in range(steps):
-        value = loss(frames)["loss_state"]
-        optimiser.zero_grad()
-        value.backward()
-        optimiser.step()
-        values.append(value.item())
-    return values

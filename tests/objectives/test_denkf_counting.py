@@ -9,18 +9,6 @@ from tests.objectives.problem_for_tests import problem, stepped
 from torch_denkf.objectives import DEnKFLoss
 
 
-def test_first_and_reset_elements_do_not_count(float64):
-    filter = toy_denkf()
-    frames, _ = problem(filter)
-    loss = DEnKFLoss(filter, **ONLY_STATE)
-    before = loss(frames)
-    frames = frames.clone()
-    frames["state"][~stepped(frames)] = 1e6
-    assert loss(frames)["loss_state"].equal(before["loss_state"])
-    frames["state"][stepped(frames)] += 1
-    assert not loss(frames)["loss_state"].equal(before["loss_state"])
-
-
 def test_done_marks_starts_where_is_init_is_missing(float64):
     filter = toy_denkf()
     frames, _ = problem(filter, resets=False)

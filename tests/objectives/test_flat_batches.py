@@ -91,10 +91,9 @@ def test_without_marks_slices_are_refused(key, init, kept):
 
 
 def test_two_slices_of_one_episode_are_refused_where_a_clock_tells():
-    loss = objective()
-    rows = TensorDict({"observation": torch.randn(12, 2), "state": torch.randn(12, 2)}, [12])
-    loss(rows)  # nothing says that these are several
-    for key, clock, refused in (
+    rows = rows_of()
+    objective()(rows)  # nothing says that these are several
+    for key, clock, several in (
         ("step", torch.arange(12), False),
         ("step", 3 * torch.arange(12).unsqueeze(-1), False),
         ("step", torch.arange(6).repeat(2), True),
@@ -105,13 +104,11 @@ def test_two_slices_of_one_episode_are_refused_where_a_clock_tells():
         (("collector", "traj_ids"), torch.arange(12) // 6, True),
     ):
         batch = rows.copy().set(key, clock)
-        if refused:
-            with pytest.raises(ValueError, match=r"seems to hold several sequences.* at 6, and"):
-                loss(batch)
-            marked = batch.set("is_init", torch.arange(12) % 6 == 0)
-            torch.testing.assert_close(loss(marked)["loss_state"], loss(rows.reshape(2, 6))["loss_state"])
+        if several:
+            refused(batch, r"seems to hold several sequences.* at 6, and")
+            accepted(batch.set("is_init", torch.arange(12) % 6 == 0), rows.reshape(2, 6))
         else:
-            torch.testing.assert_close(loss(batch)["loss_state"], loss(rows)["loss_state"])
+            accepted(batch, rows)
 
 
 @pytest.mark.parametrize("ended", [False, True])
@@ -138,11 +135,9 @@ def test_a_rollout_is_one_sequence(ended):
 
 
 def test_an_episode_that_is_done_needs_a_mark_after_it():
-    rows = TensorDict({"observation": torch.randn(12, 2), "state": torch.randn(12, 2)}, [12])
-    rows["is_init"] = torch.arange(12).unsqueeze(-1) == 0
+    rows = rows_of().set("is_init", torch.arange(12).unsqueeze(-1) == 0)
     rows["next", "done"] = (torch.arange(12) % 6 == 5).unsqueeze(-1)
-    with pytest.raises(ValueError, match=r"is done, and the next begins, at 6"):
-        objective()(rows)
+    refused(rows, r"is done, and the next begins, at 6")
 
 
 # ------------------------------------------------------------------------------------- what breaks, and what goes on

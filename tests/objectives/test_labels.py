@@ -4,19 +4,16 @@ import math
 
 import pytest
 import torch
-from tensordict import TensorDict
-from torch.distributions import Normal
 
-from tests.filters.factories import FixedEnsemble, NoisyLinear, S, linear_denkf, linear_kalman, toy_denkf
+from tests.filters.factories import S, toy_denkf
 from tests.objectives.denkf_for_tests import CLOSE, score_by_hand
-from tests.objectives.labels_for_tests import CASES, SCALE, TERMS, by_hand, case, element, gaps, normal_crps
+from tests.objectives.labels_for_tests import CASES, SCALE, TERMS, by_hand, case, gaps
 from tests.objectives.problem_for_tests import problem, stepped
 from tests.objectives.test_parts import forecasts_by_hand
-from torch_denkf.data import Recording, RecordingReplay, Table
-from torch_denkf.filters import DEnKF, KalmanFilter, ParticleFilter
-from torch_denkf.functional.manifolds import Circle, Flat
-from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianLikelihood, LinearObservation, Select
-from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
+from torch_denkf.filters import DEnKF
+from torch_denkf.functional.manifolds import Flat
+from torch_denkf.modules import EnsembleAnalysis, LinearObservation, Select
+from torch_denkf.objectives import DEnKFLoss, ObservationLoss, SensorLoss, TransitionLoss
 
 NAN = math.nan
 
@@ -109,29 +106,6 @@ def test_labels_of_a_part_of_the_state(name):
     agree(chosen(seen)["loss_state"], expected, filter)
 
 
-def test_scales_are_of_the_labels_or_of_the_whole_state():
-    filter, frames, _, loss = case("members-crps", terms=["state"], state_scale=SCALE[:2])
-    frames["state"] = frames["state"][..., :2]
-    expected = loss(frames)["loss_state"]
-    whole = DEnKFLoss(filter, transition=0.0, sensor=0.0, state_scale=SCALE)
-    assert whole(frames)["loss_state"].equal(expected)
-    both = DEnKFLoss(filter, transition=0.0, sensor=0.0, dims=[1, 0], state_scale=SCALE[1::-1])
-    assert both(frames)["loss_state"].equal(expected)
-
-
-def test_one_label_of_two_dimensions_is_not_that_of_both():
-    filter = linear_denkf("etkf")
-    readings = torch.randn(4, 9, 2) + filter["observation"].matrix @ torch.tensor([0.0, 9.0])
-    frames = TensorDict({"observation": readings, "state": torch.randn(4, 9, 2)}, [4, 9])
-    ensemble = filter.sequence(frames.copy())["belief", "ensemble"]
-    first = score_by_hand("crps", ensemble[..., :1], frames["state"][..., :1])[:, 1:].mean()
-    both = score_by_hand("crps", ensemble, frames["state"][..., :1].expand(4, 9, 2))[:, 1:].mean()
-    assert (first - both).abs() > 0.3
-    frames["state"] = frames["state"][..., :1]
-    loss = DEnKFLoss(filter, transition=0.0)
-    torch.testing.assert_close(loss(frames)["loss_state"], first, **CLOSE)
-
-
 @pytest.mark.parametrize("name", ["members-crps", "members-mse", "particles-crps", "particles-mixture"])
 def test_angles_beyond_the_labels_and_members_on_both_sides_of_pi(name):
     _, frames, _, loss = case(name, terms=["state"], space=Flat(3, circular=[0, 2]))
@@ -139,22 +113,6 @@ def test_angles_beyond_the_labels_and_members_on_both_sides_of_pi(name):
     before = loss(frames)["loss_state"]
     frames["state"][..., 0] += 2 * math.pi
     torch.testing.assert_close(loss(frames)["loss_state"], before, rtol=1e-9, atol=1e-12)
-
-
-def test_the_mean_of_particles_on_both_sides_of_pi():
-    members = torch.tensor([[math.pi - 0.1], [0.3 - math.pi]])  # with equal weights the mean is 0.1 beyond pi
-    filter = ParticleFilter(
-        NoisyLinear(torch.eye(1)),
-        None,
-        Select([0]),
-        GaussianLikelihood(observation_key="y"),
-        noise=ConstantNoise([1.0], in_key="y"),
-        initial=FixedEnsemble(members),
-    )
-    frames = TensorDict({"y": torch.zeros(4, 1), "observed": torch.zeros(4, 1, dtype=torch.bool)}, [4])
-    frames["state"] = torch.full((4, 1), math.pi)
-    value = MixtureLoss(filter, state=0.0, mean=1.0, space=Circle())(frames)["loss_mean"]
-    torch.testing.assert_close(value, torch.tensor(0.01))
 
 
 # ------------------------------------------------------------------------------------------------- what is read of it
@@ -213,12 +171,6 @@ def test_a_known_observation_of_the_true_state_is_a_label_where_it_reads_labels(
     whole = score_by_hand("crps", out["sensor", "ensemble"], truth)[frames["observed"].all(-1)].mean()
     value = DEnKFLoss(filter, state=0.0, transition=0.0, dims=[0, 2])(alone)["loss_sensor"]
     torch.testing.assert_close(value, whole, **CLOSE)
-    # Labels of the leading dimension alone: of the two readings, none is known, or one.
-    data = frames.exclude("target_observation").set("state", frames["state"][..., :1])
-    for loss in (SensorLoss(filter), DEnKFLoss(filter, state=0.0, transition=0.0)):
-        value = loss(data)["loss_sensor"]
-        one = score_by_hand("crps", out["sensor", "ensemble"][..., 1:], truth[..., 1:])[frames["observed"].all(-1)]
-        torch.testing.assert_close(value, 0 * value if linear else one.mean(), **CLOSE)
 
 
 def test_a_reading_of_fewer_labels_than_components_is_not_broadcast():
@@ -282,49 +234,7 @@ def test_a_step_begins_at_a_whole_state_and_is_scored_where_there_are_labels(how
     assert all((gradient == 0).all() for gradient in gradients(nothing, loss))
 
 
-def test_a_gaussian_step_is_scored_where_there_are_labels():
-    filter = linear_kalman()
-    filter["transition"].matrix.requires_grad_()
-    frames = TensorDict({"state": torch.randn(2, 6, 2)}, [2, 6])
-    known = torch.ones(2, 6, 2, dtype=torch.bool)
-    known[0, 2, 0] = known[1, 4, 1] = False
-    F, Q = filter["transition"].matrix, filter["transition"].noise
-    state, std, terms = frames["state"], Q.diagonal().sqrt(), []
-    full = torch.distributions.MultivariateNormal
-    for b in range(2):
-        for t in range(1, 6):
-            if known[b, t - 1].all():
-                mean, dims = F @ state[b, t - 1], known[b, t].nonzero().flatten()
-                density = full(mean, Q) if len(dims) == 2 else Normal(mean[dims], std[dims])
-                terms.append(-density.log_prob(state[b, t][dims]).sum())
-    loss = TransitionLoss(filter, score="nll")
-    value = loss(hidden(frames, known, "NaN"))["loss_transition"]
-    torch.testing.assert_close(value, torch.stack(terms).mean(), rtol=1e-10, atol=0)
-    got, due = (torch.autograd.grad(x, F)[0] for x in (value, torch.stack(terms).mean()))
-    torch.testing.assert_close(got, due, rtol=1e-9, atol=1e-12)
-
-
 # ------------------------------------------------------------------------------------------------------- other names
-
-
-def test_rows_of_a_recording_count_where_the_truth_was_measured(tmp_path):
-    # A reading every 0.1 s, the truth every 0.4 s; between, the data set holds the last one.
-    time = [0.1 * k for k in range(40)]
-    (tmp_path / "y.csv").write_text("t,y\n" + "".join(f"{t:.1f},{math.sin(t)}\n" for t in time))
-    (tmp_path / "x.csv").write_text("t,x\n" + "".join(f"{t:.1f},{math.sin(t) + 0.1}\n" for t in time[::4]))
-    streams = {"y": Table(tmp_path / "y.csv", ["y"], time="t"), "state": Table(tmp_path / "x.csv", ["x"], time="t")}
-    rows = RecordingReplay(Recording(**streams), clock="y")[:]
-    rows = rows.apply(lambda value: value.double() if value.is_floating_point() else value)
-    assert rows["state_observed"].sum() == 10
-    assert (rows["state"][1:4] == rows["state"][0]).all()
-    one = torch.eye(1)
-    filter = KalmanFilter(
-        one, one, process_noise_cov=0.1 * one, noise_cov=one, mean=torch.zeros(1), cov=one, observation_key="y"
-    )
-    mean = filter.sequence(rows.copy())["belief", "mean"]
-    expected = torch.stack([(mean[k] - math.sin(0.1 * k) - 0.1).square() for k in range(4, len(rows), 4)]).mean()
-    value = GaussianLoss(filter, score="mse", transition=0.0)(rows)["loss_state"]
-    torch.testing.assert_close(value, expected, rtol=0, atol=1e-6)  # the table's numbers are of single precision
 
 
 def test_the_masks_of_renamed_labels_are_those_that_data_sets_write():
@@ -342,11 +252,3 @@ def test_the_masks_of_renamed_labels_are_those_that_data_sets_write():
     loss.set_keys(state_observed="mine")
     again = loss(renamed.exclude("state"))
     assert all(again[key].equal(expected[key]) for key in expected.keys())  # noqa: SIM118
-
-
-def test_gaussian_oracle_is_that_of_gaussian_loss():
-    # The helper's closed form against scipy's, so that a slip in it shows.
-    out = TensorDict({("belief", "mean"): torch.randn(1, 1), ("belief", "cov"): torch.full((1, 1, 1), 0.7)}, [1])
-    value = element("moments-crps", out, "belief", (0,), torch.tensor([[0.4]]), [0], [1.0])
-    mean = out["belief", "mean"].item()
-    assert value.item() == pytest.approx(normal_crps(mean, 0.7**0.5, 0.4))

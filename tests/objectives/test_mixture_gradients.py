@@ -1,14 +1,10 @@
-"""Oracles: finite differences; training teaches likelihood and motion noise."""
+"""Oracle: finite differences."""
 
 import pytest
-import torch
-from tensordict import TensorDict
 
 from tests.filters.differences_for_tests import check_largest_gradients
 from tests.filters.particle_for_tests import toy_filter
-from tests.objectives.problem_for_tests import problem, train
-from torch_denkf.filters import DPF
-from torch_denkf.modules import AroundState, DiagonalNoise, LearnedLikelihood, LearnedTransition, Select
+from tests.objectives.problem_for_tests import problem
 from torch_denkf.objectives import MixtureLoss
 
 
@@ -48,27 +44,3 @@ def test_gradients_reach_the_likelihood_through_hard_resampling():
     MixtureLoss(filter)(frames)["loss_state"].backward()
     for name in ("likelihood", "observation", "transition"):
         assert sum(p.grad.abs().sum() for p in filter[name].parameters() if p.grad is not None) > 1e-6, name
-
-
-@pytest.mark.parametrize("score", ["mixture", "crps"])
-def test_training_teaches_likelihood_and_motion_noise(score):
-    # A random walk, read through a learned likelihood that knows nothing at first: it must learn to follow.
-    torch.manual_seed(1)
-    still = LearnedTransition(torch.nn.Linear(1, 1))
-    with torch.no_grad():
-        still.module.weight.zero_(), still.module.bias.zero_()
-    filter = DPF(
-        still.requires_grad_(False),
-        None,
-        Select([0]),
-        LearnedLikelihood(1, 1, num_cells=(16,), encoding_key="y"),
-        DiagonalNoise(1, r=0.3, num_cells=(4,), in_key=("belief", "mean"), out_key=("forecast", "q")),
-        noisy_dims=[0],
-        initial=AroundState([0.1], ensemble_size=32),
-    )
-    walk = torch.randn(16, 9, 1).cumsum(1)
-    frames = TensorDict({"state": walk, "y": walk + 0.1 * torch.randn_like(walk)}, [16, 9])
-    loss = MixtureLoss(filter, score=score, component_std=0.5)
-    values = train(loss, frames, 2e-2)
-    first, last = sum(values[:5]) / 5, sum(values[-5:]) / 5
-    assert last < 0.6 * first

@@ -6,9 +6,7 @@ import pytest
 import torch
 from torchrl.objectives import DDPGLoss
 
-from tests.objectives.test_torchrl_losses import (
-    with_other_beliefs,
-)
+from tests.objectives.test_torchrl_losses import with_other_beliefs
 from tests.test_docs import BLOCK, ROOT
 
 PAGE = ROOT / "docs/how_to/policies.md"
@@ -61,6 +59,7 @@ def test_sacs_losses_reach_the_filter_only_where_nothing_is_detached(detached):
     assert reaches(batch["info", "log_likelihood"].mean(), names["denkf"])
 
 
+@pytest.mark.slow
 def test_ddpgs_losses_reach_no_filter_in_front_and_the_actors_one_inside():
     names = run("ddpg")
     batch = names["filtered"](slices(names))
@@ -74,7 +73,7 @@ def test_ddpgs_losses_reach_no_filter_in_front_and_the_actors_one_inside():
     assert not reaches(terms["loss_value"], names["denkf"])
 
 
-@pytest.mark.parametrize("name", ["sac", "ddpg"])
+@pytest.mark.parametrize("name", ["sac", pytest.param("ddpg", marks=pytest.mark.slow)])
 def test_what_was_believed_after_the_start_of_a_slice_does_not_matter(name):
     names = run(name)
     losses = []

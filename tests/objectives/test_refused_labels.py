@@ -2,21 +2,17 @@
 
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
 from tests.borders.test_constructors import refused as refuses
-from tests.filters.differences_for_tests import central_difference
-from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_kalman, toy_denkf
+from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf
 from tests.filters.gaussian_for_tests import learned_filter
 from tests.filters.particle_for_tests import bootstrap, toy_filter
 from tests.objectives.denkf_for_tests import TERMS
 from tests.objectives.problem_for_tests import only, problem
 from torch_denkf.baselines import LSTMFilter
-from torch_denkf.filters import ParticleFilter
-from torch_denkf.modules import DiagonalNoise, GaussianLikelihood, Select
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, TransitionLoss
 from torch_denkf.smoothers import EnKS
 
@@ -131,41 +127,3 @@ def test_another_belief_is_refused_and_the_right_loss_named():
 
 def particle_smoother(filter):
     return EnKS(linear_denkf("etkf"))  # its smoothed members do not count: the filter's own have weights
-
-
-def weighted_crps(members, weights, truth):
-    """The definition, with numpy."""
-    away = np.abs(members[:, None] - members[None, :])
-    return weights @ np.abs(members - truth) - weights @ away @ weights / 2
-
-
-def test_weights_count_and_noise_that_is_trained_gets_its_gradient(float64):
-    members = torch.tensor([[-1.0], [0.2], [0.5], [2.0]])
-    noise = DiagonalNoise(1, r=0.8, num_cells=(), in_key="y")
-    filter = ParticleFilter(
-        NoisyLinear(torch.eye(1)),
-        None,
-        Select([0]),
-        GaussianLikelihood(observation_key="y"),
-        noise=noise,
-        initial=FixedEnsemble(members),
-        resampling=None,
-    )
-    frames = TensorDict({"y": torch.tensor([[0.0], [0.4]]), "state": torch.tensor([[0.0], [0.3]])}, [2])
-    density = np.exp(-0.5 * (members[:, 0].numpy() - 0.4) ** 2 / 0.8**2)
-    weights, x = density / density.sum(), members[:, 0].numpy()
-    expected = weighted_crps(x, weights, 0.3)
-    assert abs(expected - weighted_crps(x, np.full(4, 0.25), 0.3)) > 0.05
-    loss = MixtureLoss(filter, score="crps")
-    value = loss(frames)["loss_state"]
-    assert value.item() == pytest.approx(expected, rel=1e-6)
-    value.backward()
-    trained = [p for p in noise.parameters() if p.grad is not None and p.grad.any()]
-    assert trained
-    for parameter in trained:
-        entry = int(parameter.grad.abs().argmax())
-        difference = central_difference(lambda: loss(frames)["loss_state"], parameter, entry)
-        torch.testing.assert_close(parameter.grad.view(-1)[entry], difference, rtol=1e-5, atol=1e-9)
-
-
-# ------------------------------------------------------------------------------------------------ keys and callables

@@ -1,22 +1,15 @@
-"""Infinite scales, filters without a sensor, one member. Oracles: the loss without those dimensions, by hand."""
+"""Infinite scales. Oracle: the loss without those dimensions, by hand."""
 
 import math
 
 import pytest
 import torch
-from tensordict import TensorDict
-from torch import nn
 
-from tests.filters.factories import (
-    NoisyLinear,
-    toy_denkf,
-)
+from tests.filters.factories import toy_denkf
 from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, score_by_hand
 from tests.objectives.problem_for_tests import problem, stepped
-from torch_denkf.filters import Filter
 from torch_denkf.functional.manifolds import Flat
-from torch_denkf.modules import Initial, SubModel
-from torch_denkf.objectives import DEnKFLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
+from torch_denkf.objectives import DEnKFLoss, SensorLoss, TransitionLoss
 
 SCORES = ["crps", "energy", "mse"]
 
@@ -58,23 +51,6 @@ def test_a_dimension_with_infinite_scale_does_not_count(score):
     assert one_step(frames)["loss_transition"].equal(first)
 
 
-def test_infinite_scales_of_the_observation_model():
-    filter = toy_denkf()
-    frames, _ = problem(filter)
-    error = (filter["observation"].module(frames["state"]) - frames["target_observation"])[..., 1] / 3
-    loss = ObservationLoss(filter, observation_scale=[math.inf, 3.0])
-    torch.testing.assert_close(loss(frames)["loss_observation"], error.square().mean(), **CLOSE)
-
-
-def test_infinite_scales_of_a_mixture_are_those_of_fewer_dimensions():
-    filter = toy_denkf()
-    frames, _ = problem(filter)
-    for score in ("mixture", "crps"):
-        some = MixtureLoss(filter, score=score, state_scale=[0.5, math.inf, 4.0])(frames)["loss_state"]
-        chosen = MixtureLoss(filter, score=score, state_scale=[0.5, 4.0], dims=[0, 2])(frames)["loss_state"]
-        torch.testing.assert_close(some, chosen, **CLOSE)
-
-
 def test_a_loaded_scale_counts_other_dimensions():
     filter = toy_denkf()
     frames, _ = problem(filter)
@@ -83,51 +59,3 @@ def test_a_loaded_scale_counts_other_dimensions():
     assert not second(frames)["loss_state"].equal(first(frames)["loss_state"])
     second.load_state_dict(first.state_dict())
     assert second(frames)["loss_state"].equal(first(frames)["loss_state"])
-
-
-# ------------------------------------------------------------------------------------- filters without a sensor
-
-
-# --------------------------------------------------------------------------------------------------- one member
-
-
-class Point(Initial):
-    """An initial belief of one member; it has no variance."""
-
-    def __init__(self):
-        super().__init__(nn.Identity(), [], [("belief", "ensemble")])
-        self.ensemble_size = 1
-
-    def compute(self, *, batch_size):
-        return torch.ones(*batch_size, 1, 2)
-
-
-class Believe(SubModel):
-    """The belief is the forecast."""
-
-    def __init__(self):
-        super().__init__(nn.Identity(), [("forecast", "ensemble")], [("belief", "ensemble")])
-
-    def compute(self, ensemble):
-        return ensemble.clone()
-
-
-@pytest.mark.parametrize("score", SCORES)
-def test_one_member_is_a_point(score):
-    move = NoisyLinear(torch.tensor([[0.5, 1.0], [0.0, 0.9]]))
-    move.matrix.requires_grad_()
-    filter = Filter(move, Believe(), initial=Point())
-    frames = TensorDict({"state": torch.randn(2, 5, 2), "is_init": torch.zeros(2, 5, 1, dtype=torch.bool)}, [2, 5])
-    member = filter.sequence(frames.copy())["belief", "ensemble"].squeeze(-2)
-    scale = torch.tensor([2.0, 0.5])
-    error = ((member - frames["state"]) / scale)[:, 1:]
-    expected = {"crps": error.abs().mean(), "mse": error.square().mean()}
-    expected["energy"] = error.square().sum(-1).sqrt().mean()
-    value = DEnKFLoss(filter, score=score, state_scale=scale)(frames)["loss_state"]
-    torch.testing.assert_close(value, expected[score], **CLOSE)
-    (gradient,) = torch.autograd.grad(value, move.matrix, retain_graph=True)
-    (by_hand,) = torch.autograd.grad(expected[score], move.matrix)
-    torch.testing.assert_close(gradient, by_hand)
-    step = TransitionLoss(filter, score="crps")(frames)["loss_transition"]
-    moved = frames["state"][:, :-1] @ move.matrix.mT - frames["state"][:, 1:]
-    torch.testing.assert_close(step, moved.abs().mean(), **CLOSE)

@@ -1,5 +1,7 @@
 """torchrl's losses on a policy with a filter inside: the oracle is the loss written out, step by step."""
 
+from functools import partial
+
 import pytest
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
@@ -171,30 +173,24 @@ def test_clipped_ppo(float64):
     assert_same_gradients(out["loss_critic"], by_hand, [filter, critic_head])
 
 
-def test_sac(float64):
-    filter, frames = filter_and_frames()
-    data = collected(filter, frames)
-    data["action"] = data["action"].tanh() * 0.9
-    actor, head, options = sac(filter, inside=True)
-    loss = SACLoss(actor, q_network(), num_qvalue_nets=1, **options)
-    torch.manual_seed(3)
-    actor_loss, _ = loss.actor_loss(data.copy())
-    actor_loss = actor_loss.mean()
-
-    torch.manual_seed(3)
-    roots, _ = beliefs_by_hand(filter, data)
-    distribution = TanhNormal(*head(roots))
-    action = distribution.rsample()
-    q = q_of(loss, roots, action)
-    by_hand = (0.3 * distribution.log_prob(action).unsqueeze(-1) - q).mean()
-    torch.testing.assert_close(actor_loss, by_hand)
-    assert_same_gradients(actor_loss, by_hand, [filter, head])
-
-
 def q_of(loss, mean, action, number=0):
     params = loss.qvalue_network_params[number].detach()
     with params.to_module(loss.qvalue_network):
         return loss.qvalue_network.module(mean, action)
+
+
+def soft_value(head, mean, q):
+    """The worth of an action that is drawn, by the less of two critics, with the reward of its entropy."""
+    chosen = TanhNormal(*head(mean))
+    action = chosen.rsample()
+    worth = torch.stack([q(mean, action, number) for number in (0, 1)]).min(0).values
+    return worth - 0.3 * chosen.log_prob(action).unsqueeze(-1)
+
+
+def critics_by_hand(data, roots, nexts, head, q):
+    """The squared error of both critics at the beliefs ``roots``."""
+    target = data["next", "reward"] + 0.9 * ~data["next", "terminated"] * soft_value(head, nexts, q)
+    return sum((q(roots, data["action"], number) - target.detach()).square().mean() for number in (0, 1))
 
 
 def filtered(filter, batch):
@@ -249,20 +245,12 @@ def test_sac_on_what_the_filter_believes_now(float64):
     roots, nexts = beliefs_by_hand(filter, data)
     assert not torch.allclose(roots, data[MEAN], atol=1e-3), "the stored beliefs are old"
     torch.manual_seed(3)
-    ahead = TanhNormal(*head(nexts.detach()))
-    action = ahead.rsample()
-    worth = torch.stack([q_of(loss, nexts, action, number) for number in (0, 1)]).min(0).values
-    worth = worth - 0.3 * ahead.log_prob(action).unsqueeze(-1)
-    target = data["next", "reward"] + 0.9 * ~data["next", "terminated"] * worth
-    seen = [q_of(loss, roots, data["action"], number) for number in (0, 1)]
-    by_hand = sum((q - target.detach()).square().mean() for q in seen)
+    q = partial(q_of, loss)
+    by_hand = critics_by_hand(data, roots, nexts, head, q)
     torch.testing.assert_close(found[0]["loss_qvalue"], by_hand)
     assert_same_gradients(found[0]["loss_qvalue"], by_hand, [filter])
 
-    now = TanhNormal(*head(roots))
-    action = now.rsample()
-    worth = torch.stack([q_of(loss, roots, action, number) for number in (0, 1)]).min(0).values
-    by_hand = (0.3 * now.log_prob(action).unsqueeze(-1) - worth).mean()
+    by_hand = -soft_value(head, roots, q).mean()
     torch.testing.assert_close(found[0]["loss_actor"], by_hand)
     assert_same_gradients(found[0]["loss_actor"], by_hand, [filter, head])
 
@@ -284,16 +272,10 @@ def test_sac_with_the_filter_in_the_critic_too(float64, vmap):
     assert found[0].equal(found[1])
     roots, nexts = beliefs_by_hand(filter, data)
     torch.manual_seed(3)
-    ahead = TanhNormal(*head(nexts.detach()))
-    action = ahead.rsample()
     of_critic = [params.detach()["module", "1"] for params in loss.qvalue_network_params.unbind(0)]
 
-    def q_by_hand(number, mean, action):
+    def q_by_hand(mean, action, number):
         with of_critic[number].to_module(critic[1]):
             return critic[1].module(mean, action)
 
-    worth = torch.stack([q_by_hand(number, nexts, action) for number in (0, 1)]).min(0).values
-    worth = worth - 0.3 * ahead.log_prob(action).unsqueeze(-1)
-    target = data["next", "reward"] + 0.9 * ~data["next", "terminated"] * worth
-    seen = [q_by_hand(number, roots, data["action"]) for number in (0, 1)]
-    torch.testing.assert_close(found[0].mean(), sum((q - target.detach()).square().mean() for q in seen))
+    torch.testing.assert_close(found[0].mean(), critics_by_hand(data, roots, nexts, head, q_by_hand))

@@ -101,10 +101,3 @@ def test_variances_of_tangents_become_those_of_angles(space, form):
         (_, low, high), (_, lower, upper) = band(axes), band(other)
         # An end of the interval of 20 000 draws is off by 1.5 % of a standard deviation: 3 sigma of the width.
         np.testing.assert_allclose(high - low, upper - lower, rtol=0.03)
-
-
-def test_readings_of_angles_are_in_radians_beside_the_mean():
-    run = turning_run()
-    yaw = torch.from_numpy(np.deg2rad(euler(run["state"][:, :4])[:, 2]))
-    axes = plot_bands(run, space=SPACE, dims=[2], readings={2: yaw})[0]
-    np.testing.assert_allclose(line(axes, "readings")[1], line(axes, "truth")[1], atol=1e-9)

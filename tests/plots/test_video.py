@@ -55,14 +55,13 @@ def blue(frame):
     return frame[..., 2].astype(int) - frame[..., 0] > 30
 
 
-@pytest.mark.parametrize("ending", ["mp4", "gif"])
-def test_the_belief_grows_beside_the_camera(tmp_path, ending):
+def test_the_belief_grows_beside_the_camera(tmp_path):
     run = ensemble_run(steps=20)
     run["observed"] = torch.arange(20).unsqueeze(-1) != 12
     run["pixels"] = torch.zeros(20, 3, 8, 16)
     run["pixels"][:, 1] = torch.linspace(0.3, 1, 20)[:, None, None]  # ever greener
     settings = {"time": 0.1, "path": {"forward_up": True}, "bands": {"dims": [0, 1]}, "every": 2, "size": (8, 5)}
-    got, fps = decoded(belief_video(tmp_path / f"a.{ending}", run, title="a title", **settings))
+    got, fps = decoded(belief_video(tmp_path / "a.gif", run, title="a title", **settings))
     assert got.shape == (10, 500, 800, 3)
     assert fps == pytest.approx(5, abs=0.01)
     # The camera's picture is that of the step.

@@ -15,7 +15,6 @@ from torch_denkf._registered import weights
 from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
 from torch_denkf.applications.reacher import reacher
 from torch_denkf.applications.ur5.filter import ur5_table
-from torch_denkf.deployment.folder import described
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.modules import (
     ConstantNoise,
@@ -68,15 +67,6 @@ def test_settings_are_those_of_the_description(name, tmp_path):
     assert again.settings == settings
 
 
-def test_settings_of_a_builder_of_ones_own(tmp_path):
-    def still(size):
-        eye = torch.eye(size)
-        return KalmanFilter(eye, eye, process_noise_cov=eye, noise_cov=eye, mean=torch.zeros(size), cov=eye)
-
-    save_pretrained(still(2), tmp_path, builder=still, settings={"size": 2})
-    assert from_pretrained(tmp_path, builders={"still": still}).settings == {"size": 2}
-
-
 def test_what_is_saved_comes_back(tmp_path):
     torch.manual_seed(0)
     model = reacher(ensemble_size=8, num_cells=(8,))
@@ -110,46 +100,35 @@ def test_own_builders(tmp_path):
     save_pretrained(still(2), tmp_path, builder=still, settings={"size": 2})
     with pytest.raises(ValueError, match="is of a filter that 'still' builds"):
         from_pretrained(tmp_path)
-    assert isinstance(from_pretrained(tmp_path, builders={"still": still}), KalmanFilter)
+    again = from_pretrained(tmp_path, builders={"still": still})
+    assert isinstance(again, KalmanFilter)
+    assert again.settings == {"size": 2}
     with pytest.raises(TypeError, match="JSON"):
         save_pretrained(still(2), tmp_path / "none", builder=still, settings={"size": torch.ones(1)})
     assert not (tmp_path / "none").exists()
 
 
-def ball(
-    members=8, cells=(8,), scheme="perturbed", std=0.5, seen=(0,), gain=1.0, start=1.0, ceiling=1e12, key="camera"
-):
+def ball(members=8, scheme="perturbed", std=0.5, gain=1.0, key="camera"):
     """A filter each of whose settings changes what it believes, or where it reads; few of them are stored numbers."""
     return DEnKF(
-        LearnedTransition(StochasticMLP(2, 2, cells)),
+        LearnedTransition(StochasticMLP(2, 2, (8,))),
         None,
-        LearnedObservation(lambda state: gain * state[..., list(seen)]),
-        ConstantNoise([std] * len(seen), in_key=key),
+        LearnedObservation(lambda state: gain * state[..., [0]]),
+        ConstantNoise([std], in_key=key),
         EnsembleAnalysis(scheme, observation_key=key),
-        initial=GaussianPrior([0.0, 0.0], [start, 1.0], ensemble_size=members),
+        initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=members),
         process_noise=0.1,
-        variance_ceiling=ceiling,
     )
 
 
-CHANGED = {
-    "members": 32,
-    "cells": (16,),
-    "scheme": "etkf",
-    "std": 0.25,
-    "seen": (1,),
-    "gain": 2.0,
-    "start": 3.0,
-    "ceiling": 2.0,
-    "key": "lidar",
-}
+CHANGED = {"members": 32, "scheme": "etkf", "std": 0.25, "gain": 2.0, "key": "lidar"}
 
 
 @pytest.mark.parametrize("name", CHANGED)
 def test_settings_that_build_another_filter_are_refused(tmp_path, name):
     torch.manual_seed(0)
     model, settings = ball(), {name: CHANGED[name]}
-    stored = name in ("std", "start")  # a number in a buffer comes back with the weights
+    stored = name == "std"  # a number in a buffer comes back with the weights
     if not stored:
         with pytest.raises(ValueError, match=rf"ball\({name}=.*\) builds another model than the one to be stored"):
             save_pretrained(model, tmp_path, builder=ball, settings=settings)
@@ -190,20 +169,10 @@ def test_mistakes_are_named(tmp_path):
         from_pretrained(tmp_path)
     folder = copy_of("reacher", tmp_path)
     weights, config = folder / "weights.safetensors", folder / "config.json"
-    good, text = weights.read_bytes(), config.read_text()
-
-    flipped = bytearray(good)
+    flipped = bytearray(weights.read_bytes())
     flipped[-5] ^= 1  # a bit of a number: safetensors itself would not notice
     weights.write_bytes(flipped)
     with pytest.raises(ValueError, match=r"weights\.safetensors is damaged, .*its SHA-256 is [0-9a-f]{64}, expected"):
-        from_pretrained(folder)
-    weights.write_bytes(good)
-    config.write_text(described({**json.loads(text), "sha256": 64 * "0"}))
-    with pytest.raises(ValueError, match=f"expected {64 * '0'}; restore both from a copy"):
-        from_pretrained(folder)
-    weights.write_bytes(b"nothing")
-    config.write_text(described({**json.loads(text), "sha256": hashlib.sha256(b"nothing").hexdigest()}))
-    with pytest.raises(ValueError, match=r"weights\.safetensors cannot be read"):
         from_pretrained(folder)
     weights.unlink()
     with pytest.raises(FileNotFoundError, match="no weights"):

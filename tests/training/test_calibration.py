@@ -55,12 +55,6 @@ def test_distances_of_all_dimensions_count():
 # -------------------------------------------------------------------------------------------------------- hold last
 
 
-def test_what_is_not_seen_holds_the_last_reading():
-    values = torch.tensor([[[1.0], [2.0], [3.0], [4.0]]])
-    seen = torch.tensor([[[False], [True], [False], [True]]])
-    assert hold_last(values, seen, torch.tensor([[9.0]])).flatten().tolist() == [9.0, 2.0, 2.0, 4.0]
-
-
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
 def test_dimensions_are_held_each_by_itself_in_any_batch(batch):
     values, seen = torch.randn(*batch, 7, 2), torch.rand(*batch, 7, 2) < 0.5

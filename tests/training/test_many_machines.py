@@ -1,9 +1,6 @@
 """The example of many machines: what it refuses, what SAC gets, and workers under ray, where that is installed."""
 
 import importlib.util
-import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -56,19 +53,3 @@ def test_transitions_end_with_their_episode(page):
     assert torch.equal(rows["next", "reward"].squeeze(-1), 10 * first)
     missing = set(range(50)) - set(first.int().tolist())
     assert missing == {9, 19, 24, 29, 39, 49}  # before a reset, and the last of a window
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed")
-def test_two_workers_of_ray_collect_with_weights_of_known_age():
-    done = subprocess.run(
-        [sys.executable, str(FILE), "--smoke", "--collectors", "2", "--oldest", "0"],
-        capture_output=True,
-        text=True,
-        timeout=500,
-    )
-    assert done.returncode == 0, done.stderr
-    said = re.search(r"age of their weights: (.*); (\d+) rows refused", done.stdout)
-    ages = dict(re.findall(r"(\d+) versions: (\d+)", said[1]))
-    assert sum(map(int, ages.values())) == 3
-    assert int(said[2]) == 100 * sum(int(count) for age, count in ages.items() if int(age) > 0)

@@ -35,28 +35,3 @@ def test_a_part_is_trained_once_and_then_read(tmp_path):
     train_part(again, Stage("line", lambda batch: {}, never, 150), out=tmp_path, device="cpu")
     assert torch.equal(again.weight, first.weight)
     assert torch.equal(again.bias, first.bias)
-
-
-def test_a_training_that_was_broken_off_ends_as_an_unbroken_one(tmp_path):
-    """Saves 8 of 20 updates when the training fails in the 11th."""
-    results = {}
-    for name in ("whole", "broken"):
-        torch.manual_seed(0)
-        net = nn.Linear(1, 1)
-        stage, settings = line_stage(net, 20), {"out": tmp_path / name, "device": "cpu", "save_every": 4}
-        if name == "broken":
-            left = [10]
-
-            def fail_once(generator, length, sample=stage.sample, left=left):
-                left[0] -= 1
-                if left[0] == -1:
-                    raise KeyboardInterrupt
-                return sample(generator, length)
-
-            breaking = Stage("line", stage.loss, fail_once, 20, lr=0.2)
-            with pytest.raises(KeyboardInterrupt):
-                train_part(net, breaking, **settings)
-            assert not (tmp_path / name / "line.pt").exists()
-            net.weight.data.zero_()  # as a fresh process would not know it
-        results[name] = train_part(net, stage, **settings).weight.clone()
-    assert torch.equal(results["whole"], results["broken"])

@@ -1,5 +1,6 @@
 """Killed with SIGKILL and started again: every file is that of a training that was never broken off."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -59,12 +60,6 @@ def test_killed_and_resumed_is_unbroken(runs, name):
     assert_same(torch.load(run / "final_0.pt"), torch.load(unbroken / "final_0.pt"))
 
 
-def test_files_of_a_training_that_was_killed_ten_times_are_the_same_bytes(runs):
-    for file in ("last.pt", "best_sensor.pt", "best_filter.pt", "best_end_to_end.pt"):
-        assert (runs / "ten_kills" / file).read_bytes() == (runs / "plain" / file).read_bytes(), file
-    assert csv_files(runs / "ten_kills") == csv_files(runs / "plain")
-
-
 @pytest.mark.parametrize("name", ["after_rows_that_no_checkpoint_knows", "twice_in_the_last_stage"])
 def test_tensorboard_shows_every_value_once(runs, name):
     shown = []
@@ -100,6 +95,24 @@ def test_a_finished_training_is_not_trained_again(tmp_path):
     assert_same(dict(trainer.model.state_dict()), dict(torch.load(first["end_to_end"]["path"])["model"]))
 
 
+def test_settings_must_be_the_same_and_stages_may_be_added(tmp_path, caplog):
+    two = make_trainer(tmp_path, updates=2, stages=("sensor", "filter")).fit()
+    with pytest.raises(ValueError, match=r"last\.pt is of another training: seed \(0, now 3\), stages\[0\].updates"):
+        make_trainer(tmp_path, updates=3, seed=3).fit()
+    three = make_trainer(tmp_path, updates=2).fit()
+    assert list(three) == ["sensor", "filter", "end_to_end"]
+    assert {name: three[name] for name in two} == two
+    assert "fit(resume=False)" not in caplog.text
+    make_trainer(tmp_path, updates=2).fit()
+    assert "fit(resume=False)" in caplog.text, "all is done"
+    logs = csv_files(tmp_path)
+    make_trainer(tmp_path, updates=2, seed=1).fit(resume=False)
+    again = csv_files(tmp_path)
+    assert again.keys() == logs.keys()
+    assert again["scalars/filter/loss.csv"] != logs["scalars/filter/loss.csv"]
+    assert again["scalars/filter/loss.csv"].count(b"\n") == 1
+
+
 def test_another_model_is_refused(tmp_path):
     def trainer(width):
         net = torch.nn.Linear(width, 1)
@@ -112,29 +125,12 @@ def test_another_model_is_refused(tmp_path):
         trainer(2).fit()
 
 
-WAITS = """
-import sys
-from pathlib import Path
-from tests.training.problem import make_trainer
-trainer = make_trainer(Path(sys.argv[1]), updates=2)
-trainer.register_op("pre_optim_steps", lambda: (print("ready", flush=True), sys.stdin.readline()))
-trainer.fit()
-"""
-
-
-def test_a_second_trainer_is_refused_and_a_killed_one_is_not_in_the_way(tmp_path):
-    make_trainer(tmp_path / "alone", updates=2).fit()
-    command = [sys.executable, "-c", WAITS, str(tmp_path / "run")]
-    first = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert first.stdout.readline() == "ready\n"
-    match = rf"cannot use .*run: another process is training in it \(process {first.pid}\); wait for it"
-    with pytest.raises(OSError, match=match):
-        make_trainer(tmp_path / "run", updates=2).fit()
-    first.kill()
-    first.wait()
-    make_trainer(tmp_path / "run", updates=2).fit()
-    assert csv_files(tmp_path / "run") == csv_files(tmp_path / "alone")
-    assert not [file for file in (tmp_path / "run").iterdir() if file.name.startswith(".")]
+def test_a_second_trainer_raises(tmp_path):
+    locked = rf"cannot use .*run: another process is training in it \(process {os.getpid()}\); wait for it"
+    trainer = make_trainer(tmp_path / "run", updates=2, stages=("sensor",))
+    trainer.register_op("pre_optim_steps", make_trainer(tmp_path / "run", updates=2, stages=("sensor",)).fit)
+    with pytest.raises(OSError, match=locked):
+        trainer.fit()
 
 
 @pytest.mark.parametrize("resume", [True, False])

@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from torch_denkf.training import Stage
-from torch_denkf.training.stage import only_trainable
+from torch_denkf.training.stage import only_trainable, parameters_without
 
 
 def rates(stage, net):
@@ -85,3 +85,27 @@ def test_only_trainable_restores_what_was():
 def test_mistakes(change, message):
     with pytest.raises(ValueError, match=message):
         Stage(**{"name": "fit", "loss": None, "sample": None, "updates": 1, **change})
+
+
+def test_a_name_that_is_no_module_raises():
+    net = nn.ModuleDict({"sensor": nn.Linear(1, 1), "motion": nn.Linear(1, 1)})
+    stage = Stage("fit", dict, dict, 1, frozen=["sensor"])
+    assert [p for group in stage.groups(net) for p in group["params"]] == list(net["motion"].parameters())
+    with pytest.raises(KeyError, match=r"no module.*camera"):
+        Stage("fit", dict, dict, 1, frozen=["camera"]).groups(net)
+    with pytest.raises(TypeError, match="list of names"):
+        Stage("fit", dict, dict, 1, frozen="sensor")
+
+
+def test_a_stage_with_frozen_modules_trains_nothing_that_no_checkpoint_holds():
+    """Raises for a parameter that the loss alone holds, as it does without frozen modules."""
+    net, other = nn.ModuleDict({"sensor": nn.Linear(1, 1), "head": nn.Linear(1, 1)}), nn.Parameter(torch.ones(1))
+    with pytest.raises(ValueError, match="1 parameters that the trainer's model does not hold"):
+        Stage("fit", dict, dict, 1, frozen=["sensor"], parameters=[*net.parameters(), other]).groups(net)
+
+
+def test_the_initial_belief_may_be_frozen():
+    net, initial = nn.Module(), nn.Linear(1, 1)
+    net.module, net.initial = nn.ModuleDict({"sensor": nn.Linear(1, 1)}), initial
+    assert parameters_without(net, ["initial"]) == list(net.module.parameters())
+    assert parameters_without(net, ["sensor"]) == list(initial.parameters())

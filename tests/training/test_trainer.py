@@ -1,21 +1,18 @@
 """Oracles: a training loop written out by hand, the maximum of a closed-form likelihood, scripted validations."""
 
+import copy
+
 import pytest
 import torch
-from scipy.optimize import minimize_scalar
 from tensordict import TensorDict
 from torch import nn
 from torchrl.record.loggers import CSVLogger
 from torchrl.trainers import ClearCudaCache, CountFramesLog, EarlyStopping, LogScalar
 
 from tests.training.problem import make_trainer
-from torch_denkf.filters import EKF, KalmanFilter
-from torch_denkf.modules import ConstantNoise, LearnedTransition, MomentPrior, Select
-from torch_denkf.objectives import DEnKFLoss, GaussianLoss
 from torch_denkf.training import FilterTrainer, Stage
 from torch_denkf.training.checkpoint import read_checkpoint
-from torch_denkf.training.distributed import Processes
-from torch_denkf.training.update import Updates, seed_update
+from torch_denkf.training.update import seed_update
 
 
 def rows(out, name):
@@ -61,14 +58,20 @@ def by_hand(stage, net, seed, number=0, spoil=()):
 
 
 @pytest.mark.parametrize("spoil", [(), (0,), (2, 3)])
-def test_it_is_the_loop_that_one_would_write(tmp_path, spoil):
+def test_it_is_the_loop_that_one_would_write(tmp_path, spoil, caplog):
     net, twin = nn.Linear(2, 1), nn.Linear(2, 1)
     twin.load_state_dict(net.state_dict())
     options = {"lr": 0.1, "weight_decay": 0.2, "clip": 0.5}
     trainer = FilterTrainer(
         net, [line_stage(net, spoil=spoil, **options)], out=tmp_path, seed=3, log_every=3, device="cpu", save_every=4
     )
-    result = trainer.fit()["fit"]
+    with caplog.at_level("WARNING", "torch_denkf"):
+        result = trainer.fit()["fit"]
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == bool(spoil), "it is said once"
+    assert all(
+        f"'fit', update {spoil[0] + 1} is left out" in text and "['x', 'y'] of its batch" in text for text in messages
+    )
     seen = by_hand(line_stage(twin, spoil=spoil, **options), twin, 3, spoil=spoil)
     for one, other in zip(net.parameters(), twin.parameters(), strict=True):
         # clip_grad_norm_ and its two halves multiply in the same order
@@ -101,91 +104,6 @@ def test_too_many_that_are_not_finite(tmp_path):
     twin.load_state_dict(state["model"])
     assert all(torch.equal(one, other) for one, other in zip(net.parameters(), twin.parameters(), strict=True))
     assert all(torch.isfinite(p).all() and p.requires_grad for p in net.parameters())
-
-
-def small_filter():
-    """An EKF of two states with a transition that is trained."""
-    return EKF(
-        transition=LearnedTransition(nn.Linear(2, 2)),
-        sensor=None,
-        observation=Select([0, 1]),
-        noise=ConstantNoise([0.5, 0.5], in_key="observation"),
-        initial=MomentPrior(torch.zeros(2), torch.eye(2)),
-        process_noise=[0.1, 0.1],
-        observation_key="observation",
-    )
-
-
-def filter_stage(filter, spoil, updates=6):
-    """A filter on drawn sequences; the batches of the updates in ``spoil`` hold a reading that is NaN."""
-    drawn = iter(range(10**6))
-
-    def sample(generator, length):
-        batch = TensorDict({}, [4, 5])
-        for name in ("observation", "state"):
-            batch[name] = torch.randn(4, 5, 2, generator=generator)
-        if next(drawn) in spoil:
-            batch["observation"][1, 2, 0] = torch.nan
-        return batch
-
-    return Stage("fit", GaussianLoss(filter, state=1.0), sample, updates, lr=0.01)
-
-
-def test_updates_with_readings_that_are_not_finite_are_left_out_and_said_once(tmp_path, caplog):
-    filter, twin = small_filter(), small_filter()
-    twin.load_state_dict(filter.state_dict())
-    trainer = FilterTrainer(filter, [filter_stage(filter, (1, 2, 4))], out=tmp_path / "a", device="cpu", log_every=3)
-    with caplog.at_level("WARNING", "torch_denkf"):
-        result = trainer.fit()["fit"]
-    assert result["skipped"] == 3
-    assert rows(tmp_path / "a", "fit/skipped") == [(3, 2.0), (6, 3.0)]
-    (record,) = caplog.records
-    assert "Stage 'fit', update 2 is left out" in record.getMessage()
-    assert "['observation']" in record.getMessage()
-    # Those that are left out leave no trace: three updates with the batches of the others end at the same parameters.
-    stage = filter_stage(twin, ())
-    updates = Updates(stage, stage.groups(twin), Processes("cpu"))
-    for update in (0, 3, 5):
-        assert updates.step(stage.sample(seed_update(0, 0, update), None))
-    for one, other in zip(filter.parameters(), twin.parameters(), strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=0)
-
-
-def test_the_likelihood_reaches_its_maximum(tmp_path, float64):
-    truth, Q, R, T, rows_ = 0.8, 0.3, 0.2, 12, 64
-    x, readings = torch.randn(rows_), []
-    for _ in range(T):
-        readings.append(x + R**0.5 * torch.randn(rows_))
-        x = truth * x + Q**0.5 * torch.randn(rows_)
-    readings = torch.stack(readings, 1)
-
-    def joint(F):
-        """Mean negative log-likelihood of readings 1 to T - 1, whose covariance is written out."""
-        var = [1.0]
-        for _ in range(T - 1):
-            var.append(F**2 * var[-1] + Q)
-        cov = torch.tensor(
-            [[F ** abs(t - s) * var[min(s, t)] + R * (s == t) for s in range(1, T)] for t in range(1, T)]
-        )
-        density = torch.distributions.MultivariateNormal(torch.zeros(T - 1), cov)
-        return -density.log_prob(readings[:, 1:]).mean().item() / (T - 1)
-
-    best = minimize_scalar(joint, bounds=(0.1, 1.0), method="bounded", options={"xatol": 1e-8})
-    one = torch.eye(1)
-    kalman = KalmanFilter(0.3 * one, one, process_noise_cov=Q * one, noise_cov=R * one, mean=torch.zeros(1), cov=one)
-    del kalman["transition"].matrix
-    kalman["transition"].matrix = nn.Parameter(0.3 * one)
-    nll = DEnKFLoss(kalman, state=0.0, transition=0.0, sensor=0.0, nll=1.0)
-    batch = TensorDict({"observation": readings.unsqueeze(-1)}, [rows_, T])
-    stage = Stage("fit", nll, lambda generator, length: batch.copy(), 150, lr=0.05)
-    trainer = FilterTrainer(
-        kalman, [stage], out=tmp_path, device="cpu", validate=lambda: nll(batch.copy()), validate_every=20
-    )
-    result = trainer.fit()["fit"]
-    fitted = kalman["transition"].matrix.item()
-    assert result["value"] == pytest.approx(best.fun, abs=1e-7)
-    assert fitted == pytest.approx(best.x, abs=1e-3)
-    assert abs(fitted - truth) < 0.1  # three standard errors of 64 x 11 steps are 0.09
 
 
 def test_stages_freeze_and_hand_on(tmp_path):
@@ -268,12 +186,9 @@ def test_a_stage_that_gained_nothing_is_said_and_why_that_is_likely(tmp_path, ca
 
 
 def test_validation_leaves_the_training_alone(tmp_path):
-    finals = []
+    finals, first = [], nn.Linear(2, 1)
     for draws in (0, 5):
-        net = nn.Linear(2, 1)
-        nn.init.ones_(net.weight)
-        nn.init.zeros_(net.bias)
-        seen = []
+        net, seen = copy.deepcopy(first), []
 
         def validate(draws=draws, seen=seen):
             seen.append(torch.rand(draws + 1).sum().item())
@@ -315,24 +230,31 @@ def test_hooks_of_torchrl(tmp_path, capfd):
     assert capfd.readouterr() == ("", "")  # no bar where no terminal is
 
 
-def test_mistakes(tmp_path):
+OF_THE_TRAINER = {
+    "two stages of a name": ({"stages": 2}, "name of its own"),
+    "a logger": ({"loggers": ["wandb"]}, "Unknown logger 'wandb'"),
+    "what is kept": ({"keep": "first"}, "keep is"),
+    "no log": ({"log_every": 0}, "at least 1"),
+}
+OF_THE_LOSS = {
+    "no loss": (lambda net, x: {"error": net(x).mean()}, 'starts with "loss"'),
+    "a loss of rows": (lambda net, x: {"loss": net(x)}, r"'loss' is \[8, 1\]"),
+    "a loss of no parameter": (lambda net, x: {"loss": x.sum()}, "does not depend on the parameters"),
+}
+
+
+@pytest.mark.parametrize("what", [*OF_THE_TRAINER, *OF_THE_LOSS])
+def test_mistakes(what, tmp_path):
+    net, options = nn.Linear(2, 1), {"out": tmp_path, "device": "cpu", **OF_THE_TRAINER.get(what, ({},))[0]}
+    stages = [line_stage(net)] * options.pop("stages", 1)
+    if what in OF_THE_LOSS:
+        stages = [Stage("fit", lambda batch: OF_THE_LOSS[what][0](net, batch["x"]), stages[0].sample, 1)]
+    with pytest.raises(ValueError, match={**OF_THE_TRAINER, **OF_THE_LOSS}[what][1]):
+        FilterTrainer(net, stages, **options).fit()
+
+
+def test_a_monitor_that_is_not_validated(tmp_path):
     net = nn.Linear(2, 1)
-    options = {"out": tmp_path, "device": "cpu"}
-    with pytest.raises(ValueError, match="name of its own"):
-        FilterTrainer(net, [line_stage(net), line_stage(net)], **options)
-    with pytest.raises(ValueError, match="Unknown logger 'wandb'"):
-        FilterTrainer(net, [line_stage(net)], loggers=["wandb"], **options)
-    with pytest.raises(ValueError, match="keep is"):
-        FilterTrainer(net, [line_stage(net)], keep="first", **options)
-    with pytest.raises(ValueError, match="at least 1"):
-        FilterTrainer(net, [line_stage(net)], log_every=0, **options)
+    options = {"validate": lambda: {"error": 0.0}, "monitor": "mse", "out": tmp_path, "device": "cpu"}
     with pytest.raises(KeyError, match=r"monitor='mse' is none of \['error'\]"):
-        FilterTrainer(net, [line_stage(net)], validate=lambda: {"error": 0.0}, monitor="mse", **options).fit()
-    for loss, message in (
-        (lambda batch: {"error": net(batch["x"]).mean()}, 'starts with "loss"'),
-        (lambda batch: {"loss": net(batch["x"])}, r"'loss' is \[8, 1\]"),
-        (lambda batch: {"loss": batch["x"].sum()}, "does not depend on the parameters"),
-    ):
-        stage = Stage("fit", loss, line_stage(net).sample, 1)
-        with pytest.raises(ValueError, match=message):
-            FilterTrainer(net, [stage], **options).fit(resume=False)
+        FilterTrainer(net, [line_stage(net)], **options).fit()

@@ -4,36 +4,25 @@
 [3], inside or outside of a ``SerialEnv`` or ``ParallelEnv`` of two.
 """
 
-import pickle
 from functools import partial
 
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
-from torchrl.envs import (
-    Compose,
-    InitTracker,
-    ParallelEnv,
-    SerialEnv,
-    TransformedEnv,
-    check_env_specs,
-)
+from torchrl.envs import Compose, InitTracker, ParallelEnv, SerialEnv, TransformedEnv
 
-from tests.filters.factories import assert_equal, linear_kalman
+from tests.filters.factories import assert_equal
 from tests.transforms.envs_for_tests import (
     BELIEF,
     PRIOR_MEAN,
     STEPS,
-    base_env,
     filtered_env,
     fixed_filter,
     forked_env,
     half_known_filter,
-    random_filter,
     random_rollout,
     seeded_env,
     toy_base_env,
@@ -112,8 +101,7 @@ def test_steps_equal_the_sequence(kind, update_at_reset):
 def test_collector_replay_buffer_loss_gradients():
     filter = toy_filter()
     env = TransformedEnv(
-        toy_base_env(batch_size=[3], max_steps=[7, 9, 50], missing=0.2),
-        Compose(InitTracker(), DEnKFTransform(filter)),
+        toy_base_env(batch_size=[3], max_steps=[7, 9, 50], missing=0.2), Compose(InitTracker(), DEnKFTransform(filter))
     )
     policy = TensorDictModule(nn.Linear(3, 2), in_keys=[("belief", "mean")], out_keys=["action"])
     collector = Collector(env, policy, frames_per_batch=90, total_frames=180)
@@ -141,15 +129,6 @@ def test_collector_replay_buffer_loss_gradients():
         assert any((grad != 0).any() for grad in grads), name
 
 
-def test_kalman_filter_in_the_transform(float64):
-    kf = linear_kalman()
-    env = filtered_env(lambda: kf, batch_size=[3], max_steps=[4, 7, 50], missing=0.2)
-    check_env_specs(env)
-    rollout = random_rollout(TransformedEnv(env, InitTracker()))
-    expected = kf.sequence(rollout.select("observation", "observed", "is_init"))
-    assert_equal(rollout, expected, [("belief", "mean"), ("belief", "cov"), ("belief", "var")], atol=1e-13)
-
-
 @pytest.mark.parametrize("env", KINDS[1:], indirect=True, scope="module")
 def test_rows_and_workers_differ(env):
     torch.manual_seed(1)  # of the filter, where it runs in this process
@@ -161,20 +140,3 @@ def test_rows_and_workers_differ(env):
     rollout = random_rollout(env, 4)
     noise = rollout["next", "belief", "ensemble"] - rollout["next", "belief", "mean"].unsqueeze(-2)
     assert not noise[0].allclose(noise[1])
-
-
-def test_nothing_on_self():
-    transform = DEnKFTransform(random_filter())
-    env = TransformedEnv(base_env(batch_size=[3]), transform)
-    before = {name: value for name, value in vars(transform).items() if name not in ("_modules", "_parent")}
-    snapshot = pickle.dumps({k: v for k, v in before.items() if not callable(v)})
-    check_env_specs(env)
-    random_rollout(env)
-    for value in vars(transform).values():
-        assert not isinstance(value, (torch.Tensor, TensorDict))
-    after = {name: vars(transform)[name] for name in before}
-    assert pickle.dumps({k: v for k, v in after.items() if not callable(v)}) == snapshot
-    # Two environments on clones of one transform do not touch each other.
-    other = TransformedEnv(base_env(batch_size=[2]), transform.clone())
-    assert other.rollout(3).shape == (2, 3)
-    assert env.rollout(3).shape == (3, 3)

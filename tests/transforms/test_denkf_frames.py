@@ -2,22 +2,11 @@
 
 import pytest
 import torch
-from torchrl.envs import (
-    Compose,
-    DoubleToFloat,
-    TransformedEnv,
-)
+from torchrl.envs import Compose, DoubleToFloat, TransformedEnv
 
 from tests.filters.factories import assert_equal, linear_denkf
 from tests.functional.checks import assert_refused
-from tests.transforms.envs_for_tests import (
-    BELIEF,
-    Changed,
-    base_env,
-    random_filter,
-    toy_base_env,
-    toy_filter,
-)
+from tests.transforms.envs_for_tests import BELIEF, Changed, base_env, random_filter, toy_base_env, toy_filter
 from torch_denkf.imperfect import RejectReadings
 from torch_denkf.transforms import DEnKFTransform
 
@@ -67,6 +56,13 @@ def test_observed_nan_raises_and_names_the_key(make_base, make_filter):
     assert_equal(make(reject).rollout(8)["next"], make(honest=True).rollout(8)["next"], BELIEF)
 
 
+def test_divergence_is_told_apart():
+    filter = linear_denkf()
+    filter["transition"].matrix.mul_(1e30)
+    env = TransformedEnv(base_env(), DEnKFTransform(filter))
+    assert_refused(ValueError, "all inputs are finite, and the filter diverged", env.rollout, 5)
+
+
 # ------------------------------------------------------------------------------------------------------ errors
 
 
@@ -79,7 +75,6 @@ def test_float64_environment_and_float32_filter():
     with pytest.raises(TypeError, match="DoubleToFloat"):
         _ = TransformedEnv(base, DEnKFTransform(linear_denkf())).observation_spec
     mended = TransformedEnv(
-        base,
-        Compose(DoubleToFloat(in_keys=["observation"], in_keys_inv=["action"]), DEnKFTransform(linear_denkf())),
+        base, Compose(DoubleToFloat(in_keys=["observation"], in_keys_inv=["action"]), DEnKFTransform(linear_denkf()))
     )
     assert mended.rollout(3)["next", "belief", "mean"].dtype == torch.float32

@@ -8,7 +8,6 @@ import torch
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import ExcludeTransform, InitTracker, TransformedEnv
-from torchrl.modules import set_recurrent_mode
 
 from tests.filters.factories import assert_equal, linear_kalman, linear_system, toy_denkf
 from tests.transforms.envs_for_tests import A, M, S
@@ -81,24 +80,6 @@ def test_nan_before_the_filter_raises_without_a_mask_and_is_a_missing_reading_wi
     data = env.rollout(12, break_when_any_done=False)
     assert data["next", "observed"].equal(~data["next", "done"])
     assert_equal(data, filter.sequence(data.select("observation", "observed", "is_init")), filter.belief_keys)
-
-
-@pytest.mark.parametrize("rejected", [False, True])
-def test_in_a_losss_next_part_nan_stays_in_the_done_rows_and_rejection_takes_it_away(float64, rejected):
-    filter = linear_kalman()
-    data = collected(TransformedEnv(simulator(), InitTracker()))
-    following = data["next"].select("observation", "done")  # a simulator of no mask
-    if rejected:
-        following = RejectReadings({"observation": "observed"})(following)
-    with set_recurrent_mode(True):
-        mean = filter(following)["belief", "mean"]
-    assert mean.isfinite().all(-1, keepdim=True).equal(data["next", "done"].logical_not() | rejected)
-    clean = following.clone()
-    clean["observed"] = ~data["next", "done"]
-    clean["observation"] = data["next", "observation"].nan_to_num(0.0)
-    expected = filter.sequence(clean)["belief", "mean"]
-    known = torch.ones_like(mean, dtype=torch.bool) if rejected else ~data["next", "done"].expand_as(mean)
-    torch.testing.assert_close(mean[known], expected[known], rtol=0, atol=1e-12)
 
 
 def test_in_a_buffer_and_a_loss_gradients_are_those_of_data_without_nan(float64):

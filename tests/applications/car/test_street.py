@@ -39,13 +39,6 @@ def straight():
     return poses_along(0 * z, z, 0 * z, 0 * z, -0.02 + sway, 0.04 + sway), lambda x, z: np.full_like(x, HEIGHT)
 
 
-def curve():
-    s, radius = 0.8 * np.arange(90), 30.0  # to the right
-    flat = 0 * s
-    poses = poses_along(radius * (1 - np.cos(s / radius)), radius * np.sin(s / radius), flat, s / radius, flat, flat)
-    return poses, lambda x, z: np.full_like(x, HEIGHT)
-
-
 def hill():
     z = 0.7 * np.arange(190)
     smoothed = HILL * np.exp(-0.5 * (SMOOTH * WAVE) ** 2)  # a Gaussian filter's gain at the hill's frequency
@@ -77,7 +70,7 @@ def empty(poses, **changes):
 
 
 # On hills the verge is not as level to the sides as the road.
-@pytest.mark.parametrize(("road", "reach"), [(straight, 12), (curve, 12), (hill, 4)])
+@pytest.mark.parametrize(("road", "reach"), [(straight, 12), (hill, 4)])
 def test_dots_on_the_road_are_where_the_poses_put_them(road, reach):
     poses, height = road()
     tile = np.full((TILE, TILE, 3), 250, np.uint8)
@@ -90,7 +83,7 @@ def test_dots_on_the_road_are_where_the_poses_put_them(road, reach):
     grid = RESOLUTION * (8 + SPACING * np.arange(-40, 70))
     found = 0
     misses = []
-    for number in range(20, len(poses) - 20, 3):
+    for number in range(20, len(poses) - 20, 6):
         pose, picture = poses[number], cv2.cvtColor(renderer.render(poses[number], number), cv2.COLOR_BGR2GRAY)
         x, z = (axis.ravel() for axis in np.meshgrid(grid, grid))
         spots, depth = project(camera, pose, np.stack([x, height(x, z), z], -1))

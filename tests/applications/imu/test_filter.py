@@ -5,13 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
+from scipy.spatial.transform import Rotation
 
 from torch_denkf.applications.imu import imu, imu_rows, orientations
-from torch_denkf.applications.imu.filter import SPACE, ImuSettings, moves
+from torch_denkf.applications.imu.filter import ImuSettings
 from torch_denkf.functional.manifolds import SO3, rotate
 from torch_denkf.pretrained import from_pretrained
-from torch_denkf.smoothers import RTSSmoother
 
 SETTINGS = ImuSettings(
     gyro=0.003,
@@ -53,26 +52,15 @@ def body_log(count=400, rate=100.0, seed=0):
 
 
 def matrix(q):
-    w, x, y, z = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return Rotation.from_quat(q, scalar_first=True).as_matrix()
+
+
+def rotation(v):
+    return Rotation.from_rotvec(v).as_matrix()
 
 
 def skew(v):
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-
-
-def rotation(v):
-    angle = np.linalg.norm(v)
-    if angle < 1e-12:
-        return np.eye(3) + skew(v)
-    k = skew(v / angle)
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
 def left_jacobian(v):
@@ -160,62 +148,6 @@ def test_it_is_the_error_state_kalman_filter(axes):
     assert np.abs((out["cov"].numpy() - cov) / (scale[:, :, None] * scale[:, None])).max() < 1e-6
 
 
-# ------------------------------------------------------------------------------------- data of the model itself
-
-
-def drawn_rows(settings, runs=200, steps=45, seed=0):
-    """Rows and states of bodies that move, and whose sensors err, as the filter expects."""
-    torch.manual_seed(seed)
-    model, dt = imu(**dataclasses.asdict(settings)).double(), 0.035
-    rows = TensorDict(batch_size=[runs, steps])
-    time = torch.arange(steps, dtype=torch.float64) * dt
-    rows["gyro"] = torch.stack([(time * f).sin() for f in (1.0, 1.7, 2.3)], -1).expand(runs, -1, -1).contiguous()
-    rows["dt"] = torch.full((runs, steps, 1), dt, dtype=torch.float64)
-    rows["moves"] = moves(settings.poles, dt).expand(runs, steps, 9).contiguous()
-    rows["unrest"] = torch.full_like(rows["dt"], 0.5)
-    rows["disturbance"] = torch.full_like(rows["dt"], 0.3)
-    rows["lever"] = torch.randn(runs, steps, 9, dtype=torch.float64)
-    rows["rest_observed"] = torch.zeros(runs, steps, 1, dtype=torch.bool)
-    middle = SPACE.neutral(rows["dt"])
-    middle[28:30] = torch.tensor([16.0, -41.0])
-    rows["start"] = middle.expand(runs, steps, -1).contiguous()
-    transition, noise = model["transition"].module, model["transition"].process_noise
-    std = model.initial.std
-    states, accelerometer, magnetometer = [], [], []
-    for t in range(steps):
-        if t == 0:
-            state = SPACE.plus(rows["start"][:, 0], std * torch.randn(runs, 36, dtype=torch.float64))
-        else:
-            now = rows[:, t].clone()
-            now["belief", "ensemble"], now["belief", "mean"] = state.unsqueeze(1), state
-            state, variance = transition(now)["forecast", "ensemble"].squeeze(1), noise(now)["forecast", "noise"]
-            state = SPACE.plus(state, variance.sqrt() * torch.randn(runs, 36, dtype=torch.float64))
-        now = TensorDict({"forecast": {"ensemble": state.unsqueeze(1)}, **rows[:, t]}, [runs])
-        for name, to in (("accelerometer", accelerometer), ("magnetometer", magnetometer)):
-            value = model[name].module.module(now.clone()).get(("forecast", "observation")).squeeze(1)
-            variance = settings.accelerometer**2
-            if name == "magnetometer":
-                variance = model["magnetometer_noise"].module.compute(rows["gyro"][:, t])
-            to.append(value + torch.as_tensor(variance).sqrt() * torch.randn(runs, 3, dtype=torch.float64))
-        states.append(state)
-    rows["accelerometer"], rows["magnetometer"] = torch.stack(accelerometer, 1), torch.stack(magnetometer, 1)
-    return model, rows, torch.stack(states, 1)
-
-
-@torch.no_grad()
-def test_intervals_hold_on_data_of_the_model():
-    model, rows, states = drawn_rows(dataclasses.replace(SETTINGS, motion_unrest=2.0))
-    smoothed = RTSSmoother(model).sequence(rows)
-    errors = {}
-    for prefix in ("belief", "smoothed"):
-        away = SPACE.minus(states, smoothed[prefix, "mean"])[:, 20:, :3]
-        variance = smoothed[prefix, "var"][:, 20:, :3]
-        held = (away.square() < 1.645**2 * variance).double().mean((0, 1))
-        assert ((held > 0.85) & (held < 0.95)).all(), (prefix, held)
-        errors[prefix] = away.square().mean((0, 1))
-    assert (errors["smoothed"] < errors["belief"]).all()
-
-
 # --------------------------------------------------------------------------------------------------- a whole log
 
 
@@ -244,18 +176,8 @@ def test_within_a_block_the_gyro_turns_exactly():
     torch.testing.assert_close(ahead[:, 2], torch.full_like(angle, 0.1), atol=1e-3, rtol=0)
 
 
-@torch.no_grad()
-def test_an_accelerometer_says_nothing_of_the_heading():
-    _, log = body_log(600)
-    del log["magnetometer"]
-    log["gyro"] -= torch.tensor([0.01, -0.02, 0.005])  # its bias
-    model = imu(heading=0.5, gyro_bias=1e-9, gyro_walk=1e-9, gyro_scale=1e-9, gyro_skew=1e-9).double()
-    variance = model.sequence(imu_rows(model.settings, **log, rate=100.0))["belief", "cov"][:, 2, 2]
-    assert variance.min() > 0.97 * 0.5**2  # vectors in the world's axes: 0.21 * 0.5**2
-
-
 def test_a_field_unlike_that_of_the_place_widens_the_heading():
-    _, log = body_log(400)
+    _, log = body_log(250)
     model = imu().double()
     found = orientations(model, **log, rate=100.0)
     field = found.mean[-1, 28:30]
@@ -269,12 +191,8 @@ def test_a_field_unlike_that_of_the_place_widens_the_heading():
 
 def test_a_log_that_is_not_one():
     _, log = body_log(100)
-    with pytest.raises(ValueError, match=r"m/s\^2.*median of its size is 1\."):
-        imu_rows(SETTINGS, log["gyro"], log["acceleration"] / 9.82, rate=100.0)
     with pytest.raises(ValueError, match="at least 5 readings"):
         imu_rows(SETTINGS, log["gyro"][:3], log["acceleration"][:3], rate=100.0)
-    with pytest.raises(ValueError, match="not finite"):
-        imu_rows(SETTINGS, log["gyro"] / 0, log["acceleration"], rate=100.0)
     with pytest.raises(ValueError, match="poles"):
         imu(poles=(1.0, 2.0))
 

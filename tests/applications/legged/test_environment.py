@@ -7,7 +7,6 @@ from torch_denkf.applications.legged import QUADRUPED, LeggedErrors, quadruped_e
 from torch_denkf.applications.legged.environment import LeggedEnv
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.functional.manifolds import SO3, rotate
-from torch_denkf.motions.inertial import move_inertially
 
 PERFECT = LeggedErrors(*[0.0] * 9)
 
@@ -44,40 +43,9 @@ def test_the_sensors_read_how_their_place_moves():
     assert (change - world[2:]).square().mean().sqrt() < 0.03 * change.square().mean().sqrt()
 
 
-def test_integrated_readings_lead_where_the_base_is(log):
-    env = quadruped_env(PERFECT)
-    sensor = LegKinematics(env.model, QUADRUPED["feet"], QUADRUPED["imu"]).base.double()
-    turn = SO3().compose(log["true", "orientation"], sensor[:4].expand(300, 4))
-    place = log["true", "position"] + rotate(log["true", "orientation"], sensor[4:])
-    first = (place[1] - place[0]) / env.dt
-    pose = torch.cat([turn[1], first, place[1]])
-    for row in range(2, 102):
-        pose = move_inertially(pose, log["imu"][row, :3], log["imu"][row, 3:], env.dt)
-    assert SO3().distance(pose[:4], turn[101]) < 0.01
-    # The velocity at the start is half a step old: a quarter of a metre in a second at 50 m/s^2 and .005 s.
-    assert (pose[7:] - place[101]).norm() < 0.1
-
-
 def test_feet_that_stand_press_the_floor_and_carry_the_robot(log):
     weight = quadruped_env().model.body_mass.sum() * 9.81
     assert log["force"].sum(-1).mean() == pytest.approx(weight, rel=0.1)
     assert ((log["force"] > 150) <= log["contact"]).all()
     assert 0.3 < log["contact"].float().mean() < 0.95
     assert (log["true", "position"][-1, :2] - log["true", "position"][0, :2]).norm() > 0.3
-
-
-def test_feet_slide_on_ice():
-    """Measures how far standing feet move along the floor, of the robot's own way."""
-    slides = []
-    for friction in (1.5, 0.1):
-        env = quadruped_env(PERFECT, friction=friction)
-        td, moved = env.reset(), 0.0
-        before = env.data.geom_xpos[[env.model.geom(foot).id for foot in QUADRUPED["feet"]]].copy()
-        for step in range(150):
-            td["action"] = min(1.0, step * env.dt) * trot(step * env.dt)
-            td = env.step(td)["next"]
-            place = env.data.geom_xpos[[env.model.geom(foot).id for foot in QUADRUPED["feet"]]].copy()
-            moved += ((place - before)[:, :2] ** 2).sum(-1)[td["contact"].numpy()].sum() ** 0.5
-            before = place
-        slides.append(moved)
-    assert slides[1] > 2 * slides[0]

@@ -39,31 +39,6 @@ def contacts_of(model, rows=10, **options):
     return LearnedContacts(model, **QUADRUPED, rows=rows, rate=RATE, lasts=LASTS, **options)
 
 
-def standing(model, runs):
-    """Two rows of a robot that stands still with all feet; the joints say that one foot of each run moves."""
-    base = quadruped_env(seed=0).reset().select(*KEYS)
-    log = torch.stack([base.expand(runs)] * 2, 1).clone()
-    log["imu"][..., :3] = 0
-    log["contact"][:] = True
-    log["joint_rates"] = torch.zeros_like(log["joint_rates"])
-    foot = torch.randint(4, (runs,))
-    moves = torch.nn.functional.one_hot(foot, 4).bool()
-    rates = (3 + 3 * torch.rand(runs, 1)) * torch.randn(runs, 1).sign()
-    knees = torch.arange(2, 16, 4)  # a knee for each leg
-    log["joint_rates"][..., knees] = (moves * rates).unsqueeze(1).expand(runs, 2, 4)
-    log["joint_rates"] += 0.1 * torch.randn(runs, 2, 16)
-    log["true"] = TensorDict({"velocity": torch.zeros(runs, 2, 3)}, [runs, 2])
-    return with_last_rows(log, 1), moves
-
-
-def test_before_training_all_feet_are_alike(model, log):
-    contacts = contacts_of(model)
-    out = contacts(with_last_rows(log, 10))
-    assert_close(out["sensor", "noise"], LASTS * RATE**2 * torch.eye(12).expand(1, 40, 12, 12))
-    assert_close(out["legs", "slip"], torch.full((1, 40, 4), LASTS * RATE**2))
-    assert not out["legs", "moves"].any()
-
-
 def test_each_foot_has_a_covariance_of_its_own(model, log):
     contacts = contacts_of(model)
     for weight in contacts.parameters():
@@ -106,7 +81,7 @@ def test_a_foot_walks_as_its_noise_says():
     assert_close(timed(TensorDict(more, [1]))["forecast", "noise"][0, 15:], torch.tensor([1.0] * 3 + [2.25] * 3))
 
 
-@pytest.mark.parametrize("kind", ["EKF", "UKF", "DEnKF"])
+@pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
 def test_untrained_they_are_the_noises(kind, model, log):
     """Constant covariances are those of LeggedNoises(slip=, rate=); a foot walks for each step anew."""
     rate, slip = LASTS**0.5 * RATE, (0.01 * LASTS) ** 0.5 * RATE
@@ -136,38 +111,12 @@ def test_the_loss_is_that_of_the_feet_that_stand(model, log):
     assert_close(contacts.loss(rows), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_they_find_the_foot_that_slides_and_how(model):
-    torch.manual_seed(0)
-    contacts = contacts_of(model, rows=1, num_cells=(32,))
-    log = standing(model, 256)[0][:, 1]
-    contacts.standardise(log)
-    optimiser = torch.optim.Adam(contacts.parameters(), 0.01)
-    for _ in range(200):
-        loss = contacts.loss(log)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    test, moves = standing(model, 64)
-    noises = LeggedNoises(velocity=0.5, tilt=0.01, rate=RATE)
-    filters = [
-        legged_filter(model, **QUADRUPED, dt=0.01, kind="EKF", noises=noises, contacts=each)
-        for each in (contacts, None)
-    ]
-    row = test[:, 1]
-    with torch.no_grad():
-        found = contacts(row.clone())["legs", "moves"].unflatten(-1, (4, 3))
-        velocity = [filter.sequence(test.clone())["belief", "velocity"][:, 1] for filter in filters]
-    assert (found.norm(dim=-1).argmax(-1) == moves.int().argmax(-1)).float().mean() > 0.9
-    true = contacts.kinematics.velocities(row["joints"], row["joint_rates"])  # the base rests
-    assert (found - true)[moves].square().sum(-1).mean() < 0.2 * true[moves].square().sum(-1).mean()
-    learned, plain = (each.square().sum(-1).mean().sqrt() for each in velocity)
-    assert learned < 0.5 * plain
-
-
 def test_a_filter_moves_a_foot_that_slides(model):
     """All feet slide alike: threshold contacts take that for the base's motion, known slides do not."""
-    rest = standing(model, 1)[0][:, :1].expand(1, 30).clone()
-    rest["joint_rates"] = torch.zeros_like(rest["joint_rates"])
+    rest = quadruped_env(seed=0).reset().select(*KEYS).expand(1, 30).clone()
+    rest["contact"][:] = True
+    rest["joint_rates"].zero_()
+    rest["imu"][..., :3] = 0
     rest["imu"][..., 3:] *= 9.81 / rest["imu"][0, 0, 3:].norm()
     speed, kinematics = torch.tensor([0.2, -0.1, 0.05]), contacts_of(model, rows=1).kinematics
     jacobian = kinematics.jacobian(rest["joints"][0, 0])

@@ -9,8 +9,7 @@ import torch
 from torch_denkf.applications.legged import QUADRUPED, LeggedNoises, legged_filter, quadruped_env
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, LeggedSpace
-from torch_denkf.applications.legged.readings import FeetInBody, FeetRates
-from torch_denkf.functional.manifolds import SO3, rotation_matrix, skew, whole_parts
+from torch_denkf.functional.manifolds import SO3, rotation_matrix, whole_parts
 from torch_denkf.metrics.state import rotation_error
 
 DT, GRAVITY = 0.01, torch.tensor([0.0, 0.0, -9.81])
@@ -41,15 +40,6 @@ def test_it_is_a_group_and_its_jacobian_that_of_autodiff():
     torch.testing.assert_close(space.dual_basis(one) @ basis, torch.eye(space.tangent_dim))
 
 
-def test_a_step_turns_the_world():
-    space = LeggedSpace(1)
-    point = torch.cat([torch.tensor([1.0, 0, 0, 0]), torch.arange(1.0, 16.0)])
-    turn = torch.tensor([0.0, 0.0, math.pi / 2])
-    moved = space.plus(point, torch.cat([turn, torch.zeros(15)]))
-    expected = [-2.0, 1, 3, -5, 4, 6, 7, 8, 9, 10, 11, 12, -14, 13, 15]
-    torch.testing.assert_close(moved[4:], torch.tensor(expected))
-
-
 def test_labels_may_be_of_some_vectors_alone():
     """Their errors are those of the whole state; of a foot without an orientation there is none."""
     space, (base, truth) = LeggedSpace(2), LeggedSpace(2).exp(torch.randn(2, 21))
@@ -65,26 +55,6 @@ def test_labels_may_be_of_some_vectors_alone():
     assert whole_parts(space, no_turn)[1].nonzero().flatten().tolist() == list(range(9, 15))
     angle = rotation_error(space.plus(truth, 0.5 * torch.eye(21)[1]), truth, space=space)
     torch.testing.assert_close(angle.deg2rad(), torch.tensor([0.5]))
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_errors_move_alike_wherever_the_mean_is(seed):
-    """Without biases the Jacobian is Hartley's, eq. 21: of gravity and the time step alone."""
-    torch.manual_seed(seed)
-    space, motion = LeggedSpace(2), LeggedMotion(2, DT)
-    state = space.exp(torch.randn(space.tangent_dim))
-    imu, feet, stands = 5 * torch.randn(6), torch.randn(6), torch.ones(2)
-
-    def moved(step):
-        points = (space.plus(state, step), state)
-        return space.minus(*(motion.move(point, imu, feet, stands, dt=DT) for point in points))
-
-    found = torch.func.jacrev(moved)(torch.zeros(space.tangent_dim))
-    rows = [*range(9), *range(15, 21)]
-    expected = torch.eye(15)
-    expected[3:6, :3], expected[6:9, :3] = DT * skew(GRAVITY), DT**2 / 2 * skew(GRAVITY)
-    expected[6:9, 3:6] = DT * torch.eye(3)
-    torch.testing.assert_close(found[rows][:, rows], expected, rtol=0, atol=1e-9)
 
 
 def test_noise_is_that_of_steps_in_the_sensors_axes():
@@ -109,16 +79,6 @@ def test_the_jacobian_of_members_is_that_of_each(contact):
     each = [motion.jacobian(member.unsqueeze(-2), *read) for member in state.unbind(-2)]
     torch.testing.assert_close(moved, torch.cat([one for one, _ in each], -2))
     torch.testing.assert_close(jacobian, torch.cat([one for _, one in each], -3))
-
-
-def test_a_turn_of_the_world_is_not_seen_in_what_feet_say():
-    """Scales by any size: so no update is mistaken about where up is."""
-    space = LeggedSpace(2)
-    torch.manual_seed(0)
-    state = space.exp(torch.randn(space.tangent_dim))
-    turned = space.plus(state, torch.cat([torch.randn(3), torch.zeros(18)]))
-    for reading in (FeetInBody(space).compute, lambda states: FeetRates(space).compute(states, torch.arange(6.0))):
-        torch.testing.assert_close(reading(turned.unsqueeze(0)), reading(state.unsqueeze(0)))
 
 
 class Hartley:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from torch_denkf.applications.robot import robot_model
 from torch_denkf.applications.robot.config import PLANE
@@ -13,14 +14,6 @@ EYE = np.eye(15)
 
 def flags(*places):
     return [place in places for place in range(15)]
-
-
-def rotation(roll, pitch, yaw):
-    sr, cr, sp, cp, sy, cy = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch), np.sin(yaw), np.cos(yaw)
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    return about_z @ about_y @ about_x
 
 
 def moved(state, dt):
@@ -34,7 +27,7 @@ def moved(state, dt):
         ]
     )
     out = state.copy()
-    out[:3] += rotation(*state[3:6]) @ (state[6:9] * dt + state[12:] * dt**2 / 2)
+    out[:3] += Rotation.from_euler("xyz", state[3:6]).as_matrix() @ (state[6:9] * dt + state[12:] * dt**2 / 2)
     out[3:6] += rates @ state[9:12] * dt
     out[6:9] += state[12:] * dt
     return out

@@ -21,6 +21,7 @@ from tests.data.lerobot.lerobot_folder import (
     write_version_2,
     write_version_3,
 )
+from tests.data.lerobot.test_errors import edit_table
 from torch_denkf.data import LeRobotReplay
 
 open_all = partial(LeRobotReplay, size=SIZE, cache=None, split="all", progress=False)
@@ -96,8 +97,7 @@ def test_commands_under_another_name(tmp_path, name):
     features = {name if key == "action" else key: one for key, one in info["features"].items()}
     edit_info(tmp_path, features=features)
     file = tmp_path / "data/chunk-000/episode_000000.parquet"
-    table = parquet.read_table(file)
-    parquet.write_table(table.rename_columns([name if one == "action" else one for one in table.column_names]), file)
+    edit_table(file, action=None, **{name: parquet.read_table(file)["action"]})
     with pytest.warns(UserWarning, match=rf"info.json: '{name}' is left out, and looks .* action_key='{name}'") as said:
         assert "action" not in open_all(tmp_path)[:]
     assert said[0].filename == __file__
@@ -164,10 +164,8 @@ def test_large_numbers(tmp_path, cached):
     root = tmp_path / "robot"
     write_version_2(root, [40])
     file = root / "data/chunk-000/episode_000000.parquet"
-    table, ticks = parquet.read_table(file), 7 * np.arange(120.0).reshape(40, 3)
-    place = table.column_names.index("observation.state")
-    large = pa.array(list(2.1e9 + ticks), pa.list_(pa.float64()))
-    parquet.write_table(table.set_column(place, "observation.state", large), file)
+    ticks = 7 * np.arange(120.0).reshape(40, 3)
+    edit_table(file, **{"observation.state": pa.array(list(2.1e9 + ticks), pa.list_(pa.float64()))})
     options = {"cache": tmp_path / "cache" if cached else None}
     match = (
         r"episode_000000.parquet: 'shoulder' moves by 21 a row near 2100000\d+[.5]*, where float32 resolves 1.3e\+02"
@@ -184,28 +182,12 @@ def test_large_numbers(tmp_path, cached):
     assert_close(each["action"], torch.from_numpy(actions(0, 40) - 1))
 
 
-@pytest.mark.parametrize(
-    ("origin", "error", "match"),
-    [
-        (5.0, TypeError, "origin holds numbers for 'state' and 'action'"),
-        ({"joints": 1.0}, ValueError, r"origin names \['joints'\]; it holds numbers for \['state', 'action'\]"),
-        ({"state": [1.0, 2.0]}, ValueError, "origin of 'state' must be a finite number, or 3 of them"),
-        ({"state": "far"}, ValueError, "origin of 'state' must be a finite number"),
-    ],
-)
-def test_origins_that_are_none(tmp_path, origin, error, match):
-    write_version_2(tmp_path, [3])
-    with pytest.raises(error, match=match):
-        open_all(tmp_path, origin=origin)
-
-
 def test_a_stamp_that_is_missing_leaves_the_others_their_steps(tmp_path):
     write_version_2(tmp_path, [20])
     file = tmp_path / "data/chunk-000/episode_000000.parquet"
-    table = parquet.read_table(file)
     times = np.arange(20) / FPS
     times[7] = np.nan
-    parquet.write_table(table.set_column(table.column_names.index("timestamp"), "timestamp", pa.array(times)), file)
+    edit_table(file, timestamp=pa.array(times))
     with pytest.warns(UserWarning, match="1 of 20 rows have a timestamp that does not increase"):
         data = open_all(tmp_path)
     assert_close(data[:]["time"].flatten(), torch.arange(20).double() / FPS)

@@ -29,6 +29,13 @@ def fails(error, match, *, clock=None, name=None, **streams):
         ("time,x\n0,1\ninf,3\n", r"run.csv:3: 'time' is 'inf'"),
         ("time,x\n0,1\n2,1\n1.5,1\n", r"run.csv:4: 'time' goes from 2 to 1.5 s; times must ascend"),
         ("time,x\n0,1\n2,1\n2,1\n", r"run.csv:4: 'time' goes from 2 to 2 s"),
+        ("time,x\n0,1\n0.1,1_1\n", r"run.csv:3: 'x' is '1_1'"),
+        ("time,x\n0,1\n0.1,1e39\n", r"run.csv:3: 'x' is '1e39'"),  # infinite in float32
+        ("time,x\n0,1\n1_0,1\n", r"run.csv:3: 'time' is '1_0'"),
+        ("t,time,x\n0,1700000000.25,1\n0,1700000000.125,2\n", "from 1700000000.25 to 1700000000.125 s"),
+        ("0,1\n0.1,1\n", "its first line must name the columns, or pass columns= with 2 names"),
+        ("time\n0\n1\n", "has no column to read beside 'time'"),
+        ("time,x\n0,1\n0.1,1,5\n", r"run.csv:3: 3 cells for 2 columns; write decimals with points"),
         ("time,x\n", r"run.csv has no rows"),
         ("", r"run.csv lacks the columns \['time'\]; it has \[\]"),
     ],
@@ -36,6 +43,12 @@ def fails(error, match, *, clock=None, name=None, **streams):
 def test_tables(tmp_path, text, match):
     (tmp_path / "run.csv").write_text(text)
     fails(ValueError, match, state=Table(tmp_path / "run.csv"))
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
+def test_other_encodings(tmp_path, encoding):
+    (tmp_path / "run.csv").write_text("time,größe\n0,1\n", encoding)
+    fails(ValueError, r"run.csv is no text in UTF-8 .*store it again", state=Table(tmp_path / "run.csv"))
 
 
 def test_parquet(tmp_path):

@@ -1,12 +1,9 @@
 """Text logs in the forms in which robots and their tools write them, each read as it is, and ROS bags."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from tests.real_data import SHARED
-from torch_denkf.data import Table, Video
+from torch_denkf.data import Table
 
 S = [1395837505.25, 1395837505.5, 1395837505.75]  # s since 1970, which float64 holds
 X = [1.5, -2.0, 3.0]
@@ -25,22 +22,14 @@ def whole(unit):
 FORMS = {
     "blanks": (lines("t gyro", lambda t, x: f"   {t:.7e}   {x:.7e}", [0.5, 0.75, 1.0]), {}, [0.5, 0.75, 1.0]),
     "blanks and tabs": (lines("t \t gyro", lambda t, x: f"{t}\t {x}"), {}, S),
-    "semicolons and decimal commas": (
-        lines("time;x", lambda t, x: f"{t};{x}".replace(".", ",")),
-        {},
-        S,
-    ),
+    "semicolons and decimal commas": (lines("time;x", lambda t, x: f"{t};{x}".replace(".", ",")), {}, S),
     "TUM": (lines("", lambda t, x: f"{t} {x} 0.5 0.25 {Q}"), {"columns": ["tx"]}, S),
     "TUM with comments": (
         lines("# ground truth\n# timestamp tx ty tz qx qy qz qw", lambda t, x: f"{t} {x} 0.5 0.25 {Q}"),
         {"columns": ["tx"]},
         S,
     ),
-    "EuRoC": (
-        lines("#timestamp [ns],w_RS_S_x [rad s^-1]", lambda t, x: f"{t},{x}", whole(1e9)),
-        {},
-        S,
-    ),
+    "EuRoC": (lines("#timestamp [ns],w_RS_S_x [rad s^-1]", lambda t, x: f"{t},{x}", whole(1e9)), {}, S),
     "KITTI times": (lines("", lambda t, x: f"{t:e}", [0.0, 0.125, 0.25]), {}, [0.0, 0.125, 0.25]),
     "KITTI's dates": (
         lines("", lambda t, x: f"2014-03-26 12:38:25.{t}", ["250000000", "500000000", "750000000"]),
@@ -48,11 +37,7 @@ FORMS = {
         S,
     ),
     "no header": (lines("", lambda t, x: f"{t},{x},9"), {"columns": ["when", "x", "y"], "time": "when"}, S),
-    "dates of ISO": (
-        lines("date,x", lambda t, x: f"2014-03-26T13:38:25.{t}+01:00,{x}", ["25", "50", "75"]),
-        {},
-        S,
-    ),
+    "dates of ISO": (lines("date,x", lambda t, x: f"2014-03-26T13:38:25.{t}+01:00,{x}", ["25", "50", "75"]), {}, S),
     "a date and a time of day": (
         lines("x,date,time", lambda t, x: f"{x},2014/03/26,12:38:{t}", ["25.25", "25.5", "25.75"]),
         {},
@@ -92,12 +77,7 @@ FORMS = {
     ),
     "ms by name": (lines("millis,x", lambda t, x: f"{t},{x}", [500, 750, 1000]), {}, [0.5, 0.75, 1.0]),
     "us by size": (lines("timestamp,x", lambda t, x: f"{t},{x}", whole(1e6)), {}, S),
-    "a row of units": (
-        lines("time,x\n[ms],[m]", lambda t, x: f"{t},{x}", [500, 750, 1000]),
-        {},
-        [0.5, 0.75, 1.0],
-    ),
-    "the same column twice": (lines("time,x,x", lambda t, x: f"{t},{x},7"), {"columns": ["x"]}, S),
+    "a row of units": (lines("time,x\n[ms],[m]", lambda t, x: f"{t},{x}", [500, 750, 1000]), {}, [0.5, 0.75, 1.0]),
     "empty cells of slow sensors": (
         lines("time,imu,gps", lambda t, x: f"{t},0.5,{x}\n{t + 0.125},0.25,"),
         {"columns": ["gps"]},
@@ -199,19 +179,3 @@ def test_bags(tmp_path, version):
     (tmp_path / "cut.mcap").write_bytes(b"nothing")
     with pytest.raises(ValueError, match=r"cut.mcap is no complete bag"):
         Table(tmp_path / "cut.mcap").read()
-
-
-def test_a_bag_of_a_turtlebot():
-    pytest.importorskip("rosbags")
-    bag = SHARED / "logs" / "turtlebot.mcap"
-    if not bag.exists():
-        pytest.skip("the bag is not here")
-    counts = {"/odom": 380, "/ekf_state": 1519}
-    for topic, count in counts.items():
-        assert Table(bag, ["pose.pose.position.x"], topic=topic).read().values.shape == (count, 1)
-
-
-def test_times_of_a_video_in_the_form_of_kitti(tmp_path):
-    (tmp_path / "times.txt").write_text("0.0e+00\n1.0e-01\n")
-    with pytest.raises(FileNotFoundError, match="no video"):
-        Video(tmp_path / "none.mp4", times=Path(tmp_path / "times.txt")).read((8, 8), None, False)

@@ -9,8 +9,6 @@ import torch
 
 from tests.data.recordings.own_files import SIZE, write_csv, write_images
 from torch_denkf.data import Images, Recording, RecordingReplay, Table
-from torch_denkf.filters import KalmanFilter
-from torch_denkf.fusion import Refiltering
 
 open_runs = partial(RecordingReplay, cache=None, size=SIZE, progress=False)
 
@@ -106,30 +104,3 @@ def test_a_reading_stands_in_the_row_after_it_arrived(tmp_path, seed, span):
         shown += bool(new)
     assert shown > 6
     assert rows["gps_late"].dtype == torch.int64
-
-
-def test_late_readings_give_the_belief_of_readings_in_order(tmp_path):
-    """A Kalman filter in numpy that gets each fix at the row it was taken in is the oracle."""
-    recording, taken, arrived = late_files(tmp_path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        rows = open_runs(recording, span="all")[:]
-    filter = KalmanFilter(
-        torch.eye(2), torch.eye(2), process_noise_cov=0.3 * torch.eye(2), noise_cov=0.5 * torch.eye(2),
-        mean=torch.zeros(2), cov=torch.eye(2), observation_key="gps", observed_key="gps_observed",
-    )  # fmt: skip
-    late = Refiltering(filter, {"gps_late": ("gps", "gps_observed")}, lag=10)
-    mean = late.sequence(rows.clone())["belief", "mean"][-1]
-    at = {}  # what arrived at last of two in a row, and of two taken in a row the one that arrived at last
-    order = np.argsort(arrived)
-    last = {int(np.ceil(10 * arrived[k])): k for k in order}
-    for k in (k for k in order if last[int(np.ceil(10 * arrived[k]))] == k):
-        at[int(np.ceil(10 * taken[k]))] = recording.streams["gps"].read().values[k]
-    expected, variance = np.zeros(2), 1.0
-    for row in range(1, len(rows)):
-        variance += 0.3
-        if row in at:
-            gain = variance / (variance + 0.5)
-            expected, variance = expected + gain * (at[row] - expected), (1 - gain) * variance
-    assert len(at) > 8
-    np.testing.assert_allclose(mean, expected, atol=1e-5)

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-from tests.real_data import SHARED
 from torch_denkf.cli.main import main
 from torch_denkf.data import Recording, Table, clock_offsets
 from torch_denkf.data.recordings.offsets import delays_between, solved
 from torch_denkf.data.recordings.tables import Readings
 
-CAR = SHARED / "logs" / "car.csv"
 LATE = {"wheels": 0.1, "gps": 0.3}
 
 
@@ -50,18 +48,6 @@ def test_delays_that_are_known():
     assert held >= 34
 
 
-def test_intervals_of_delays_by_poor_fixes():
-    """Fixes of 0.5 m: of 40 intervals of the GPS's delay beside the gyro, 38 hold on average."""
-    held = []
-    for seed in range(40):
-        tables = drive(seed, noise=0.5)
-        delays = {(one.late, one.early): one for one in delays_between(tables, most=2.0)}
-        if found := delays.get(("gps", "gyro")):
-            held.append(abs(found.seconds - LATE["gps"]) < 1.96 * found.std)
-    assert len(held) > 35
-    assert np.mean(held) > 0.9
-
-
 def test_scales_tell_units():
     tables = drive(0)
     scales = {(delay.late, delay.early): delay.scale for delay in delays_between(tables, most=2.0)}
@@ -79,32 +65,6 @@ def test_streams_that_share_nothing(tmp_path):
     run = Recording(name="run", **{name: Table(tmp_path / f"{name}.txt") for name in ("a", "b")})
     with pytest.raises(ValueError, match=r"recording 'run': no two of \['a', 'b'\] know the same turns"):
         clock_offsets(run)
-
-
-@pytest.mark.skipif(not CAR.exists(), reason="the log is not here")
-def test_the_log_of_a_car(capsys, tmp_path):
-    streams = {"imu": ["yawrate"], "gps": ["latitude", "longitude"], "speed": ["speed", "course"]}
-    options = {"repeats": "drop", "origin": {"latitude": 51.04, "longitude": 13.79}}
-    tables = {
-        name: Table(CAR, columns, **(options if name == "gps" else {"repeats": "drop"}))
-        for name, columns in streams.items()
-    }
-    found = clock_offsets(Recording(**tables))
-    assert abs(found["gps"].seconds + 0.7) < 0.1
-    assert abs(found["speed"].seconds + 1.2) < 0.1
-    assert main(["log", str(CAR), "--picture", str(tmp_path / "log.png")]) == 0
-    out = capsys.readouterr().out
-    for text in (
-        "216.0 s from 1395837505.11915 s",
-        "gps: 2149 readings, 10 Hz: latitude, longitude",
-        "  repeated in 80% of the rows",
-        "yawrate looks like degrees",
-        "their numbers differ by 3.72: km/h beside m/s?",
-        "speed: pass offset=-1.1",
-        "gps: pass offset=-0.6",
-    ):
-        assert text in out
-    assert (tmp_path / "log.png").stat().st_size > 10_000
 
 
 def test_oddities_of_a_log(tmp_path, capsys):

@@ -5,20 +5,24 @@ import re
 import pytest
 from PIL import Image
 
-from torch_denkf import from_pretrained
-from torch_denkf.applications.car import read_kitti_drive
-from torch_denkf.applications.car.odometry.failing_drive import drive_scores, track_failing_drive, usual_failures
+from torch_denkf.applications.car.odometry import failing_drive
+from torch_denkf.applications.car.odometry.failing_drive import drive_scores, track_failing_drive
 from torch_denkf.cli.main import main
 
 
 @pytest.mark.filterwarnings("ignore:.*:UserWarning")
 def test_demo_of_a_rendered_drive(tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
-    words = ["demo", "--out", str(tmp_path), "--frames", "36", "--every", "12"]
-    assert main(words) == 0
-    said = capsys.readouterr().out
-    drive = read_kitti_drive(tmp_path / "drives", "demo", size=(100, 300), cache=None)
-    scores = drive_scores(track_failing_drive(from_pretrained("car-odometry"), drive, usual_failures(36)))
+    tracked = []
+
+    def track(*args, **options):
+        tracked.append(track_failing_drive(*args, **options))
+        return tracked[0]
+
+    monkeypatch.setattr(failing_drive, "track_failing_drive", track)
+    assert main(["demo", "--out", str(tmp_path), "--frames", "36", "--every", "12"]) == 0
+    said, scores = capsys.readouterr().out, drive_scores(tracked[0])
+    assert len(tracked[0]) == 36
     assert re.search(rf"DEnKF +{scores['filter_end_m']:.1f} m .* {scores['filter_mean_m']:.1f} m", said)
     assert re.search(rf"dead reckoning +{scores['reckoned_end_m']:.1f} m .* {scores['reckoned_mean_m']:.1f} m", said)
     assert f"hold {100 * scores['held_v']:.0f} % of the true speeds" in said

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 from torch.testing import assert_close
 
 from tests.real_data import KITTI, SHARED
@@ -107,54 +106,6 @@ def test_wrong_disparities_do_not_make_the_way_shorter():
         corners[..., 2] += stays + noise.disparity * torch.randn(1000, 60)
     ahead = SE3().minus(corner_motion(before, after, seen, CAMERA, noise).motion, motion)[:, 5]
     assert ahead.mean().abs() < 3 * ahead.std() / 1000**0.5
-
-
-def rows_of(count=8, batch=40, corners=60, stereo=0.5, seed=0):
-    """Drawn drives of a few rows, each with the same corners; their disparities are wrong, and stay so."""
-    torch.manual_seed(seed)
-    step = SE3().exp(torch.tensor([0.0, 0.01, 0.0, 0.0, 0.0, 1.0]))
-    drives = []
-    for _ in range(batch):
-        points = torch.randn(corners, 3) * torch.tensor([8.0, 2.0, 10.0]) + torch.tensor([0.0, 0.0, 40.0])
-        points[:, 2] = points[:, 2].clamp_min(15.0)
-        wrong, places = stereo * torch.randn(corners), []
-        for _ in range(count):
-            corner = CAMERA.project(points)
-            corner[:, :2] += 0.05 * torch.randn(corners, 2)
-            right = corner[:, 0] - corner[:, 2] - wrong + 0.05 * torch.randn(corners)
-            places.append(torch.stack([corner[:, 0], corner[:, 1], right, corner[:, 1]], -1))
-            points = rotate(SO3().inverse(step[:4]).expand(corners, 4), points - step[4:])
-        pairs = torch.stack([torch.stack([places[max(row - 1, 0)], places[row]], 1) for row in range(count)])
-        rows = TensorDict({"corners": pairs, "seen": torch.ones(count, corners, dtype=torch.bool)}, [count])
-        rows["came_from"] = torch.arange(corners).expand(count, corners).clone()
-        rows["came_from"][:2] = -1
-        rows["repeats"] = torch.zeros(count, corners, dtype=torch.int64)
-        rows["seen"][0] = False
-        drives.append(rows)
-    return drives, step
-
-
-def test_what_corners_have_shown_makes_later_motions_better():
-    """To the side; of the way ahead, corners that are all remembered tell no more than their first row did."""
-    drives, step = rows_of()
-    noise = CornerNoise(0.07, 0.0, 0.05, 0.0, 0.5, 0.0, stereo_walk=0.02, freedom=20.0)
-    errors = {}
-    for memory in (False, True):
-        found = [corner_motions(rows, CAMERA, noise, memory=memory).motion[-1] for rows in drives]
-        errors[memory] = SE3().minus(torch.stack(found), step).square().mean(0).sqrt()
-    assert errors[True][3] < 0.8 * errors[False][3]
-    assert (errors[True] < 1.2 * errors[False]).all()
-
-
-def test_a_corner_that_is_wrong_once_spoils_no_later_row():
-    drives, step = rows_of(batch=10)
-    noise = CornerNoise(0.07, 0.0, 0.05, 0.0, 0.5, 0.0, stereo_walk=0.02, freedom=2.0)
-    sound = [corner_motions(rows, CAMERA, noise).motion for rows in drives]
-    for rows in drives:
-        rows["corners"][:, ::5, 1] += 30 * torch.randn(len(rows), 12, 4)
-    spoilt = [corner_motions(rows, CAMERA, noise).motion for rows in drives]
-    errors = [SE3().minus(torch.stack(found)[:, 1:], step).square().mean((0, 1)).sqrt() for found in (sound, spoilt)]
-    assert (errors[1] < 1.5 * errors[0]).all()
 
 
 def test_a_file_is_read_as_rows(tmp_path):

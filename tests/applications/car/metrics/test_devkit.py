@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 from evo.core.metrics import RPE
-from evo.core.units import Unit
 
-from tests.applications.car.metrics.paths_for_tests import evo_errors, matrices, straight, winding
+from tests.applications.car.metrics.paths_for_tests import matrices, straight, winding
 from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
+from torch_denkf.functional.manifolds import SE3, SO3
 
 LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)
 
@@ -46,46 +46,6 @@ def test_the_definition_written_out():
         torch.testing.assert_close(error.length_rotation[k], rows[:, 2].mean(), equal_nan=True, atol=1e-7, rtol=1e-7)
 
 
-def test_segments_are_those_of_evo_where_both_search_alike():
-    # evo ends a segment at the frame nearest to its length, the development kit at the first beyond it. Both are one
-    # frame where 100 m are 103.99 steps.
-    truth, estimated = winding(2, rows=950, step=100 / 103.99), winding(3, rows=950)
-    error = kitti_devkit_error(estimated, truth)
-    means, count = [], 0
-    for k, length in enumerate(LENGTHS):
-        last, metres, degrees = evo_errors(estimated, truth, float(length), Unit.meters, tolerance=1e-3)
-        steps = math.ceil(1.0399 * length)
-        assert last[0] == steps
-        tenth = (last - steps) % 10 == 0
-        assert error.segments[k] == tenth.sum()
-        torch.testing.assert_close(error.length_translation[k], 100 * metres[tenth].mean() / length)
-        torch.testing.assert_close(error.length_rotation[k], degrees[tenth].mean() / length, atol=1e-7, rtol=1e-7)
-        means.append(100 * metres[tenth].sum() / length)
-        count += int(tenth.sum())
-    torch.testing.assert_close(error.translation, sum(means) / count)
-
-
-def test_by_hand():
-    truth = straight(251)
-    fast = truth * torch.tensor([1.1, 1.0, 1.0], dtype=torch.float64)
-    estimated = fast.clone()
-    estimated[:, 2] = 0.001 * torch.arange(
-        251, dtype=torch.float64
-    )  # the heading turns, the positions do not: each segment is laid on
-    error = kitti_devkit_error(fast, truth, lengths=(100, 200))
-    # 101 steps for 100 m: 10.1 m of 100 m; 201 for 200 m. Starts at 0 to 140 (of 149), and at 0 to 40 (of 49).
-    assert error.segments.tolist() == [15, 5]
-    torch.testing.assert_close(error.length_translation, torch.tensor([10.1, 10.05], dtype=torch.float64))
-    torch.testing.assert_close(error.translation.item(), (15 * 10.1 + 5 * 10.05) / 20)  # by segments, not by lengths
-    assert error.rotation == 0
-    turned = kitti_devkit_error(estimated, truth, lengths=(100, 200))
-    expected = torch.tensor([math.degrees(0.101) / 100, math.degrees(0.201) / 200], dtype=torch.float64)
-    torch.testing.assert_close(turned.length_rotation, expected)
-    # The start at k is off by 0.001 k: the estimate of length 1.1 x 101 leaves at that angle.
-    law_of_cosines = [math.sqrt(111.1**2 + 101**2 - 2 * 111.1 * 101 * math.cos(0.001 * k)) for k in range(0, 150, 10)]
-    torch.testing.assert_close(turned.length_translation[0].item(), sum(law_of_cosines) / 15)
-
-
 def test_errors_say_what_to_do():
     path = straight(90)
     with pytest.raises(ValueError, match=r"the shortest path is 89\.0 m long; leave such paths out"):
@@ -96,3 +56,47 @@ def test_errors_say_what_to_do():
             kitti_devkit_error(path, path, **options)
     with pytest.raises(ValueError, match=r"pass state\[..., :3\]"):
         kitti_devkit_error(path[:, :2], path[:, :2])
+
+
+def in_space(path):
+    """A planar path (x, y, angle) as points of SE3, whose z is up."""
+    turn = SO3().exp(torch.cat([torch.zeros_like(path[..., :2]), path[..., 2:]], -1))
+    return torch.cat([turn, path[..., :2], torch.zeros_like(path[..., :1])], -1)
+
+
+def random_path(steps=400):
+    torch.manual_seed(0)
+    angle = (0.02 * torch.randn(2, steps, dtype=torch.float64)).cumsum(-1)
+    step = torch.stack([angle.cos(), angle.sin()], -1)
+    return torch.cat([step.cumsum(-2), angle.unsqueeze(-1)], -1)
+
+
+def test_a_planar_path_has_the_planar_error():
+    truth = random_path()
+    estimated = truth + 0.05 * torch.randn_like(truth).cumsum(-2)
+    planar, spatial = kitti_devkit_error(estimated, truth), kitti_devkit_error(in_space(estimated), in_space(truth))
+    for name in planar._fields:
+        torch.testing.assert_close(getattr(spatial, name), getattr(planar, name), equal_nan=True)
+
+
+def test_the_frames_of_both_paths_do_not_count():
+    truth = in_space(random_path())
+    estimated = SE3().plus(truth, 0.01 * torch.randn(2, 400, 6, dtype=torch.float64))
+    moved = SE3().exp(torch.randn(6, dtype=torch.float64))
+    other = SE3().compose(moved.expand_as(estimated), estimated)
+    torch.testing.assert_close(
+        kitti_devkit_error(other, truth).translation, kitti_devkit_error(estimated, truth).translation
+    )
+
+
+def test_a_climb_that_is_not_seen():
+    """One metre up in a hundred metres ahead: the distance left is 1 m in 100 m, the angle is the slope's."""
+    truth = torch.zeros(301, 7, dtype=torch.float64)
+    truth[:, 0], truth[:, 4] = 1.0, torch.arange(301)
+    slope = torch.tensor(0.01, dtype=torch.float64)
+    estimated = truth.clone()
+    estimated[:, 4], estimated[:, 6] = slope.cos() * truth[:, 4], slope.sin() * truth[:, 4]
+    error = kitti_devkit_error(estimated, truth, lengths=(100,))
+    # A segment of 100 m ends with the first row beyond: 101 m.
+    torch.testing.assert_close(error.translation, 101 * 2 * (slope / 2).sin() * 100 / 100)
+    assert error.rotation == 0

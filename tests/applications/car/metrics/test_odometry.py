@@ -1,35 +1,15 @@
 """Oracles: numbers by hand, closed forms of circles, and the official trajectories."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
 
+from tests.applications.car.metrics.paths_for_tests import straight
 from tests.real_data import KITTI
 from torch_denkf.applications.car import dead_reckoning
 from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
-from torch_denkf.functional import wrap_angles
 
 POSES = KITTI / "poses"
-
-
-def straight(rows=201, step=1.0, dtype=torch.float64):
-    x = step * torch.arange(rows, dtype=dtype)
-    return torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], -1)
-
-
-def turned(path, angle, shift):
-    x, y, theta = path.unbind(-1)
-    c, s = math.cos(angle), math.sin(angle)
-    return torch.stack([c * x - s * y + shift[0], s * x + c * y + shift[1], theta + angle], -1)
-
-
-def random_path(seed=0, rows=160, batch=()):
-    generator = torch.Generator().manual_seed(seed)
-    speed = 5 + 10 * torch.rand(*batch, rows, generator=generator, dtype=torch.float64)
-    turn = 0.3 * torch.randn(*batch, rows, generator=generator, dtype=torch.float64)
-    return dead_reckoning(torch.stack([speed, turn], -1), torch.zeros(*batch, 3, dtype=torch.float64), 0.1)
 
 
 def test_speed_bias_of_a_tenth_is_a_tenth_of_a_metre_for_each_metre():
@@ -47,71 +27,6 @@ def test_speed_bias_of_a_tenth_is_a_tenth_of_a_metre_for_each_metre():
             torch.testing.assert_close(error.window_translation, expected)
 
 
-def test_constant_yaw_bias_is_the_chord_of_a_circle():
-    bias, dt, speed, window = 0.05, 0.1, 10.0, 100
-    velocities = torch.tensor([speed, bias], dtype=torch.float64).expand(151, 2)
-    estimated = dead_reckoning(velocities, torch.zeros(3, dtype=torch.float64), dt)
-    truth = straight(151, speed * dt)
-    # The estimate goes round a circle: a sum of unit steps at headings (k + 1/2) a is the chord
-    # sin(N a / 2) / sin(a / 2) in the direction N a / 2.
-    a = bias * dt
-    chord = math.sin(window * a / 2) / math.sin(a / 2)
-    x, y = chord * math.cos(window * a / 2), chord * math.sin(window * a / 2)
-    error = kitti_endpoint_error(estimated, truth, window=window)
-    expected = math.hypot(x - window, y) / window
-    torch.testing.assert_close(error.window_translation, torch.full((51,), expected).double())
-    torch.testing.assert_close(error.rotation.item(), math.degrees(window * a) / window)
-
-
-def test_a_rotated_start_changes_nothing_under_align():
-    truth, estimated = random_path(0), random_path(1)
-    plain = kitti_endpoint_error(estimated, truth, window=50)
-    moved = kitti_endpoint_error(turned(estimated, 2.5, (30.0, -7.0)), truth, window=50)
-    for one, other in zip(plain, moved, strict=True):
-        torch.testing.assert_close(one, other)
-    unaligned = kitti_endpoint_error(turned(estimated, 2.5, (30.0, -7.0)), truth, window=50, align=False)
-    assert unaligned.translation > 2 * plain.translation
-
-
-def test_a_heading_error_of_a_whole_turn_is_none():
-    truth = straight()
-    estimated = truth.clone()
-    estimated[100:, 2] += 2 * math.pi
-    error = kitti_endpoint_error(estimated, truth)
-    torch.testing.assert_close(error.rotation.item(), 0.0, atol=1e-12, rtol=0)
-
-
-def test_the_length_is_that_of_the_path_and_not_of_the_chord():
-    # Ten steps out and ten back: the truth ends where it began, after 20 m; the estimate 4 m beside it.
-    x = torch.cat([torch.arange(11.0), torch.arange(9.0, -1.0, -1.0)]).double()
-    truth = torch.stack([x, 0 * x, 0 * x], -1)
-    estimated = truth.clone()
-    estimated[-1, 1] = 4.0
-    error = kitti_endpoint_error(estimated, truth, window=20)
-    assert error.windows == 1
-    torch.testing.assert_close(error.translation.item(), 4 / 20)
-
-
-def test_windows_follow_the_stride_and_the_definition():
-    truth, estimated = random_path(0), random_path(1)
-    window, stride = 30, 7
-    error = kitti_endpoint_error(estimated, truth, window=window, stride=stride)
-    expected = []
-    for first in range(0, 160 - window, stride):  # written out, with matrices
-
-        def pose(path, k):
-            x, y, theta = path[k].tolist()
-            c, s = math.cos(theta), math.sin(theta)
-            return np.array([[c, -s, x], [s, c, y], [0, 0, 1]])
-
-        relative = np.linalg.inv(pose(estimated, first)) @ pose(estimated, first + window)
-        relative_true = np.linalg.inv(pose(truth, first)) @ pose(truth, first + window)
-        length = sum(np.linalg.norm((truth[k + 1] - truth[k])[:2].numpy()) for k in range(first, first + window))
-        expected.append(np.linalg.norm(relative[:2, 2] - relative_true[:2, 2]) / length)
-    torch.testing.assert_close(error.window_translation, torch.tensor(expected))
-    torch.testing.assert_close(error.translation, torch.tensor(expected).mean())
-
-
 def test_standing_windows_are_left_out():
     truth = torch.cat([straight(11), straight(11)[-1:].expand(20, 3)])
     estimated = truth * torch.tensor([1.2, 1.0, 1.0])
@@ -122,14 +37,6 @@ def test_standing_windows_are_left_out():
     torch.testing.assert_close(error.translation.item(), 0.2)
     with pytest.raises(ValueError, match=r"no window of 10 steps in which the car travels 1\.0 m"):
         kitti_endpoint_error(estimated[11:], truth[11:], window=10)
-
-
-def test_dead_reckoning_by_hand():
-    velocities = torch.tensor([[99.0, 99.0], [10.0, 0.0], [10.0, math.pi]], dtype=torch.float64)
-    path = dead_reckoning(velocities, torch.tensor([1.0, 2.0, math.pi / 2]).double(), 0.1)
-    a = math.pi / 2 + 0.05 * math.pi  # half of the turn, on top of the heading
-    expected = [[1, 2, math.pi / 2], [1, 3, math.pi / 2], [1 + math.cos(a), 3 + math.sin(a), 0.6 * math.pi]]
-    torch.testing.assert_close(path, torch.tensor(expected, dtype=torch.float64))
 
 
 def official(sequence):
@@ -161,13 +68,3 @@ def test_true_velocities_leave_only_the_sideways_motion_of_the_camera(sequence, 
     step[0] = truth[0, :2]
     old = torch.cat([step.cumsum(0), truth[:, 2:]], -1)
     assert error.translation < 0.9 * kitti_endpoint_error(old, truth).translation
-    # The camera sits ahead of the rear axle and so moves sideways in turns: its direction differs from the heading
-    # by a slip angle. A step of length d at an angle s to the true one misses by at most d |s|, and errors add up to
-    # at most their sum: each window's error is below its mean |slip|, weighted with length.
-    moved = truth[1:, :2] - truth[:-1, :2]
-    heading = truth[:-1, 2] + velocities[1:, 1] * dt / 2
-    slip = wrap_angles(torch.atan2(moved[:, 1], moved[:, 0]) - heading).abs()
-    length = moved.norm(dim=-1)
-    limit = (slip * length).unfold(0, 100, 1).sum(-1) / length.unfold(0, 100, 1).sum(-1)
-    counts = ~error.window_translation.isnan()
-    assert (error.window_translation <= limit + 1e-9)[counts].all()

@@ -23,13 +23,3 @@ def test_factors_are_lognormal_quantiles_that_stay_with_their_members(float64):
         assert float(factor[0, :, dim].neg().exp().mean()) == pytest.approx(1.0, abs=1e-12)
     # Dimensions are shuffled apart: of 50 pairs, a correlation is 0 +- 0.14.
     assert abs(float(torch.corrcoef(factor[0].T)[0, 1])) < 0.42
-
-
-@pytest.mark.parametrize("std", [0.05, 0.3])
-def test_members_that_are_drawn_to_one_reading_have_its_mean(std, float64):
-    """Each member meets the reading by its own gain; without the shift they would be e^(std^2 / 2) times too fast."""
-    gain, reading, speed = MemberGain([std], ensemble_size=32, in_key="y"), 12.0, torch.full((32, 1), 5.0)
-    for _ in range(200):
-        speed = speed + 0.3 * (reading - gain(TensorDict({"y": speed}))["y"].detach())
-    assert float(speed.mean()) == pytest.approx(reading, abs=1e-9)
-    assert float(speed.log().std(correction=0)) == pytest.approx(std)

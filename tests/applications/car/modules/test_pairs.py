@@ -71,47 +71,6 @@ def test_neighbours_are_filtered_as_without_a_history(float64):
     torch.testing.assert_close(*results, rtol=0, atol=1e-12)
 
 
-def cloned_kalman(y, steps):
-    """Velocity and way (one dimension each, no turning in y's sense): exact mean and variance of [v, way since start].
-
-    The state is [v_t, v_t-1, v_t-2, way]; the way is a sum of the same velocities, so that all of it is linear.
-    """
-    moments = []
-    for dim in range(2):
-        mean = torch.tensor([4.0, 4.0, 4.0, 0.0]) if dim == 0 else torch.tensor([0.1, 0.1, 0.1, 0.0])
-        cov = torch.zeros(4, 4)
-        cov[:3, :3] = START[3 + dim] ** 2
-        shift = torch.tensor([[1.0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [DT, 0, 0, 1]])
-        noise = torch.tensor([1.0, 0.0, 0.0, DT])
-        for value, count in zip(y[1:, dim], steps[1:], strict=True):
-            mean, cov = shift @ mean, shift @ cov @ shift.T + Q[dim] * noise[:, None] * noise
-            if count:
-                h = torch.tensor([float(lag < count) for lag in range(3)] + [0.0])
-                gain = cov @ h / (h @ cov @ h + R[dim])
-                mean, cov = mean + gain * (value - h @ mean), cov - gain[:, None] * (h @ cov)
-        moments.append((mean, cov))
-    return moments
-
-
-def test_a_reading_over_a_gap_corrects_velocity_and_way_like_a_kalman_filter_with_clones(float64):
-    # Two frames are missing after the start, so that the whole way since then lies in the reading.
-    size, steps = 40_000, [0, 0, 0, 3]
-    y = torch.tensor([[0.0, 0.0]] * 3 + [[16.0, 1.2]])
-    torch.manual_seed(0)
-    belief = pair_filter(size).sequence(frames_of(y, steps))["belief", "ensemble"][-1]
-    (mean_v, cov_v), (mean_w, cov_w) = cloned_kalman(y, steps)
-    # The analysis is linear, the way of the members is not (they turn): compare what stays linear.
-    found = torch.stack([belief[:, 3], belief[:, 4], belief[:, 2]], -1)
-    mean = torch.stack([mean_v[0], mean_w[0], mean_w[3]])
-    var = torch.stack([cov_v[0, 0], cov_w[0, 0], cov_w[3, 3]])
-    error = (found.mean(0) - mean).abs() / (var / size).sqrt()
-    assert (error < 4).all(), error  # standard errors; three of them
-    torch.testing.assert_close(found.var(0), var, rtol=4 * (2 / size) ** 0.5, atol=0)
-    # The reading says 16 over three steps where 12 was forecast: the way is corrected, and not the last step alone.
-    way = belief[:, :2].norm(dim=-1).mean()
-    assert abs(float(way) - float(mean_v[3])) < 0.05 * float(mean_v[3])
-
-
 def test_the_way_over_a_gap_is_that_of_the_corrected_steps(float64):
     before = torch.tensor([1.0, 2.0, 0.3, 9.0, 0.2]).expand(2, 5)
     history = torch.tensor([[9.0, 0.2], [8.0, -0.1]]).expand(2, 2, 2)
@@ -192,41 +151,6 @@ def test_a_smoothed_path_is_that_of_a_kalman_filter_of_velocity_and_way(float64)
     torch.testing.assert_close(way.var(), cov[1, 1], rtol=4 * (2 / size) ** 0.5, atol=0)
     assert float(mean[1] - found[False][:, 0].mean()) > 20 * error  # 0.13 m of 14.5 m
     torch.testing.assert_close(found[True][:, 3:], found[False][:, 3:], rtol=0, atol=1e-12)  # velocities are the same
-
-
-def test_velocities_go_on_changing_by_a_share_of_their_last_change(float64):
-    transition = UnicycleTransition(torch.zeros_like, DT, history_key=("belief", "history"))
-    with torch.no_grad():
-        transition.raw_trend.copy_(torch.tensor([0.0, -torch.log(torch.tensor(3.0))]))  # a half and a quarter
-    state = torch.tensor([[0.0, 0.0, 0.0, 6.0, 0.4], [0.0, 0.0, 0.0, 7.0, 0.1]])
-    history = torch.tensor([[[6.0, 0.4], [8.0, 0.0]], [[7.0, 0.1], [7.0, 0.1]]])
-    out = transition(TensorDict({"belief": {"ensemble": state, "history": history}}))["forecast", "ensemble"]
-    torch.testing.assert_close(out[:, 3:], torch.tensor([[5.0, 0.5], [7.0, 0.1]]), rtol=0, atol=1e-12)
-    torch.testing.assert_close(out[0, 0], 5.0 * DT * torch.tensor(0.5 * DT / 2).cos(), rtol=0, atol=1e-12)
-
-
-def test_with_a_trend_a_braking_car_is_followed_without_lag(float64):
-    """Readings without noise of a speed that falls by 0.5 m/s a step, weighed as if they were noisy."""
-    errors = []
-    for trend in (None, ("belief", "history")):
-        filter = pair_filter(64, "etkf")
-        transition = UnicycleTransition(Walk(), DT, history_key=trend)
-        if trend:
-            with torch.no_grad():
-                transition.raw_trend.fill_(5.0)  # nearly all of it
-        filter = DEnKF(
-            transition, None, filter["observation"], filter["noise"], filter["analysis"], initial=filter.initial
-        )
-        speed = 20.0 - 0.5 * torch.arange(30.0)
-        frames = frames_of(torch.stack([speed, torch.zeros(30)], -1), [0] + [1] * 29)
-        frames["state"] = torch.stack([torch.tensor([0.0, 0.0, 0.0, float(v), 0.0]) for v in speed])
-        torch.manual_seed(0)
-        belief = filter.sequence(frames)["belief", "mean"][:, 3]
-        errors.append(float((belief - speed)[10:].mean().detach()))
-    forecast = Q[0] / 2 + (Q[0] ** 2 / 4 + Q[0] * R[0]) ** 0.5  # the steady variance
-    gain = forecast / (forecast + R[0])
-    assert errors[0] == pytest.approx(0.5 * (1 - gain) / gain, abs=0.04)  # 0.23; 64 members, 20 steps
-    assert abs(errors[1]) < 0.04
 
 
 def test_an_ekf_with_clones_is_the_kalman_filter_with_clones(float64):

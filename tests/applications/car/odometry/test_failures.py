@@ -6,32 +6,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 
 from tests.applications.car.odometry.test_tracking import calibration_of, frames_of
 from torch_denkf.applications.car import read_kitti_drive, track, write_drives
 from torch_denkf.applications.car.odometry.failing_drive import drive_scores, track_failing_drive, usual_failures
 from torch_denkf.applications.car.odometry.failures import CameraFailure, fail_frames
 from torch_denkf.applications.car.odometry.paths import read_path
-from torch_denkf.applications.car.vision.epipolar import two_view_motion
-from torch_denkf.applications.car.vision.motion import image_motion
 from torch_denkf.cli.main import main
 from torch_denkf.pretrained import from_pretrained
-
-
-def test_black_frames_are_missing_frames(checkpoint, drive):
-    car, images, calibration = from_pretrained(checkpoint), frames_of(drive), calibration_of(drive)
-    lost = list(track(car, fail_frames(images, [CameraFailure("missing", 5, 6)]), calibration))
-    black = [*fail_frames(images, [CameraFailure("black", 5, 6)])]
-    black[5][0, 0] = 255  # a hot pixel
-    known = list(track(car, black, calibration))
-    assert [belief.observed for belief in known] == [n not in (0, 5, 6) for n in range(16)]
-    for one, other in zip(lost, known, strict=True):
-        assert torch.equal(one.ensemble, other.ensemble)
-    unknown = list(track(car, black, calibration, black_level=None))
-    assert all(belief.observed for belief in unknown[1:])
-    with pytest.raises(ValueError, match="black_level must be finite, at least 0 and at most 255; got 300"):
-        track(car, black, calibration, black_level=300)
 
 
 def test_what_stands_still_before_the_camera_is_told_and_looked_past(tmp_path, capsys):
@@ -64,25 +46,6 @@ def test_what_stands_still_before_the_camera_is_told_and_looked_past(tmp_path, c
     assert "Something stands still before the camera in 4 frames, 6 to 9" in capsys.readouterr().out
     path = read_path(tmp_path / "out/path.csv")
     assert path["hidden"].flatten().numpy() == pytest.approx(shares, rel=1e-6)
-
-
-def test_readings_are_velocities(checkpoint, drive):
-    """Takes the mean over the steps of a pair over a gap, in real time where frames are not as far apart as trained."""
-    car, images, calibration = from_pretrained(checkpoint), frames_of(drive), calibration_of(drive)
-    plain, slow = (list(track(car, images, calibration, fps=fps)) for fps in (1 / 0.103, 1 / 0.12))
-    assert plain[0].reading is None
-    for one, other in zip(plain[1:], slow[1:], strict=True):
-        assert one.reading.tolist() == pytest.approx((other.reading * 0.12 / 0.103).tolist(), rel=1e-4)
-    images[5] = None
-    gap = list(track(car, images, calibration))
-    assert gap[5].reading is None
-    with torch.no_grad():  # the sensor's mean of the pair over the gap, whatever its noise
-        pair = [drive["image"][n][0].numpy() for n in (4, 6)]
-        flow, road = (torch.from_numpy(part).half().float() for part in image_motion(*pair, calibration))
-        frame = {"flow": flow, "road": road, "two_view": torch.from_numpy(two_view_motion(*pair, calibration))}
-        whole = car.sensor(TensorDict(frame))["sensor", "ensemble"].mean(0)
-    spread = torch.stack([belief.reading for belief in plain[1:]]).std(0)
-    assert ((gap[6].reading - whole / 2).abs() < spread + 0.5).all()
 
 
 def test_dead_reckoning_integrates_what_was_read(checkpoint, drive):

@@ -1,15 +1,17 @@
 """A training leaves a filter that predicts better than before; a broken one goes on to the same weights."""
 
+import csv
 import shutil
 
 import pytest
 import torch
 
-from tests.applications.car.odometry.conftest import OPTIONS
-from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter, markdown_table, write_rows
+from tests.applications.car.conftest import OPTIONS, SIZE
+from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
 from torch_denkf.applications.car.odometry.roles import assign_roles
 from torch_denkf.applications.car.odometry.streams import Drive, all_frames, read_spans
 from torch_denkf.applications.car.odometry.training import train_car_filter
+from torch_denkf.cli.main import main
 from torch_denkf.training import FilterTrainer
 
 
@@ -26,10 +28,7 @@ class Killed(Exception):
     """As if the process had ended."""
 
 
-@pytest.mark.parametrize(
-    "stage",
-    [pytest.param("sensor", marks=pytest.mark.slow), "filter", pytest.param("end_to_end", marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("stage", ["filter", pytest.param("end_to_end", marks=pytest.mark.slow)])
 def test_a_killed_training_goes_on_to_the_same_weights(stage, root, trained, tmp_path, monkeypatch):
     shutil.copytree(trained[0] / "cache", tmp_path / "cache")  # the optical flow
     plain = FilterTrainer._update
@@ -51,9 +50,9 @@ def test_a_killed_training_goes_on_to_the_same_weights(stage, root, trained, tmp
     assert resumed.inflation == trained[1].inflation
 
 
-def test_evaluation_beside_the_floor(trained, root, tmp_path):
-    car = trained[1]
-    options = {"cache": trained[0] / "cache", "draws": 2, "window": 10, "progress": False}
+def test_evaluation_beside_the_floor(trained, root, tmp_path, capsys):
+    folder, car = trained
+    options = {"cache": folder / "cache", "draws": 2, "window": 10, "progress": False}
     rows, beliefs = evaluate_car_filter(car, root, ["b", "c"], **options)
     assert [(row["drive"], row["method"]) for row in rows[:3]] == [
         ("b", "filter"),
@@ -65,23 +64,23 @@ def test_evaluation_beside_the_floor(trained, root, tmp_path):
     assert rows[0]["translation_m_per_m"] > floor["translation_m_per_m"]
     assert 0 <= rows[0]["coverage90_v"] <= 1
     assert rows[0]["blind"] == 0
-    again, _ = evaluate_car_filter(car, root, ["b", "c"], **options)
-    assert again == rows
     # Dead reckoning is the readings' mean, integrated.
-    data = [Drive(root, "b", (25, 75), trained[0] / "cache", two_view=True).read()]
-    readings = all_frames(read_spans(car.sensor, data, 3))
-    velocity = readings["sensor", "ensemble"].mean(1)
+    data = [Drive(root, "b", SIZE, folder / "cache", two_view=True).read()]
+    velocity = all_frames(read_spans(car.sensor, data, 3))["sensor", "ensemble"].mean(1)
     assert beliefs["b"]["sensor", "ensemble"].mean(1) == pytest.approx(velocity)
-    table = markdown_table(rows)
-    assert (
-        f"| mean of 2 | filter | 10 | {(rows[0]['translation_m_per_m'] + rows[3]['translation_m_per_m']) / 2:.4f}"
-        in table
-    )
-    write_rows(rows, tmp_path / "rows.csv")
-    lines = (tmp_path / "rows.csv").read_text().splitlines()
-    assert len(lines) == 7
-    assert float(lines[1].split(",")[4]) == rows[0]["translation_m_per_m"]
     missing, _ = evaluate_car_filter(car, root, ["b"], **options, missing=0.5)
     assert missing[0]["blind"] > 0.3
     with pytest.raises(ValueError, match=r"missing is in \[0, 1\)"):
         evaluate_car_filter(car, root, ["b"], missing=1.0)
+
+    out = tmp_path / "evaluation"
+    shutil.copytree(folder / "cache", out / "cache")  # the optical flow
+    words = ["--drives", "b", "c", "--draws", "2", "--window", "10", "--out", str(out)]
+    assert main(["evaluate", "--checkpoint", str(folder), "--root", str(root), *words]) == 0
+    table = capsys.readouterr().out
+    mean = (rows[0]["translation_m_per_m"] + rows[3]["translation_m_per_m"]) / 2
+    assert f"| mean of 2 | filter | 10 | {mean:.4f}" in table
+    assert table.splitlines()[2] in (out / "evaluation.md").read_text()
+    with (out / "evaluation.csv").open() as stream:
+        found = [(row["method"], float(row["translation_m_per_m"])) for row in csv.DictReader(stream)]
+    assert found == [(row["method"], row["translation_m_per_m"]) for row in rows]

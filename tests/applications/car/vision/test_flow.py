@@ -4,11 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.applications.car.vision.drives_for_tests import rendered_motion
 from tests.applications.car.vision.plane_for_tests import as_image, pair, random_texture
 from torch_denkf.applications.car.vision.camera import CanonicalCamera
 from torch_denkf.applications.car.vision.flow import coarse_flow, dense_flow, median_turn
-from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHIFTS
+from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE
 
 cv2.setNumThreads(1)
 CAMERAS = [CanonicalCamera(120.0), CanonicalCamera(240.0)]
@@ -87,32 +86,3 @@ def test_median_turn_of_cast_rays(turn, distance):
     left, up = median_turn(dense_flow(previous, current, camera))
     assert left == pytest.approx(turn * (1 + 0.1075**2), abs=3e-4)  # 0.04 pixels
     assert up == pytest.approx(0.01, abs=3e-4)
-
-
-def drives():
-    parts = [rendered_motion(name) for name in ("road3", "road9")]
-    motion = {key: np.concatenate([part[key].float().numpy() for part in parts]) for key in ("flow", "road", "state")}
-    assert np.ptp(motion["state"][:, 3]) > 8  # m/s: stopping and driving
-    assert np.ptp(motion["state"][:, 4]) > 0.2  # rad/s: turning and straight ahead
-    return motion
-
-
-def test_median_turn_is_the_turn_rate_of_a_drive():
-    motion, dt = drives(), 0.103
-    rate = np.array([median_turn(flow.transpose(1, 2, 0))[0] for flow in motion["flow"]]) / dt
-    truth = motion["state"][:, 4]
-    assert np.corrcoef(rate, truth)[0, 1] > 0.99
-    # 1.2 % more than the angle (see above), and things that are near.
-    assert np.polyfit(truth, rate, 1)[0] == pytest.approx(1.0, abs=0.05)
-    assert np.sqrt(np.mean((rate - truth) ** 2)) < 0.02  # rad/s: a quarter of a pixel
-
-
-def test_the_roads_distance_is_the_speed_of_a_drive():
-    motion, dt = drives(), 0.103
-    truth = motion["state"][:, 3]
-    level = motion["road"][:, np.abs(ROAD_PITCHES).argmin()]  # the rendered camera is level
-    speed = ROAD_SHIFTS[level.argmax(1)] / dt
-    assert np.corrcoef(speed, truth)[0, 1] > 0.97
-    assert np.polyfit(truth, speed, 1)[0] == pytest.approx(1.0, abs=0.07)
-    # A cell is 0.49 m/s. Measured: 1.2 cells; the small images' median filter and what stands by a bend cost that.
-    assert np.sqrt(np.mean((speed - truth) ** 2)) < 2 * 0.05 / dt

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests.applications.car.vision.drives_for_tests import rendered
 from torch_denkf.applications.car.vision.camera import CanonicalCamera
 from torch_denkf.applications.car.vision.expansion import coarse_cells
 from torch_denkf.applications.car.vision.flow import coarse_flow
 from torch_denkf.applications.car.vision.hidden import continue_flow
-from torch_denkf.applications.car.vision.motion import image_motion
 from torch_denkf.applications.car.vision.signs import (
     FLOW_SIGNS,
     PICTURE_SIGNS,
@@ -119,23 +117,3 @@ def test_behind_a_hole_in_a_wall_the_flow_is_known(hole):
     found, mismatch = continue_flow(seen, coarse_flow(seen, empty, empty, camera), hidden, camera)
     assert np.abs(found - true).max() < 1e-3  # a tenth of a pixel, of a turn of two and a half
     assert np.abs(mismatch).max() < 1e-6
-
-
-def test_flow_is_continued_behind_a_box():
-    drive = rendered("road9")
-    images = [drive["image"][row, 0].numpy() for row in (10, 11)]
-    calibration = drive["calibration"][0].tolist()
-    height, width = images[0].shape
-    hidden = np.zeros((height, width), bool)
-    hidden[height // 4 : 2 * height // 3, 2 * width // 5 : 3 * width // 5] = True
-    boxed = [np.where(hidden, 0, image).astype(np.uint8) for image in images]
-    flow, road = image_motion(*images, calibration)
-    spoilt, spoilt_road = image_motion(*boxed, calibration)
-    mended, mended_road = image_motion(*boxed, calibration, hidden=hidden)
-    inside = np.s_[:2, 8:15, 33:46]
-    error, before = (np.abs(each[inside] - flow[inside]).mean() for each in (mended, spoilt))
-    assert error < 0.75 * before
-    assert np.abs(mended_road - road).mean() < np.abs(spoilt_road - road).mean()
-    none = image_motion(*images, calibration, hidden=np.zeros_like(hidden))
-    assert np.array_equal(none[0], flow)
-    assert np.array_equal(none[1], road)

@@ -1,6 +1,5 @@
 """Raises for wrong options, folders and files with their names and with what to do."""
 
-import json
 import os
 from functools import partial
 
@@ -8,7 +7,7 @@ import pytest
 
 from tests.applications.ur5.data.ur5_demos import make_demo, ten_demos, write_folder
 from torch_denkf.applications.ur5 import UR5ExperienceReplay
-from torch_denkf.applications.ur5.data.files import COMMAND, MANIFEST, read_manifest
+from torch_denkf.applications.ur5.data.files import COMMAND
 
 open_dataset = partial(UR5ExperienceReplay, cache=None)
 
@@ -49,12 +48,3 @@ def test_damaged_files_are_named(tmp_path, damage, error):
     damage(tmp_path / "demo-000002.npz")
     with pytest.raises(error, match=f"{tmp_path / 'demo-000002.npz'}.*{COMMAND}"):
         open_dataset(tmp_path)
-
-
-def test_a_cut_line_of_the_manifest_counts_as_not_written(root, tmp_path):
-    write_folder(tmp_path, [make_demo(number, 8) for number in range(3)])
-    text = (tmp_path / MANIFEST).read_text()
-    (tmp_path / MANIFEST).write_text(text[:-30])
-    assert list(read_manifest(tmp_path)) == [0, 1]
-    assert [json.loads(line)["demo"] for line in text.splitlines()] == [0, 1, 2]
-    assert [e.demo for e in open_dataset(tmp_path, split="all").episodes] == [0, 1]

@@ -1,13 +1,18 @@
 """Oracles: the simulator's own data, the law of the expert's plan, and that a seed is an episode."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
+from torchrl.envs import ParallelEnv, SerialEnv, check_env_specs
+
+from tests.envs.opengl import needs_opengl
+from torch_denkf.applications.ur5 import UR5TableEnv
+from torch_denkf.applications.ur5.envs.expert import UR5Expert
 
 pytest.importorskip("mujoco", reason="mujoco is not installed: pip install 'mujoco>=3.17,<4'")
 
-from torch_denkf.applications.ur5 import UR5TableEnv
-from torch_denkf.applications.ur5.envs.expert import UR5Expert
 
 TASKS = ("pick", "push", "put_down")
 
@@ -95,3 +100,26 @@ def test_joints_of_the_real_like_arm_stand_off():
     rest = (runs["real_like"]["next", "state"][-1] - runs["sim"]["next", "state"][-1])[:6]
     offset = torch.tensor([0.012, -0.008, 0.010, -0.012, 0.010, 0.015])
     torch.testing.assert_close(rest, offset, atol=0.0025, rtol=0)
+
+
+OPTIONS = {"size": (16, 24), "max_steps": 6}
+SEEDS = [{"seed": 3}, {"seed": 4}]
+
+
+def alone():
+    return torch.stack([UR5TableEnv("pick", **OPTIONS, **seed).rollout(6, UR5Expert()) for seed in SEEDS])
+
+
+@pytest.mark.parametrize("kind", [SerialEnv, pytest.param(ParallelEnv, marks=pytest.mark.slow)])
+def test_batched(kind):
+    needs_opengl()
+    env = kind(2, partial(UR5TableEnv, "pick", **OPTIONS), create_env_kwargs=SEEDS)
+    try:
+        rollout = env.rollout(6, UR5Expert())
+        assert (rollout == alone()).all()
+        check_env_specs(env)
+        env.set_seed(0)
+        start = env.reset()["state"]
+        assert (start[0] != start[1]).any()
+    finally:
+        env.close()

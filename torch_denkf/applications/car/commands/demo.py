@@ -90,12 +90,13 @@ class Demo(Command):
         title = "Where is the car? One camera, which fails three times"
         with replacing(out / "demo.png") as beside:
             drive_picture(tracked, shown, spans, title).savefig(beside, dpi=90)
+        moving = tracked[1:]  # one picture alone shows no motion
         belief_video(
             out / "demo.gif",
-            tracked,
-            np.stack(named_frames(shown, spans)),
-            time=tracked["time"],
-            path=path_options(tracked),
+            moving,
+            np.stack(named_frames(shown, spans)[1:]),
+            time=moving["time"],
+            path=path_options(moving),
             bands=BANDS,
             title=title,
             every=self.every,

@@ -51,5 +51,36 @@ class CloseLook(nn.Module):
         return self.squeeze(self.dropout(close.float()))
 
 
+class GlimpseTrunk(nn.Module):
+    """Looks at the whole picture, and closely at the hand, which is a dozen pixels wide in it.
+
+    Args:
+        coarse: sees the whole picture, ``[N, 3, H, W]`` to ``[N, F]``.
+        close: looks at the patch.
+        size: F.
+        raised: how far above the hand's place the patch's middle is.
+        dropout: in front of the last layer.
+        told: whether the last two features are where it looks, columns and rows from -1 (left, top) to 1. Train them to
+            be the hand: what the patch shows teaches where to look no better.
+    """
+
+    def __init__(
+        self, coarse: nn.Module, close: CloseLook, size: int, raised: float = 0.0, dropout: float = 0.0, told=False
+    ):
+        super().__init__()
+        self.coarse, self.centre, self.close = coarse, nn.Linear(size, 2), close
+        width = 254 if told else 256
+        self.mix = nn.Sequential(nn.Dropout(dropout), nn.Linear(size + FEATURES + 2, width), nn.ReLU())
+        self.raised, self.told = raised, told
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Features ``[N, 256]`` of images."""
+        code = self.coarse(images)
+        centre = self.centre(code)
+        patch = self.close(images, centre.detach() if self.told else centre, self.raised)
+        mixed = self.mix(torch.cat([code, patch, centre], -1))
+        return torch.cat([mixed, centre], -1) if self.told else mixed
+
+
 def _block(before: int, after: int, side: int, stride: int) -> tuple[nn.Module, ...]:
     return nn.Conv2d(before, after, side, stride, side // 2), nn.GroupNorm(8, after), nn.ReLU()
