@@ -95,7 +95,8 @@ def write_page(page: str, file: Path | None) -> None:
         write_text(file, page)
 
 
-def report(folder: Path, columns: Columns, rows: Sequence[dict], page: str) -> None:
-    """Leaves the rows as table.csv and a page as table.md, and prints the page."""
-    columns.write(rows, folder / "table.csv")
-    write_page(page, folder / "table.md")
+def report(folder: Path | None, columns: Columns, rows: Sequence[dict], page: str, name: str = "table") -> None:
+    """Prints a page; leaves it and the rows as NAME.md and NAME.csv in a folder if one is given."""
+    if folder is not None:
+        columns.write(rows, folder / f"{name}.csv")
+    write_page(page, None if folder is None else folder / f"{name}.md")

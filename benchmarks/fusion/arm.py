@@ -8,11 +8,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.fusion.task import Task, add_features
+from benchmarks.fusion.task import Task, add_features, fused_sensors
 from torch_denkf.applications.ur5 import UR5TableEnv
 from torch_denkf.applications.ur5.envs.expert import UR5Expert
 from torch_denkf.functional import crps_gaussian
-from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.fusion import FusedFilter
 from torch_denkf.modules import ConstantNoise, LinearObservation, LinearTransition, MappedNoise, MomentPrior
 from torch_denkf.pretrained import from_pretrained
 
@@ -98,16 +98,8 @@ def arm_task(*, demos: tuple[int, int] = (24, 6), steps: int = 75, validate: boo
     parts["motion"] = ConstantNoise(push, trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
 
     def build(weights: nn.Module | None, heed: bool) -> FusedFilter:
-        sensors = {
-            name: FusedSensor(
-                LinearObservation(readings[name]),
-                parts[name],
-                delay=late[name] if heed else 0,
-                late_key=f"{name}_late" if heed else None,
-                features_key=None if weights is None else f"{name}_features",
-            )
-            for name in names
-        }
+        models = {name: LinearObservation(matrix) for name, matrix in readings.items()}
+        sensors = fused_sensors(models, parts, late, weights is not None, heed)
         motion = LinearTransition(move, MappedNoise(parts["motion"], eye[:, JOINTS:]))
         # Linear sensors: one update of all is the same as one after the other, and takes less time.
         return FusedFilter(motion, sensors, initial=MomentPrior(mean, start), joint=True, weights=weights)

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.fusion.task import Task, add_features, delayed
+from benchmarks.fusion.task import Task, add_features, delayed, fused_sensors
 from torch_denkf.applications.car import UnicycleNoise, UnicycleTransition
 from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 from torch_denkf.applications.car.kitti.files import read_poses
@@ -18,7 +18,7 @@ from torch_denkf.applications.car.odometry.streams import Drive, read_sensor
 from torch_denkf.applications.car.unicycle import unicycle_move
 from torch_denkf.applications.car.vision.poses import KITTI_DT, poses_to_state
 from torch_denkf.functional import crps_gaussian
-from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.fusion import FusedFilter
 from torch_denkf.modules import ConstantNoise, GaussianAround, Select
 from torch_denkf.pretrained import from_pretrained
 
@@ -129,19 +129,9 @@ def car_task(root: Path | None, *, frames: int = 60, validate: bool = False) -> 
     parts["motion"] = ConstantNoise([0.3, 0.06], trainable=True, **walk)
 
     def build(weights: nn.Module | None, heed: bool) -> FusedFilter:
-        sensors = {
-            name: FusedSensor(
-                model,
-                parts[name],
-                delay=longest[name] if heed else 0,
-                late_key=f"{name}_late" if heed else None,
-                features_key=None if weights is None else f"{name}_features",
-            )
-            for name, model in models.items()
-        }
         return FusedFilter(
             UnicycleTransition(torch.zeros_like, DT),
-            sensors,
+            fused_sensors(models, parts, longest, weights is not None, heed),
             initial=GaussianAround(START, state_key="start"),
             process_noise=UnicycleNoise(parts["motion"], DT),
             joint=True,  # linear sensors: the same as one after the other, in less time

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.jobs import compute
-from benchmarks.common.tables import Columns, head, line, pick, write_page
+from benchmarks.common.tables import Columns, head, line, pick, report
 from benchmarks.fusion.arm import arm_task
 from benchmarks.fusion.car import car_task
 from benchmarks.fusion.task import FAULTS, Task, delayed, faulty, without
@@ -168,5 +168,4 @@ def main() -> None:
     runs = [(name, seed) for seed in range(study.seeds) for name in tasks]
     jobs = {study.out / "parts" / f"{name}-{seed}.json": partial(job, name, seed, study) for name, seed in runs}
     found = compute(jobs, study.processes, "fusion")
-    COLUMNS.write(found, study.out / "fusion.csv")
-    write_page(page(found, study), study.out / "fusion.md")
+    report(study.out, COLUMNS, found, page(found, study), "fusion")

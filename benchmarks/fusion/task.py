@@ -9,7 +9,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from torch_denkf.fusion import FusedFilter
+from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.modules import SubModel
 
 #: What a sensor does for a while, without a word.
 FAULTS = ("frozen", "offset", "noise")
@@ -66,6 +67,22 @@ class Task:
     def settled(self) -> slice:
         """The steps that are scored: all but those of the start-up."""
         return slice(round(min(STARTUP * self.rate, self.test.shape[1] // 4)), None)
+
+
+def fused_sensors(
+    models: Mapping[str, SubModel], parts: Mapping[str, SubModel], delays: Mapping[str, int], weighted: bool, heed: bool
+) -> dict[str, FusedSensor]:
+    """Returns the sensors of a filter: their models and noises, whether features weigh them, and delays are heeded."""
+    return {
+        name: FusedSensor(
+            model,
+            parts[name],
+            delay=delays[name] if heed else 0,
+            late_key=f"{name}_late" if heed else None,
+            features_key=f"{name}_features" if weighted else None,
+        )
+        for name, model in models.items()
+    }
 
 
 def without(data: TensorDict, *sensors: str) -> TensorDict:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import OneCycleLR
 
+from benchmarks.common.descent import minimise
 from benchmarks.fusion.task import FAULTS, Task, faulty, without
 from torch_denkf.fusion import SensorAttention
 
@@ -59,29 +61,14 @@ def train(task: Task, weights: nn.Module, *, updates: tuple[int, int], window: i
             parts.append(part)
         return torch.cat(parts)
 
-    def loss(out: TensorDict) -> Tensor:
-        return task.loss(out[:, settled])
+    def fit(network: nn.Module | None, trained: nn.Module, fail: bool, updates: int, rate: float) -> None:
+        model, keep = task.build(network, False), [("belief", "mean"), ("belief", "var")]
+        one_cycle = partial(OneCycleLR, max_lr=rate, total_steps=max(updates, 2), pct_start=0.2)
 
-    fit(task.build(None, False), loss, partial(sample, False), task.parts.parameters(), updates[0], 5e-2)
-    fit(task.build(weights, False), loss, partial(sample, True), weights.parameters(), updates[1], 2e-2)
+        def loss() -> Tensor:
+            return task.loss(model.sequence(sample(fail), keep=keep)[:, settled])
 
+        minimise(trained.parameters(), loss, updates, rate, schedule=one_cycle, clip=1.0)
 
-def fit(
-    model: nn.Module,
-    loss: Callable[[TensorDict], Tensor],
-    sample: Callable[[], TensorDict],
-    parameters: Iterable[nn.Parameter],
-    updates: int,
-    lr: float,
-) -> None:
-    """Minimises a loss of what a filter believes."""
-    parameters = list(parameters)
-    optimiser = torch.optim.Adam(parameters, lr)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, lr, total_steps=max(updates, 2), pct_start=0.2)
-    for _ in range(updates):
-        value = loss(model.sequence(sample(), keep=[("belief", "mean"), ("belief", "var")]))
-        optimiser.zero_grad()
-        value.backward()
-        nn.utils.clip_grad_norm_(parameters, 1.0)
-        optimiser.step()
-        schedule.step()
+    fit(None, task.parts, False, updates[0], 5e-2)
+    fit(weights, weights, True, updates[1], 2e-2)

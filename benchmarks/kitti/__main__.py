@@ -10,8 +10,6 @@ from pathlib import Path
 
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import report
-from benchmarks.kitti.frontier import draw
-from benchmarks.kitti.past import compare
 from benchmarks.kitti.study import Study, make_jobs, rows_of, run_jobs
 from benchmarks.kitti.tables import COLUMNS, markdown
 from benchmarks.kitti.training import Budget
@@ -25,12 +23,17 @@ def smoke(study: Study) -> Study:
     names = tuple(write_drives(folder / "kitti", ["a", "b", "c", "d"], frames=20, seed=0))
     budget = Budget(sensor=3, fine_tuning=2, filter=2, end_to_end=2, length=8)
     settings = {"size": (25, 75), "seeds": 1, "processes": 1, "drives": names, "test": names[:1], "budget": budget}
-    kinds = {"filters": (*study.filters, "denkf_gated"), "sensors": ("flow", "image"), "sizes": (4, 8)}
-    return replace(study, root=folder / "kitti", out=folder / "out", **kinds, **settings)
+    return replace(study, root=folder / "kitti", out=folder / "out", sensors=("flow", "image"), **settings)
 
 
-def table(study: Study) -> None:
+def main() -> None:
     """Trains and tests every filter and sensor on every fold."""
+    study = parse(Study)
+    if study.smoke:
+        study = smoke(study)
+    if study.root is None:
+        raise SystemExit("--root is missing: the folder with 'sequences' and 'poses' (or --smoke)")
+    study.out.mkdir(parents=True, exist_ok=True)
     begun = time.time()
     jobs = make_jobs(study)
     write_text(study.out / "settings.json", json.dumps(asdict(study), indent=1, default=str))
@@ -38,22 +41,6 @@ def table(study: Study) -> None:
     rows = rows_of(study.out)
     header = f"`{command('kitti')}`: {(time.time() - begun) / 60:.0f} min, {study.processes} process(es)"
     report(study.out, COLUMNS, rows, markdown(rows, header))
-
-
-def main() -> None:
-    """Runs a command."""
-    study = parse(Study)
-    if study.smoke:
-        study = smoke(study)
-    if study.root is None:
-        raise SystemExit("--root is missing: the folder with 'sequences' and 'poses' (or --smoke)")
-    study.out.mkdir(parents=True, exist_ok=True)
-    if study.command == "table" or study.smoke:
-        table(study)
-    if study.command == "frontier" or study.smoke:
-        print(*draw(study), sep="\n")
-    if study.command == "past" or study.smoke:
-        print(*compare(study, command("kitti")), sep="\n")
 
 
 if __name__ == "__main__":

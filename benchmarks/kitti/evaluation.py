@@ -15,13 +15,13 @@ from benchmarks.common.scores import cost, counted
 from benchmarks.kitti.folds import VELOCITIES, Part
 from benchmarks.kitti.readings import read_spans
 from benchmarks.kitti.recipes import REACH, KITTIRecipe
-from benchmarks.kitti.streams import CONDITIONS, DISTURBANCES, Stream
+from benchmarks.kitti.streams import DISTURBANCES, Stream
 from benchmarks.kitti.training import FLOOR, run_filter
 from torch_denkf.applications.car import dead_reckoning
 from torch_denkf.applications.car.metrics.benchmark import kitti_pathlength_error
 from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
 from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
-from torch_denkf.applications.car.odometry.streams import all_frames, lose_frames, shortest_spans
+from torch_denkf.applications.car.odometry.streams import all_frames, lose_frames
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_gaussian
 from torch_denkf.functional.gaussian import gaussian_log_prob
@@ -57,15 +57,12 @@ def evaluate(
     recipe: KITTIRecipe, model: Filter, stream: Stream, cache: Path, *, filter_name: str, kind: str, seed: int
 ) -> tuple[list[dict], dict[str, TensorDict]]:
     """All rows of the table for one drive, and its beliefs by condition, for the plots."""
-    stream = replace(stream, repair=recipe.repair)
     clean = read_spans(model["sensor"], Part(stream), cache, kind)
-    readings = {"clean": [shortest_spans(clean) if recipe.repair else all_frames(clean)]}
-    readings["missing"] = [lose_frames(clean, seed=stream.seed() + number) for number in range(MASKS)]
+    pairs = [("clean", all_frames(clean))]
     for condition in DISTURBANCES:
         part = Part(replace(stream, condition=condition))
-        spans = read_spans(model["sensor"], part, cache, kind)
-        readings[condition] = [shortest_spans(spans) if recipe.repair else all_frames(spans)]
-    pairs = [(condition, reading) for condition in CONDITIONS for reading in readings.get(condition, ())]
+        pairs.append((condition, all_frames(read_spans(model["sensor"], part, cache, kind))))
+    pairs += [("missing", lose_frames(clean, seed=stream.seed() + number)) for number in range(MASKS)]
     first = pairs[0][1][:TIMED]
     costs = cost(model, lambda: run_filter(recipe, model, [first]), len(first))
     rows, beliefs = defaultdict(list), {}

@@ -16,14 +16,11 @@ from benchmarks.common.jobs import side_by_side
 from torch_denkf.applications.car import read_kitti_drive, with_motion
 from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 from torch_denkf.applications.car.kitti.frames import MOTION_KEYS
-from torch_denkf.applications.car.kitti.gaps import steps_between
-from torch_denkf.applications.car.vision.signs import static_region
 from torch_denkf.data.cache import cached
 from torch_denkf.envs import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 
 SMALL = (50, 150)  # rows and columns of what the image sensor reads: the paper's
 LONGEST = 3  # steps between two frames that the flow sensor may compare, where those between them are missing
-BLACK, WHITE, BLIND = 5, 250, 0.5  # grey levels; share of such pixels from which on a picture shows nothing
 MISSING = 0.3  # share of frames that do not arrive, and of black ones, as in the paper
 
 #: What happens to every image of a drive. "missing" needs no images of its own: it is a mask.
@@ -48,7 +45,6 @@ class Stream:
     size: tuple[int, int] = (125, 414)  # of the images from which the flow is computed
     pitch: float = 0.0  # rad: the camera is taken to be turned so far up, which makes the sensor find out
     steps: int = 1  # between the two frames of a pair
-    repair: bool = False  # leave out what shows nothing, and see the street behind what stands still before the camera
 
     @property
     def name(self) -> str:
@@ -63,8 +59,6 @@ class Stream:
     def read(self, cache: Path) -> TensorDict:
         """Flow, road, small grey images and the truth, ``[N]``; memory-mapped."""
         name = f"{self.drive}-{self.camera}-{self.condition}-{self.seed():08x}"
-        if self.repair:
-            return cached(cache / f"{name}-repaired", lambda: self._repaired(cache))
         return cached(cache / name, self._compute)
 
     def _drive(self) -> TensorDict:
@@ -80,44 +74,14 @@ class Stream:
             drive = disturb(drive)
         return drive
 
-    def _paired(self, valid: torch.Tensor) -> torch.Tensor:
-        """Which frames have both images of a pair, ``[N, 1]``."""
-        return valid & torch.cat([torch.zeros_like(valid[: self.steps]), valid[: -self.steps]])
-
-    def _repaired(self, cache: Path) -> TensorDict:
-        """The stream without pictures that are black or white; behind what stands still flow and corners are anew.
-
-        Longer pairs of a disturbed drive are made alone where the pictures between them are left out.
-        """
-        drive = self._drive()
-        images = drive["image"][:, 0].numpy()
-        blind = [max((image <= BLACK).mean(), (image >= WHITE).mean()) > BLIND for image in images]
-        shown = drive["frame_valid"] & ~torch.tensor(blind).unsqueeze(-1)
-        paired = self._paired(shown)
-        plain = None
-        if self.condition == "clean" or self.steps == 1:
-            plain, anew = replace(self, repair=False).read(cache).copy(), torch.zeros_like(paired)
-            for row in paired.squeeze(-1).nonzero().flatten().tolist():
-                anew[row] = bool(static_region(images[row - self.steps], images[row]).any())
-        else:
-            anew = paired = paired & (steps_between(shown.squeeze(-1), LONGEST) == self.steps).unsqueeze(-1)
-        drive = drive.copy().set("steps", self.steps * anew.long())
-        drive = with_motion(drive, cache=None, two_view=True, repair=True)
-        for key in MOTION_KEYS if plain is not None else ():
-            mask = anew.reshape(-1, *[1] * (plain[key].ndim - 1))
-            drive[key] = torch.where(mask, drive[key], plain[key])
-        return _reduced(drive.set("steps", self.steps * paired.long()))
-
     def _compute(self) -> TensorDict:
+        """Flow, road and corners of the drive, and its images, small."""
         drive = self._drive()
-        paired = self._paired(drive["frame_valid"])
-        return _reduced(with_motion(drive.copy().set("steps", self.steps * paired.long()), cache=None, two_view=True))
-
-
-def _reduced(drive: TensorDict) -> TensorDict:
-    """A drive with small images."""
-    small = [cv2.resize(image[0].numpy(), SMALL[::-1], interpolation=cv2.INTER_AREA) for image in drive["image"]]
-    return drive.set("image", torch.stack([torch.from_numpy(image) for image in small]).unsqueeze(1))
+        valid = drive["frame_valid"]
+        paired = valid & torch.cat([torch.zeros_like(valid[: self.steps]), valid[: -self.steps]])
+        drive = with_motion(drive.copy().set("steps", self.steps * paired.long()), cache=None, two_view=True)
+        small = [cv2.resize(image[0].numpy(), SMALL[::-1], interpolation=cv2.INTER_AREA) for image in drive["image"]]
+        return drive.set("image", torch.stack([torch.from_numpy(image) for image in small]).unsqueeze(1))
 
 
 def find_streams(root: Path, size: tuple[int, int], drives: list[str] | None = None) -> list[Stream]:
@@ -146,8 +110,7 @@ def _prepare(stream: Stream, cache: Path) -> None:
 
 def spans(stream: Stream, sensor: str) -> list[Stream]:
     """The same drive in pairs of 1, 2, ... steps: what a sensor may read where frames are missing."""
-    left_out = stream.repair and stream.condition == "black"
-    longest = LONGEST if sensor == "flow" and (stream.condition == "clean" or left_out) else 1
+    longest = LONGEST if sensor == "flow" and stream.condition == "clean" else 1
     return [replace(stream, steps=steps) for steps in range(1, longest + 1)]
 
 

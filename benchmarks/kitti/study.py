@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -20,7 +20,7 @@ from benchmarks.kitti.recipes import FILTERS
 from benchmarks.kitti.sensors import SENSORS, SensorOfFold, SensorTraining, sensor_of_fold
 from benchmarks.kitti.streams import Stream, find_streams, prepare, spans
 from benchmarks.kitti.tables import IDENTITY
-from benchmarks.kitti.training import Budget, load_filter, train_filter
+from benchmarks.kitti.training import Budget, train_filter
 from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.modules import SubModel
 
@@ -32,12 +32,11 @@ SHARED = ("dead_reckoning", "floor")  # rows that come with every filter
 class Study:
     """Visual odometry on KITTI: the paper's protocol, with every filter that is registered.
 
-    table: leave one drive out after the other, in all conditions. frontier: error against milliseconds a step of the
-    filters that a table left. past: how long a past the DEnKF corrects, with and without significance, and with how
-    many members. What was broken off goes on where it stopped. See benchmarks/kitti/README.md.
+    table: leave one drive out after the other, in all conditions. What was broken off goes on where it stopped. See
+    benchmarks/kitti/README.md.
     """
 
-    command: Positional[Literal["table", "frontier", "past"]] = "table"
+    command: Positional[Literal["table"]] = "table"
     root: Path | None = None  # folder with sequences and poses
     out: Path = Path("runs/kitti")  # checkpoints, logs, table and plots
     drives: tuple[str, ...] = ()  # drives of the study; all that are found
@@ -48,7 +47,6 @@ class Study:
     rendered: int = 0  # drives to render for a first training of the sensor
     first: Path | None = None  # a table's --out, whose rendered drives and first training are taken; those of --out
     size: tuple[int, int] = (125, 414)  # rows and columns to compute the flow at
-    sizes: tuple[int, ...] = (8, 32, 128, 512)  # of the ensemble, in the frontier and with the past
     processes: int = 1  # folds side by side
     budget: OmitArgPrefixes[Budget] = field(default_factory=Budget)
     smoke: bool = False  # a tiny run of everything, on rendered drives
@@ -118,36 +116,23 @@ class Job:
             pretrained=self.pretrain() if self.rendered[0] else None,
         )
 
-    def train(self, name: str, base: SensorOfFold):
-        """Trains one filter, or goes on where it was broken off; or takes the weights of another."""
-        if whose := FILTERS[name].weights_of:
-            if not self.borrows(name):
-                self.train(whose, base)
-            recipe, model, *_ = load_filter(self.out(whose))
-            return FILTERS[name](model["sensor"], recipe.facts), model
-        loggers = ("csv", "tensorboard")
-        settings = {"cache": self.study.cache, "seed": self.seed, "budget": self.study.budget, "loggers": loggers}
-        return train_filter(self.fold, name, base, out=self.out(name), **settings)
-
-    def borrows(self, name: str) -> bool:
-        """Whether it takes another's weights, which are there."""
-        whose = FILTERS[name].weights_of
-        return whose is not None and (self.out(whose) / "filter.pt").exists()
-
     def run(self) -> None:
         """Trains, evaluates and draws what is not done already; leaves the rows in each filter's folder."""
         base = None
         for name in self.study.filters:
             if (self.out(name) / "rows.json").exists():
                 continue
-            base = self.base() if base is None and not self.borrows(name) else base
+            base = base or self.base()
             once(self.out(name) / "rows.json", lambda name=name, base=base: self.test(name, base))
 
     def test(self, name: str, base: SensorOfFold) -> list[dict]:
         """Rows of one filter, trained for it; and pictures, of the first seed."""
+        loggers = ("csv", "tensorboard")
+        settings = {"cache": self.study.cache, "seed": self.seed, "budget": self.study.budget, "loggers": loggers}
+        trained = train_filter(self.fold, name, base, out=self.out(name), **settings)
         plots = self.study.out / "plots" if self.seed == 0 else None
         names = {"filter_name": name, "kind": self.sensor, "seed": self.seed}
-        return evaluate_and_draw(*self.train(name, base), self.fold.test, self.study.cache, plots, **names)
+        return evaluate_and_draw(*trained, self.fold.test, self.study.cache, plots, **names)
 
     def pretrain(self) -> SubModel:
         """The sensor that all folds of this seed begin with."""
@@ -199,14 +184,7 @@ def prepare_jobs(jobs: Sequence[Job], processes: int) -> None:
         streams += [part.stream for part in job.fold.train if part.stream.steps == 1 or job.sensor == "flow"]
         read = [*job.fold.tune, *job.fold.validation, *with_disturbances([Part(stream) for stream in job.fold.test])]
         streams += [stream for part in read for stream in spans(part.stream, job.sensor)]
-    study = jobs[0].study
-    prepare(list(dict.fromkeys(streams)), study.cache, processes)
-    if any(FILTERS[name].repair for name in study.filters):  # of what is there by then
-        tested = [replace(stream, repair=True) for job in jobs for stream in job.fold.test]
-        repaired = [
-            each for part in with_disturbances([Part(s) for s in tested]) for each in spans(part.stream, "flow")
-        ]
-        prepare(list(dict.fromkeys(repaired)), study.cache, processes)
+    prepare(list(dict.fromkeys(streams)), jobs[0].study.cache, processes)
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> None:

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from statistics import mean, median, stdev
 
-from benchmarks.common.tables import Columns, head, line, pick
+import pandas as pd
+
+from benchmarks.common.tables import Columns, head, line
 from benchmarks.kitti.streams import CONDITIONS
 
 IDENTITY = ("filter", "sensor", "drive", "condition", "window", "seed")
 _ERRORS = (
-    "translation_m_per_m",
-    "spread_m_per_m",
-    "of_dead_reckoning",
-    "rotation_deg_per_m",
-    "coverage90",
-    "coverage90_v",
-    "coverage90_theta_dot",
+    *("translation_m_per_m", "spread_m_per_m", "of_dead_reckoning", "rotation_deg_per_m"),
+    *("coverage90", "coverage90_v", "coverage90_theta_dot"),
 )
 _VELOCITY = ("rmse_v_m_per_s", "mae_v_m_per_s", "rmse_theta_dot_deg_per_s", "mae_theta_dot_deg_per_s")
 _BELIEF = ("crps_v_m_per_s", "crps_theta_dot_deg_per_s", "nll", "nees", "spread_skill")
@@ -40,46 +34,49 @@ FAIRNESS = (
 )
 TITLES = {"dead_reckoning": "dead reckoning", "floor": "floor: true v and theta_dot"}
 HEADLINES = ("m/m", "of its sensor", "deg/m", "devkit", "CRPS v", "CRPS theta_dot", "coverage v", "coverage theta_dot")
-END_POINT = ("translation_m_per_m", "rotation_deg_per_m")
-PATH_LENGTH = ("pathlength_m_per_m", "pathlength_deg_per_m")
+END_POINT = ["translation_m_per_m", "rotation_deg_per_m"]
+PATH_LENGTH = ["pathlength_m_per_m", "pathlength_deg_per_m"]
+FLOOR = ("floor", "truth")  # a filter and its sensor
 
 
-def by_drive(rows: Iterable[dict], column: str) -> dict[str, float]:
-    """Median over the seeds of each drive; cameras of one drive are averaged first."""
-    values: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        value = row.get(column, math.nan)
-        if value == value:
-            values[drive_of(row)][row["seed"]].append(value)
-    return {drive: median(mean(cameras) for cameras in seeds.values()) for drive, seeds in sorted(values.items())}
+def by_drive(rows: Iterable[dict]) -> pd.DataFrame:
+    """Returns numbers by filter, sensor, condition, window and drive: means of its cameras, then medians of seeds."""
+    frame = pd.DataFrame(rows, columns=COLUMNS.names)
+    frame["drive"] = frame["drive"].str.split("/").str[0]
+    keys = ["filter", "sensor", "condition", "window", "drive"]
+    return frame.groupby([*keys, "seed"]).mean().groupby(keys).median()
 
 
-def drive_of(row: dict) -> str:
-    """The drive without its camera."""
-    return row["drive"].split("/")[0]
+class Drives:
+    """Looks up the drives' numbers, a row each; empty where there are none."""
+
+    def __init__(self, rows: Sequence[dict]):
+        self.table = by_drive(rows)
+
+    def __call__(self, method: tuple[str, str], condition: str, window: int) -> pd.DataFrame:
+        key = (*method, condition, window)
+        return self.table.loc[key] if key in self.table.index else self.table.iloc[:0].droplevel([0, 1, 2, 3])
 
 
-def summary(rows: Iterable[dict], column: str) -> str:
-    """Mean over the drives and its standard error."""
-    values = list(by_drive(rows, column).values())
-    if not values:
-        return ""
-    error = f" ± {stdev(values) / math.sqrt(len(values)):.3f}" if len(values) > 1 else ""
-    return f"{mean(values):.3f}{error}"
+def summary(values: pd.Series) -> str:
+    """Returns the mean over the drives and its standard error."""
+    values = values.dropna()
+    error = f" ± {values.sem():.3f}" if len(values) > 1 else ""
+    return f"{values.mean():.3f}{error}" if len(values) else ""
 
 
-def plain(rows: Iterable[dict], column: str, factor: float = 1.0) -> str:
-    """Mean over the drives."""
-    values = by_drive(rows, column).values()
-    return f"{factor * mean(values):.3g}" if values else ""
+def plain(values: pd.Series, layout: str = "{:.3g}", factor: float = 1.0) -> str:
+    """Returns the mean over the drives."""
+    return layout.format(factor * values.mean()) if values.notna().any() else ""
 
 
 def markdown(rows: Sequence[dict], header: str) -> str:
-    """Means over drives for each condition, errors by window, and each drive's own."""
-    seeds = {row["seed"] for row in rows}
+    """Returns means over drives for each condition, errors by window, and each drive's own."""
     methods = sorted({(row["filter"], row["sensor"]) for row in rows if row["filter"] != "floor"}, key=_order)
-    window = 100 if any(row["window"] == 100 for row in rows) else max(row["window"] for row in rows)
-    floor = [{**row, "sensor": "truth"} for row in pick(rows, filter="floor", sensor=methods[0][1])]
+    windows = sorted({row["window"] for row in rows})
+    window = 100 if 100 in windows else windows[-1]
+    floor = [{**row, "sensor": "truth"} for row in rows if (row["filter"], row["sensor"]) == ("floor", methods[0][1])]
+    drives, seeds = Drives([*rows, *floor]), {row["seed"] for row in rows}
     lines = [
         header,
         *(["", FAIRNESS] if len({name for name, _ in methods} - {"dead_reckoning"}) > 1 else []),
@@ -93,57 +90,47 @@ def markdown(rows: Sequence[dict], header: str) -> str:
         "",
         *head("condition", "filter", "sensor", *HEADLINES),
     ]
-    shown = [(condition, *method) for condition in CONDITIONS for method in methods]
-    for condition, name, sensor in [*shown, ("clean", "floor", "truth")]:
-        own = pick([*rows, *floor], condition=condition, window=window, filter=name, sensor=sensor)
-        devkit = [plain(own, "devkit_t_rel_percent"), plain(own, "devkit_r_rel_deg_per_m", 100)]
-        cells = [summary(own, END_POINT[0]), plain(own, "of_dead_reckoning"), summary(own, END_POINT[1])]
-        cells.append(", ".join(filter(None, devkit)))
-        cells += [plain(own, key) for key in ("crps_v_m_per_s", "crps_theta_dot_deg_per_s")]
-        cells += [summary(own, key) for key in ("coverage90_v", "coverage90_theta_dot")]
-        lines.append(line(condition, _title(rows, name, len(seeds)), sensor, *cells))
-    lines += ["", *_by_window([*rows, *floor], [*methods, ("floor", "truth")])]
-    lines += ["", *_by_drive(rows, methods, window), "", *_reference(rows, methods, window)]
-    return "\n".join(lines) + "\n"
+    for condition, method in [*((each, method) for each in CONDITIONS for method in methods), ("clean", FLOOR)]:
+        own = drives(method, condition, window)
+        devkit = plain(own["devkit_t_rel_percent"]), plain(own["devkit_r_rel_deg_per_m"], factor=100)
+        translation, rotation = (summary(own[key]) for key in END_POINT)
+        cells = [translation, plain(own["of_dead_reckoning"]), rotation, ", ".join(filter(None, devkit))]
+        cells += [plain(own[key]) for key in ("crps_v_m_per_s", "crps_theta_dot_deg_per_s")]
+        cells += [summary(own[key]) for key in ("coverage90_v", "coverage90_theta_dot")]
+        lines.append(line(condition, _title(rows, method[0], len(seeds)), method[1], *cells))
+    lines += ["", "Errors by length, clean: m/m, deg/m", "", *head("filter", "sensor", *windows)]
+    for method in [*methods, FLOOR]:
+        lines.append(line(*_names(method), *(_pair(drives(method, "clean", each)) for each in windows)))
+    lines += ["", f"Each drive, clean, {window} steps (50 where it is shorter): m/m, deg/m", ""]
+    lines += head("drive", *(", ".join(_names(method)) for method in methods))
+    own = [(drives(method, "clean", window), drives(method, "clean", 50)) for method in methods]
+    for drive in sorted(set(drives.table.index.get_level_values("drive"))):
+        found = [long.loc[[drive]] if drive in long.index else short.filter([drive], axis=0) for long, short in own]
+        lines.append(line(drive, *map(_pair, found)))
+    return "\n".join([*lines, "", *_reference(drives, methods, window)]) + "\n"
 
 
 def _title(rows: Sequence[dict], name: str, seeds: int) -> str:
-    """A filter's, with its number of seeds where others have more."""
+    """Returns a filter's title, with its number of seeds where others have more."""
     own = len({row["seed"] for row in rows if row["filter"] == name})
     return TITLES.get(name, name) + (f" (at most {own} of {seeds} seeds)" if own < seeds else "")
+
+
+def _names(method: tuple[str, str]) -> tuple[str, str]:
+    return TITLES.get(method[0], method[0]), method[1]
 
 
 def _order(method: tuple[str, str]) -> tuple:
     return method[1] != "flow", method[0] == "dead_reckoning", method[0]
 
 
-def _pair(rows: Sequence[dict], columns: Sequence[str] = END_POINT) -> str:
-    """Means over the drives of an error of translation and one of rotation."""
-    values = [list(by_drive(rows, column).values()) for column in columns]
-    return ", ".join(f"{mean(each):.3f}" if each else "-" for each in values)
+def _pair(drives: pd.DataFrame, columns: Sequence[str] = END_POINT) -> str:
+    """Returns means over the drives of an error of translation and one of rotation."""
+    return ", ".join(plain(drives[column], "{:.3f}") or "-" for column in columns)
 
 
-def _by_window(rows: Sequence[dict], methods: Sequence[tuple[str, str]]) -> list[str]:
-    windows = sorted({row["window"] for row in rows})
-    lines = ["Errors by length, clean: m/m, deg/m", "", *head("filter", "sensor", *windows)]
-    for name, sensor in methods:
-        chosen = pick(rows, filter=name, sensor=sensor, condition="clean")
-        lines.append(line(TITLES.get(name, name), sensor, *(_pair(pick(chosen, window=each)) for each in windows)))
-    return lines
-
-
-def _by_drive(rows: Sequence[dict], methods: Sequence[tuple[str, str]], window: int) -> list[str]:
-    titles = [f"{TITLES.get(name, name)}, {sensor}" for name, sensor in methods]
-    lines = [f"Each drive, clean, {window} steps (50 where it is shorter): m/m, deg/m", "", *head("drive", *titles)]
-    clean = pick(rows, condition="clean")
-    for drive in sorted({drive_of(row) for row in rows}):
-        own = [[row for row in pick(clean, filter=f, sensor=s) if drive_of(row) == drive] for f, s in methods]
-        lines.append(line(drive, *(_pair(pick(each, window=window) or pick(each, window=50)) for each in own)))
-    return lines
-
-
-def _reference(rows: Sequence[dict], methods: Sequence[tuple[str, str]], window: int) -> list[str]:
-    """The paper's Tables II and III: both metrics, its conditions; and what a filter costs."""
+def _reference(drives: Drives, methods: Sequence[tuple[str, str]], window: int) -> list[str]:
+    """Returns the paper's Tables II and III: both metrics, its conditions; and what a filter costs."""
     conditions = ("clean", "salt_and_pepper", "blur", "missing")
     lines = [
         f"Both metrics over {window} steps, end point / path length as in the reference script: m/m, deg/m; parameters "
@@ -151,11 +138,9 @@ def _reference(rows: Sequence[dict], methods: Sequence[tuple[str, str]], window:
         "",
         *head("filter", "sensor", *conditions, "parameters", "ms"),
     ]
-    for name, sensor in methods:
-        own = pick(rows, filter=name, sensor=sensor, window=window)
-        cells = [f"{_pair(at)} / {_pair(at, PATH_LENGTH)}" for at in (pick(own, condition=c) for c in conditions)]
-        for column, digits in (("parameters", 0), ("ms_per_step", 2)):
-            values = list(by_drive(own, column).values())
-            cells.append(f"{median(values):.{digits}f}" if values else "")
-        lines.append(line(TITLES.get(name, name), sensor, *cells))
+    for method in methods:
+        found = [drives(method, condition, window) for condition in conditions]
+        cost = found[0][list(_COST)].median().map("{:.2f}".format).replace("nan", "")
+        times = cost["parameters"].removesuffix(".00"), cost["ms_per_step"]
+        lines.append(line(*_names(method), *(f"{_pair(at)} / {_pair(at, PATH_LENGTH)}" for at in found), *times))
     return lines

@@ -16,8 +16,8 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from benchmarks.common.scores import belief_crps
-from benchmarks.common.training import fit_filter, read_filter
-from benchmarks.kitti.folds import VELOCITIES, Fold, Statistics, frame_sampler
+from benchmarks.common.training import fit_filter
+from benchmarks.kitti.folds import VELOCITIES, Fold, frame_sampler
 from benchmarks.kitti.readings import read_spans
 from benchmarks.kitti.recipes import FILTERS, KITTIRecipe
 from benchmarks.kitti.sensors import SENSORS, SensorOfFold, sensor_loss
@@ -170,29 +170,3 @@ def train_filter(
     fit_filter(recipe, model, stages, None, out=out, inflations=INFLATIONS, error=gained_error, notes=notes, **settings)
     recipe.set_gain(model, read_checkpoint(out / "filter.pt").get("gain", 0.0))
     return recipe, model
-
-
-def load_filter(folder: Path, size: int | None = None, **options) -> tuple[KITTIRecipe, Filter, str, str]:
-    """A recipe, its trained filter, and the names of filter and sensor.
-
-    Args:
-        folder: of its training.
-        size: members to run with, and samples of its sensor; those that it was trained with.
-        **options: attributes of the recipe that are to be others than in the training.
-
-    Raises:
-        FileNotFoundError: if no training was finished in the folder.
-    """
-    saved = read_checkpoint(folder / "filter.pt")
-    facts = Statistics(**saved["facts"])
-    recipe = FILTERS[saved["filter"]](SENSORS[saved["sensor"]](facts), facts)
-    if size is not None:
-        recipe.size = recipe.sensor.ensemble_size = size
-    for name, value in options.items():
-        setattr(recipe, name, value)
-    model = recipe.build()
-    # Which quantile a member has is no weight, and follows from their number.
-    quantiles = {key: value for key, value in model.state_dict().items() if key.endswith(".quantiles")}
-    saved["model"] |= quantiles
-    recipe.set_gain(model, saved.get("gain", 0.0))
-    return recipe, read_filter(recipe, model, saved), saved["filter"], saved["sensor"]

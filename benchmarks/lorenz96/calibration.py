@@ -13,12 +13,16 @@ from __future__ import annotations
 import platform
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
+from torch import Tensor
+from torch.optim.lr_scheduler import OneCycleLR
 
 from benchmarks.common.arguments import command
+from benchmarks.common.descent import minimise
 from benchmarks.common.tables import head, line, write_page
 from torch_denkf.filters import DEnKF
 from torch_denkf.metrics import spread_skill_ratio
@@ -70,18 +74,13 @@ def train(loss_name: str, data: TensorDict, updates: int, length: int, seed: int
     torch.manual_seed(seed)
     denkf = make_filter()
     loss = DEnKFLoss.paper(denkf) if loss_name == "mse" else DEnKFLoss(denkf, score=loss_name)
-    optimiser = torch.optim.Adam(denkf.parameters(), lr=2e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=updates)
-    for _ in range(updates):
-        rows = torch.randint(data.shape[0], (64,))
-        start = int(torch.randint(data.shape[1] - length + 1, ()))
-        batch = data[rows, start : start + length]
-        total = sum(loss(batch).values())
-        optimiser.zero_grad()
-        total.backward()
-        torch.nn.utils.clip_grad_norm_(denkf.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
+
+    def batch_loss() -> Tensor:
+        rows, start = torch.randint(data.shape[0], (64,)), int(torch.randint(data.shape[1] - length + 1, ()))
+        return sum(loss(data[rows, start : start + length]).values())
+
+    one_cycle = partial(OneCycleLR, max_lr=2e-3, total_steps=updates)
+    minimise(denkf.parameters(), batch_loss, updates, 2e-3, schedule=one_cycle, clip=1.0)
     return denkf
 
 
@@ -122,18 +121,9 @@ class Calibration:
         for loss, length in (("crps", 16), ("energy", 16), ("mse", 16), ("crps", 2), ("mse", 2)):
             for seed in range(self.seeds):
                 scores = evaluate(train(loss, training, self.updates, length, seed), unseen, seed)
-                lines.append(
-                    line(
-                        "mse (the paper's)" if loss == "mse" else loss,
-                        length - 1,
-                        seed,
-                        f"{scores['sensor']:.3f}",
-                        f"{scores['filter']:.3f}",
-                        f"{scores['spread/skill']:.2f}",
-                        f"{scores['lowest']:.2f} to {scores['highest']:.2f}",
-                        f"{100 * scores['coverage90']:.0f} %",
-                    )
-                )
+                name, worst = loss.replace("mse", "mse (the paper's)"), "{lowest:.2f} to {highest:.2f}".format(**scores)
+                cells = [f"{scores['sensor']:.3f}", f"{scores['filter']:.3f}", f"{scores['spread/skill']:.2f}", worst]
+                lines.append(line(name, length - 1, seed, *cells, f"{100 * scores['coverage90']:.0f} %"))
                 print(lines[-1], flush=True)
         header = (
             f"`{command('lorenz96')}`: {time.perf_counter() - began:.0f} s on one core ({platform.machine()}). 400 "

@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 
-from benchmarks.common.arguments import command, processor
+from benchmarks.common.arguments import made_by
 from benchmarks.common.jobs import once, read_rows
 from benchmarks.common.plots import draw_frontier
 from benchmarks.common.scores import processor_ms
@@ -164,7 +164,6 @@ class Frontier:
             draw_frontier(rows, self.out.with_suffix(".png"), error="rmse", label=label, limit=SHOWN)
 
     def _page(self, rows: list[dict], seconds: float) -> str:
-        titles = ("filter", "members", "setting", "RMSE, validation", "RMSE", "ms a step", "ms, not compiled")
         lines = [
             "# Lorenz-96: error against milliseconds a step",
             "",
@@ -174,7 +173,7 @@ class Frontier:
             f"of {self.steps} steps without the first {self.burn_in}. The readings' own RMSE is 1. ms: processor "
             f"time, one record, one thread, the least of {RUNS} runs of {TIMED} steps, each step compiled.",
             "",
-            *head(*titles),
+            *head("filter", "members", "setting", "RMSE, validation", "RMSE", "ms a step", "ms, not compiled"),
         ]
         for row in rows:
             numbers = (f"{row[k]:.3f}" for k in ("validation_rmse", "rmse", "ms_per_step", "eager_ms_per_step"))
@@ -183,8 +182,6 @@ class Frontier:
             "",
             "![RMSE against milliseconds a step](frontier.png)",
             "",
-            f"* Command: `{command('lorenz96')}`",
-            f"* Hardware: {processor()}, {torch.get_num_threads()} thread(s), shared; torch {torch.__version__}; "
-            f"{seconds:.0f} s in all.",
+            *made_by("lorenz96", f", {seconds:.0f} s"),
         ]
         return "\n".join(lines) + "\n"

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
+from benchmarks.common.descent import minimise
 from benchmarks.common.lorenz96 import lorenz96_step
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional.localisation import gaspari_cohn
@@ -16,6 +19,7 @@ from torch_denkf.objectives import DEnKFLoss
 
 FORCING, NOISE, R = 8.0, 0.2, 1.0  # of the true system: F; model noise and observation noise, standard deviations
 START, NOISE_START = 5.0, 1.0  # where learning begins
+BATCH, WARM_UP, WINDOW = 8, 20, 40  # windows in an update; steps before a window, and of it
 SPIN_UP = 500  # steps from a random state to the attractor
 
 
@@ -124,46 +128,29 @@ def noise_of(denkf: DEnKF) -> torch.Tensor:
     return (0.5 * denkf["transition"].module["noise"].log_variance).exp().detach()
 
 
-def learn(
-    denkf: DEnKF,
-    record: TensorDict,
-    *,
-    updates: int,
-    rng: torch.Generator,
-    batch: int = 8,
-    warm_up: int = 20,
-    window: int = 40,
-    detach_every: int = 10,
-    rate: float = 0.1,
-) -> list[float]:
-    """Maximises the likelihood on windows of the ``record`` ``[records, steps]``; returns F before and after updates.
+def learn(denkf: DEnKF, record: TensorDict, updates: int, rng: torch.Generator, rate: float = 0.1) -> None:
+    """Maximises the likelihood on windows of the ``record`` ``[records, steps]``, in place.
 
-    A window begins with the belief that the present filter has after ``warm_up`` steps from the window's first
+    A window begins with the belief that the present filter has after a warm-up from the window's first
     observation: the start knows less than the filter does later, and its likelihood says little about F. The choice
     of the windows is ``rng``'s, the noise of the filter torch's own.
     """
-    loss = DEnKFLoss.ad_enkf(denkf, detach_every=detach_every)
-    optimiser = torch.optim.Adam(denkf.parameters(), lr=rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates, 0.01 * rate)
-    path = [forcing_of(denkf).item()]
-    for _ in range(updates):
-        rows = torch.randint(record.shape[0], (batch,), generator=rng).tolist()
-        starts = torch.randint(record.shape[1] - warm_up - window, (batch,), generator=rng).tolist()
+    loss = DEnKFLoss.ad_enkf(denkf, detach_every=10)
+
+    def batch_loss() -> torch.Tensor:
+        rows = torch.randint(record.shape[0], (BATCH,), generator=rng).tolist()
+        starts = torch.randint(record.shape[1] - WARM_UP - WINDOW, (BATCH,), generator=rng).tolist()
         places = zip(rows, starts, strict=True)
-        frames = torch.stack([record[row, start : start + warm_up + window + 1] for row, start in places])
+        frames = torch.stack([record[row, start : start + WARM_UP + WINDOW + 1] for row, start in places])
         with torch.no_grad():
-            warm = denkf.sequence(frames[:, : warm_up + 1].copy()).select(*denkf.belief_keys)
-        frames = frames[:, warm_up:].copy()
+            warm = denkf.sequence(frames[:, : WARM_UP + 1].copy()).select(*denkf.belief_keys)
+        frames = frames[:, WARM_UP:].copy()
         # A stored belief needs an entry for every time; only the first is read, as nothing starts anew in between.
-        frames.update(warm[:, -1:].expand(batch, window + 1))
-        total = loss(frames)["loss_nll"]
-        optimiser.zero_grad()
-        total.backward()
-        nn.utils.clip_grad_norm_(denkf.parameters(), 10.0)
-        optimiser.step()
-        schedule.step()
-        path.append(forcing_of(denkf).item())
-    return path
+        frames.update(warm[:, -1:].expand(BATCH, WINDOW + 1))
+        return loss(frames)["loss_nll"]
+
+    cosine = partial(CosineAnnealingLR, T_max=updates, eta_min=0.01 * rate)
+    minimise(denkf.parameters(), batch_loss, updates, rate, schedule=cosine, clip=10.0)
 
 
 @torch.no_grad()

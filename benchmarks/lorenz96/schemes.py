@@ -19,7 +19,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.common.arguments import command, processor
+from benchmarks.common.arguments import made_by
 from benchmarks.common.lorenz96 import lorenz96_step
 from benchmarks.common.tables import head, line, write_page
 from torch_denkf.functional import analyse
@@ -39,7 +39,6 @@ class Case:
     ensemble_size: int
     inflation: float  # factor on the analysis anomalies, DAPPER's convention
     published: float  # DAPPER's table, which cites the papers
-    target: float
     rotate: bool = False
 
     @property
@@ -49,13 +48,13 @@ class Case:
 
 
 CASES = [
-    Case("perturbed", 40, 1.06, published=0.22, target=0.24),
-    Case("sakov", 40, 1.01, published=0.18, target=0.20),
+    Case("perturbed", 40, 1.06, published=0.22),
+    Case("sakov", 40, 1.01, published=0.18),
     # Published at 1.013, with which 24 members lose the state in some seeds; 1.02 is chosen on seeds 100 to 107.
-    Case("etkf", 24, 1.02, published=0.18, target=0.21, rotate=True),
-    Case("letkf", 7, 1.04, published=0.22, target=0.25, rotate=True),
+    Case("etkf", 24, 1.02, published=0.18, rotate=True),
+    Case("letkf", 7, 1.04, published=0.22, rotate=True),
 ]
-TITLES = ("scheme", "E", "inflation", "RMSE", "each seed", "spread", "published", "target", "met", "ms a cycle")
+TITLES = ("scheme", "E", "inflation", "RMSE", "each seed", "spread", "published", "ms a cycle")
 RADIUS = 4.0  # of the localisation, in variables
 
 
@@ -114,26 +113,16 @@ def assimilate(
     for state, observation in zip(truth[1:], observations[1:], strict=True):
         ensemble = lorenz96_step(ensemble)
         if case.scheme == "letkf":
-            frame = TensorDict(
-                {
-                    "forecast": {"ensemble": ensemble, "observation": ensemble},
-                    "sensor": {"ensemble": observation, "noise": noise},
-                },
-                [seeds],
-            )
+            forecast = {"ensemble": ensemble, "observation": ensemble}
+            sensor = {"ensemble": observation, "noise": noise}
+            frame = TensorDict({"forecast": forecast, "sensor": sensor}, [seeds])
             if case.rotate:
                 frame["noise", "self"] = random.rotation(case.ensemble_size)
             ensemble = local(frame)["belief", "ensemble"]
         else:
-            ensemble = analyse(
-                ensemble,
-                ensemble,
-                observation,
-                noise,
-                scheme=case.scheme,
-                perturbation=draw(ensemble) if case.scheme == "perturbed" else None,
-                rotation=random.rotation(case.ensemble_size) if case.rotate else None,
-            ).ensemble
+            options = {"perturbation": draw(ensemble)} if case.scheme == "perturbed" else {}
+            options |= {"rotation": random.rotation(case.ensemble_size)} if case.rotate else {}
+            ensemble = analyse(ensemble, ensemble, observation, noise, scheme=case.scheme, **options).ensemble
         ensemble = inflate(ensemble, case.inflation)
         errors.append((ensemble.mean(1) - state).square().mean(-1).sqrt())
         spreads.append(ensemble.var(1).mean(-1).sqrt())
@@ -151,7 +140,7 @@ def report(study: Schemes) -> str:
         "40 variables, forcing 8, all observed with unit variance every 0.05 time units. RMSE: time mean",
         f"over {cycles:,} cycles after {burn_in:,} of burn-in of the root mean square error of the analysis mean;",
         f"mean over {seeds} seeds, then each seed. Spread: the same of the ensemble's standard deviation.",
-        "Published: DAPPER's table, which reproduces the papers. Met: the mean does not exceed the target.",
+        "Published: DAPPER's table, which reproduces the papers.",
         f"The start and perturbations are {study.draws} draws.",
         "",
         *head(*TITLES),
@@ -164,26 +153,15 @@ def report(study: Schemes) -> str:
         errors, spreads = assimilate(case, truth, observations, study.first, study.draws == "exact")
         elapsed = 1e3 * (time.perf_counter() - began) / len(errors)
         scores = errors[burn_in:].mean(0)
-        cells = [
-            case.name,
-            str(case.ensemble_size),
-            f"{case.inflation}",
-            f"{scores.mean():.3f}",
-            ", ".join(f"{score:.3f}" for score in scores),
-            f"{spreads[burn_in:].mean():.3f}",
-            f"{case.published}",
-            f"{case.target}",
-            "yes" if scores.mean() <= case.target else "no",
-            f"{elapsed:.2f}",
-        ]
-        lines.append(line(*cells))
+        each = ", ".join(f"{score:.3f}" for score in scores)
+        cells = f"{scores.mean():.3f}", each, f"{spreads[burn_in:].mean():.3f}", case.published
+        lines.append(line(case.name, case.ensemble_size, case.inflation, *cells, f"{elapsed:.2f}"))
         print(lines[-1], flush=True)
     lines += [
         "",
-        f"* Command: `{command('lorenz96')}`",
         f"* Seeds: {study.first} to {study.first + seeds - 1}, all run as one batch, none left out; double precision.",
-        f"* Hardware: {processor()}, {torch.get_num_threads()} thread(s); torch {torch.__version__}; "
-        f"{time.perf_counter() - start:.0f} s in all. A cycle: {seeds} filters' forecast, analysis, score.",
+        f"* A cycle: {seeds} filters' forecast, analysis, score.",
+        *made_by("lorenz96", f", {time.perf_counter() - start:.0f} s"),
     ]
     return "\n".join(lines) + "\n"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,19 +9,12 @@ from typing import Literal
 
 import torch
 
-from benchmarks.arms.arms import ARMS
-from benchmarks.arms.study import Study, collect, trained
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import head, line, write_page
-from benchmarks.members.tasks import Score, episodes_of_reacher, filtered, resized
-from torch_denkf import Filter, from_pretrained
-from torch_denkf.applications.ur5.envs.collect import collect_ur5_demos
-from torch_denkf.applications.ur5.filter import UR5TableSettings
-from torch_denkf.applications.ur5.train import evaluate_ur5_table
+from benchmarks.members import tasks
 from torch_denkf.modules import StochasticMLP
 
 MASKS = ("random", "balanced")
-Scored = Callable[[Filter, int], Score]
 
 
 @dataclass(frozen=True)
@@ -38,42 +30,14 @@ class Masks:
     updates: int = 8000  # of the manipulator's motion
 
 
-def reacher(study: Masks) -> tuple[Callable[[int], Filter], Scored]:
-    """The filter that comes with the library, by members; the score of its velocities by filter and seed."""
-    shipped, data = from_pretrained("reacher"), episodes_of_reacher(10, 400, 1000)
-    return partial(resized, shipped, threshold=None), lambda filter, seed: filtered(filter, data, 1, slice(2, 4), seed)
-
-
-def ur5(study: Masks) -> tuple[Callable[[int], Filter], Scored]:
-    """The same of the UR5's joints, on demos that its filter has not seen."""
-    shipped, folder = from_pretrained("ur5-table"), study.runs / "ur5" / "test"
-    collect_ur5_demos(folder, study.demos, size=(UR5TableSettings.pixels,) * 2, seed=0)
-
-    def score(filter: Filter, seed: int) -> Score:
-        torch.manual_seed(seed)
-        found = evaluate_ur5_table(filter, folder, cache=study.runs / "ur5" / "cache", progress=False)
-        return Score(found["filter"]["joints, deg"], found["held by 90 % intervals"])
-
-    return partial(resized, shipped, threshold=None), score
-
-
-def manipulator(study: Masks) -> tuple[Callable[[int], Filter], Scored]:
-    """The same of the velocities of the filter of :mod:`benchmarks.arms`."""
-    arm = ARMS["manipulator"]
-    filter = trained(arm, False, Study(demos=100, motion_updates=study.updates), study.runs / "manipulator")
-    data = collect(arm, False, 60, 200, 1000)
-
-    def make(members: int) -> Filter:
-        filter.initial.ensemble_size = members
-        return filter
-
-    return make, lambda filter, seed: filtered(filter, data, 1, slice(2 * arm.joints, None), seed)
-
-
 def main() -> None:
     """Writes the table."""
     study = parse(Masks)
-    tasks = {"reacher": reacher, "manipulator": manipulator, "ur5": ur5}
+    makers = {
+        "reacher": tasks.reacher,
+        "manipulator": partial(tasks.manipulator, study.runs / "manipulator", updates=study.updates),
+        "ur5": partial(tasks.ur5, study.runs / "ur5", study.demos),
+    }
     lines = [
         "# Balanced masks",
         "",
@@ -84,15 +48,15 @@ def main() -> None:
         *head("task", "members", *(word for masks in MASKS for word in (f"{masks} masks", "held"))),
     ]
     for name in study.tasks:
-        make, score = tasks[name](study)
+        task = makers[name]()
         for members in study.members:
             cells = []
             for masks in MASKS:
-                filter = make(members)
+                filter = task.make(members, None)
                 for module in filter.modules():
                     if isinstance(module, StochasticMLP):
                         module.balanced = masks == "balanced"
-                scores = [score(filter, seed) for seed in range(study.draws)]
+                scores = [task.test(filter, seed) for seed in range(study.draws)]
                 error = torch.tensor([score.error for score in scores])
                 held = sum(score.held for score in scores) / len(scores)
                 cells += [f"{error.mean():.4f} ± {error.std():.4f}", f"{held:.1%}"]

@@ -27,22 +27,6 @@ from torch_denkf.functional.inflation import inflate
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
 
-__all__ = [
-    "ERRORS",
-    "Score",
-    "Task",
-    "cartpole",
-    "episodes_of_reacher",
-    "filtered",
-    "lorenz96",
-    "manipulator",
-    "reacher",
-    "resized",
-    "ur5",
-    "walks",
-    "wheels",
-]
-
 LEVEL = 0.9  # of the intervals
 #: What the error of each task is of, with the unit.
 ERRORS = {
@@ -71,15 +55,25 @@ class Task:
 
     Attributes:
         name: of the task.
-        score: of a filter with so many members, and the threshold of the significance or ``None``.
-        validate: the same on other data, by which the threshold is chosen.
+        make: returns a filter with so many members, and the threshold of the significance or ``None``.
+        test: scores such a filter from a seed.
+        validation: the same on other data, by which the threshold is chosen.
         reference: name and score of a filter without members; ``None`` for none.
     """
 
     name: str
-    score: Callable[[int, float | None], Score]
-    validate: Callable[[int, float | None], Score]
+    make: Callable[[int, float | None], Any]
+    test: Callable[[Any, int], Score]
+    validation: Callable[[Any, int], Score]
     reference: tuple[str, Score] | None = None
+
+    def score(self, members: int, threshold: float | None) -> Score:
+        """Scores a filter on the test data."""
+        return self.test(self.make(members, threshold), 0)
+
+    def validate(self, members: int, threshold: float | None) -> Score:
+        """Scores a filter on the validation data."""
+        return self.validation(self.make(members, threshold), 0)
 
 
 def localised(threshold: float | None) -> dict[str, Any]:
@@ -95,7 +89,7 @@ def scored(mean: Tensor, var: Tensor, truth: Tensor, dims: slice = slice(None)) 
 
 
 @torch.no_grad()
-def filtered(filter: Filter, data: TensorDict, skip: int, dims: slice = slice(None), seed: int = 0) -> Score:
+def filtered(filter: Filter, seed: int, data: TensorDict, skip: int, dims: slice = slice(None)) -> Score:
     """The score on sequences ``[B, T]`` behind their first steps."""
     torch.manual_seed(seed)
     out = filter.sequence(data.clone(), keep=[("belief", "mean"), ("belief", "var")])["belief"][:, skip:]
@@ -105,13 +99,12 @@ def filtered(filter: Filter, data: TensorDict, skip: int, dims: slice = slice(No
 def wheels(runs: int = 8, steps: int = 6000) -> Task:
     """The robot on wheels of ``benchmarks.wheels``: fast sensors, slow GPS."""
     test, other = recordings(runs, steps, 0), recordings(runs, steps, 1)
-    skip, place = min(500, steps // 2), slice(0, 2)
+    scores = [partial(filtered, data=data, skip=min(500, steps // 2), dims=slice(0, 2)) for data in (test, other)]
 
-    def score(data: TensorDict, members: int, threshold: float | None) -> Score:
-        return filtered(ensemble_filter(members, **localised(threshold)), data, skip, place)
+    def make(members: int, threshold: float | None) -> Filter:
+        return ensemble_filter(members, **localised(threshold))
 
-    kalman = filtered(gaussian_filter(), test, skip, place)
-    return Task("wheels", partial(score, test), partial(score, other), ("EKF", kalman))
+    return Task("wheels", make, *scores, ("EKF", scores[0](gaussian_filter(), 0)))
 
 
 def _walks(runs: int, steps: int, seed: int) -> TensorDict:
@@ -126,12 +119,13 @@ def _walks(runs: int, steps: int, seed: int) -> TensorDict:
 def walks(runs: int = 16, steps: int = 1000) -> Task:
     """Ten random walks that have nothing to do with each other, one of which is read at each step."""
     test, other = _walks(runs, steps, 0), _walks(runs, steps, 1)
-    skip, eye = min(100, steps // 2), torch.eye(WALKS)
+    scores = [partial(filtered, data=data, skip=min(100, steps // 2)) for data in (test, other)]
+    eye = torch.eye(WALKS)
 
-    def score(data: TensorDict, members: int, threshold: float | None) -> Score:
+    def make(members: int, threshold: float | None) -> Filter:
         still = torch.nn.Linear(WALKS, WALKS, bias=False)
         still.weight.data = torch.eye(WALKS)
-        filter = DEnKF(
+        return DEnKF(
             LearnedTransition(still, residual=False),
             None,
             Select(range(WALKS)),
@@ -140,12 +134,10 @@ def walks(runs: int = 16, steps: int = 1000) -> Task:
             process_noise=[WALK_STD] * WALKS,
             initial=GaussianPrior([0.0] * WALKS, [WALK_STD] * WALKS, ensemble_size=members),
         )
-        return filtered(filter, data, skip)
 
     noises = {"process_noise": [WALK_STD] * WALKS, "noise": [READING_STD] * WALKS}
     exact = KalmanFilter(eye, eye, **noises, mean=torch.zeros(WALKS), cov=WALK_STD**2 * eye, observation_key="reading")
-    best = ("Kalman filter", filtered(exact, test, skip))
-    return Task("walks", partial(score, test), partial(score, other), best)
+    return Task("walks", make, *scores, ("Kalman filter", scores[0](exact, 0)))
 
 
 def _weather(seeds: int, cycles: int, first: int) -> tuple[Tensor, Tensor]:
@@ -187,18 +179,20 @@ def lorenz96(seeds: int = 4, cycles: int = 600, inflations: tuple[float, ...] = 
             scores.append(replace(scored(mean, var, true), error=float(error)))
         return scores
 
-    def validate(members: int, threshold: float | None) -> Score:
-        scores = run("validation", members, threshold)
-        best = min(range(len(scores)), key=lambda place: scores[place].error)
-        chosen[members, threshold] = best
-        return scores[best]
+    def make(members: int, threshold: float | None) -> tuple[int, float | None]:
+        return members, threshold
 
-    def score(members: int, threshold: float | None) -> Score:
-        if (members, threshold) not in chosen:
-            validate(members, threshold)
-        return run("test", members, threshold)[chosen[members, threshold]]
+    def validate(setting: tuple[int, float | None], seed: int) -> Score:
+        scores = run("validation", *setting)
+        chosen[setting] = min(range(len(scores)), key=lambda place: scores[place].error)
+        return scores[chosen[setting]]
 
-    return Task("lorenz96", score, validate)
+    def score(setting: tuple[int, float | None], seed: int) -> Score:
+        if setting not in chosen:
+            validate(setting, seed)
+        return run("test", *setting)[chosen[setting]]
+
+    return Task("lorenz96", make, score, validate)
 
 
 def manipulator(folder: Path, demos: int = 100, updates: int = 8000) -> Task:
@@ -208,51 +202,40 @@ def manipulator(folder: Path, demos: int = 100, updates: int = 8000) -> Task:
     """
     arm = ARMS["manipulator"]
     shipped = trained(arm, False, Study(demos=demos, motion_updates=updates), folder)
-    test, other = (collect(arm, False, 60, 200, seed) for seed in (1000, 2000))
+    data = [collect(arm, False, 60, 200, seed) for seed in (1000, 2000)]
 
-    def score(data: TensorDict, members: int, threshold: float | None) -> Score:
+    def make(members: int, threshold: float | None) -> Filter:
         shipped.initial.ensemble_size = members
-        localise(shipped, threshold)
-        return filtered(shipped, data, 1, slice(2 * arm.joints, None))
+        return localise(shipped, threshold)
 
-    return Task("manipulator", partial(score, test), partial(score, other))
+    dims = slice(2 * arm.joints, None)
+    return Task("manipulator", make, *(partial(filtered, data=each, skip=1, dims=dims) for each in data))
 
 
-def localise(filter: torch.nn.Module, threshold: float | None) -> None:
-    """Switches significance on or off in a filter that is there."""
+def localise(filter: Filter, threshold: float | None) -> Filter:
+    """Switches significance on or off in a filter that is there; returns it."""
     for module in filter.modules():
         if isinstance(module, EnsembleAnalysis):
             module.localisation, module.threshold = (None, 3.0) if threshold is None else ("significance", threshold)
+    return filter
 
 
 def resized(filter: Any, members: int, threshold: float | None) -> Any:
     """A filter that comes with the library, with so many members; their noise models stay those of its training."""
     new = type(filter)(replace(filter.settings, ensemble_size=members))
     new.load_state_dict(filter.state_dict())
-    new.eval()
-    localise(new, threshold)
-    return new
-
-
-def episodes_of_reacher(episodes: int, steps: int, seed: int) -> TensorDict:
-    """Episodes ``[episodes, steps]`` of random actions."""
-    torch.manual_seed(seed)
-    env = reacher_env(seed)
-    return TensorDict.stack([env.rollout(steps).select("state", "encoder", "action") for _ in range(episodes)])
+    return localise(new.eval(), threshold)
 
 
 def reacher(episodes: int = 10, steps: int = 400) -> Task:
-    """Joint velocities of the reacher by the filter that comes with the library."""
-    test, other, shipped = (
-        episodes_of_reacher(episodes, steps, 1000),
-        episodes_of_reacher(episodes, steps, 2000),
-        from_pretrained("reacher"),
-    )
-
-    def score(data: TensorDict, members: int, threshold: float | None) -> Score:
-        return filtered(resized(shipped, members, threshold), data, 1, slice(2, 4))
-
-    return Task("reacher", partial(score, test), partial(score, other))
+    """Joint velocities of the reacher by the filter that comes with the library, under random actions."""
+    scores = []
+    for seed in (1000, 2000):
+        torch.manual_seed(seed)
+        env, keys = reacher_env(seed), ("state", "encoder", "action")
+        data = TensorDict.stack([env.rollout(steps).select(*keys) for _ in range(episodes)])
+        scores.append(partial(filtered, data=data, skip=1, dims=slice(2, 4)))
+    return Task("reacher", partial(resized, from_pretrained("reacher")), *scores)
 
 
 def _pushes(noise: float, episodes: int, seed: int) -> TensorDict:
@@ -263,25 +246,24 @@ def _pushes(noise: float, episodes: int, seed: int) -> TensorDict:
 
 def cartpole(noise: float = 0.3, episodes: int = 20) -> Task:
     """Velocities of the cartpole of ``benchmarks.control`` under random pushes, by a filter that knows its physics."""
-    test, other = _pushes(noise, episodes, 0), _pushes(noise, episodes, 1)
+    data = [_pushes(noise, episodes, seed) for seed in (0, 1)]
 
-    def score(data: TensorDict, members: int, threshold: float | None) -> Score:
-        filter = exact_filter(noise, members)
-        localise(filter, threshold)
-        return filtered(filter, data, 1, slice(3, 5))
+    def make(members: int, threshold: float | None) -> Filter:
+        return localise(exact_filter(noise, members), threshold)
 
-    return Task("cartpole", partial(score, test), partial(score, other))
+    return Task("cartpole", make, *(partial(filtered, data=each, skip=1, dims=slice(3, 5)) for each in data))
 
 
 def ur5(folder: Path, demos: int = 200, others: int = 100) -> Task:
     """Joints of the UR5 at its table by the filter that comes with the library, on demos that it has not seen."""
-    shipped, side = from_pretrained("ur5-table"), UR5TableSettings.pixels
-    test, other = folder / "test", folder / "validation"
-    collect_ur5_demos(test, demos, size=(side, side), seed=0)
-    collect_ur5_demos(other, others, size=(side, side), seed=1)
+    side = UR5TableSettings.pixels
+    collect_ur5_demos(folder / "test", demos, size=(side, side), seed=0)
+    collect_ur5_demos(folder / "validation", others, size=(side, side), seed=1)
 
-    def score(data: Path, members: int, threshold: float | None) -> Score:
-        found = evaluate_ur5_table(resized(shipped, members, threshold), data, cache=folder / "cache", progress=False)
+    def score(data: Path, filter: Filter, seed: int) -> Score:
+        torch.manual_seed(seed)
+        found = evaluate_ur5_table(filter, data, cache=folder / "cache", progress=False)
         return Score(found["filter"]["joints, deg"], found["held by 90 % intervals"])
 
-    return Task("ur5", partial(score, test), partial(score, other))
+    scores = [partial(score, folder / name) for name in ("test", "validation")]
+    return Task("ur5", partial(resized, from_pretrained("ur5-table")), *scores)

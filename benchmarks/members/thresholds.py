@@ -45,14 +45,11 @@ class Study:
     smoke: bool = False  # small: does it run?
 
 
-class Turn(nn.Module):
-    """A target ``[*, 5]``, place, speeds and turn rate, one step later."""
-
-    def forward(self, state: Tensor) -> Tensor:
-        """The states."""
-        x, y, vx, vy, turn = state.unbind(-1)
-        vx, vy = turn.cos() * vx - turn.sin() * vy, turn.sin() * vx + turn.cos() * vy
-        return torch.stack([x + vx, y + vy, vx, vy, 0.95 * turn], -1)
+def turned(state: Tensor) -> Tensor:
+    """Targets ``[*, 5]``, place, speeds and turn rate, one step later."""
+    x, y, vx, vy, turn = state.unbind(-1)
+    vx, vy = turn.cos() * vx - turn.sin() * vy, turn.sin() * vx + turn.cos() * vy
+    return torch.stack([x + vx, y + vy, vx, vy, 0.95 * turn], -1)
 
 
 class Bearing(SubModel):
@@ -70,14 +67,14 @@ class Bearing(SubModel):
 def targets(runs: int, seed: int, steps: int = 40) -> TensorDict:
     """Targets with rare turns, an observer that weaves, and bearings."""
     generator = torch.Generator().manual_seed(seed)
-    draw, move, time = partial(torch.randn, generator=generator), Turn(), torch.arange(steps)
+    draw, time = partial(torch.randn, generator=generator), torch.arange(steps)
     state, states = torch.tensor(MEAN) + torch.tensor(STD) * draw(runs, 5), []
     phase = 2 * math.pi * torch.rand(runs, 1, generator=generator)
     weave = 2 * (2 * math.pi * time / 24 + phase).sin()
     observer = torch.stack([weave, torch.zeros_like(weave)], -1)
     for t in range(steps):
         if t:
-            state = move(state) + torch.tensor([0.0, 0.0, 0.003, 0.003, 0.02]) * draw(runs, 5)
+            state = turned(state) + torch.tensor([0.0, 0.0, 0.003, 0.003, 0.02]) * draw(runs, 5)
             jump = torch.rand(runs, generator=generator) < 0.03
             state[:, 4] = torch.where(jump, 0.15 * draw(runs), state[:, 4])
         states.append(state)
@@ -93,7 +90,7 @@ def bearings(runs: int) -> tuple[Score, Callable[[int, float | None], Score]]:
     data = targets(runs, 4)
     common = {"process_noise": WALK, "update_at_reset": True}
     reading = {"reading_space": Circle(), "observation_key": "reading"}
-    parts = LearnedTransition(Turn(), residual=False), None, Bearing(), ConstantNoise([BEARING], in_key="reading")
+    parts = LearnedTransition(turned, residual=False), None, Bearing(), ConstantNoise([BEARING], in_key="reading")
 
     def of(filter) -> Score:
         torch.manual_seed(0)
@@ -135,11 +132,11 @@ def linear(size: int, read: int, runs: int) -> tuple[Score, Callable[[int, float
             process_noise=[0.1] * size,
             initial=GaussianPrior([0.0] * size, [1.0] * size, ensemble_size=members),
         )
-        return filtered(filter, data, 20)
+        return filtered(filter, 0, data, 20)
 
     noises = {"process_noise": [0.1] * size, "noise": [0.2] * read}
     exact = KalmanFilter(f, h, **noises, mean=torch.zeros(size), cov=torch.eye(size), observation_key="reading")
-    return filtered(exact, data, 20), score
+    return filtered(exact, 0, data, 20), score
 
 
 def main() -> None:

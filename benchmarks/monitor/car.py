@@ -171,17 +171,6 @@ def drive_rows(
     return rows
 
 
-def clean_rows(
-    task: str, root: Path, drives: Sequence[str], calibration: Sequence[TensorDict], cache: Path, draws: int
-) -> list[dict]:
-    """Path scores of rendered drives without faults, one row."""
-    _, model = car_filter()
-    gates = gates_of(calibration)
-    readings = [failing(root, name, "clean", cache, repair=True) for name in drives]
-    guarded = filtered(model, [gates.answered(each) for each in readings], draws)
-    return [{"task": task, "fault": "none", **compared(filtered(model, readings, draws), guarded)}]
-
-
 def compared(plain: Sequence[TensorDict], gated: Sequence[TensorDict]) -> dict[str, float]:
     """Path scores of the filter and of the gated one, means over the drives of at least 100 steps."""
     out: dict[str, float] = {}

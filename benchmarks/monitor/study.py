@@ -11,7 +11,7 @@ from typing import Literal
 
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.jobs import compute
-from benchmarks.common.tables import Columns, head, line, write_page
+from benchmarks.common.tables import Columns, head, line, report, write_page
 from benchmarks.monitor import car
 from benchmarks.monitor.drives import FAULTS, failing
 from torch_denkf.applications.car import write_drives
@@ -19,24 +19,13 @@ from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 from torch_denkf.applications.car.kitti.render import render_drives
 
 TASKS = ("ur5", "kitti-real", "kitti-rendered")
+ALARMS = ("auroc", "delay_steps", "false_alarms_per_1000", "error_ratio")
 PATHS = ("m_per_m", "held_v", "held_theta_dot", "m_per_m_gated", "held_v_gated", "held_theta_dot_gated")
 COLUMNS = Columns(
-    names=(
-        "task",
-        "fault",
-        "auroc",
-        "delay_steps",
-        "false_alarms_per_1000",
-        "error_ratio",
-        "found",
-        "false_steps_per_1000",
-        "error",
-        "error_gated",
-        *PATHS,
-    ),
+    names=("task", "fault", *ALARMS, "found", "false_steps_per_1000", "error", "error_gated", *PATHS),
     text=("task", "fault"),
     whole=(),
-    order=lambda row: (TASKS.index(row["task"].split(",")[0]), row["task"], row["fault"]),
+    order=lambda row: (TASKS.index(row["task"]), row["fault"]),
 )
 
 
@@ -86,14 +75,7 @@ def rows_of(study: Study, task: str) -> list[dict]:
     folder, poses = study.out / "rendered", None if study.root is None else study.root / "poses"
     options = {"size": (100, 300), "processes": 1}
     render_drives(folder, poses=poses, names=list(study.rendered), frames=study.frames, **options)
-    near = cache / "rendered"
-    rows = car.drive_rows(task, folder, study.rendered, known, near, study.draws)
-    hidden = [name for name in study.rendered if name == "04"]  # whose road a car hides for two seconds
-    if hidden:
-        rows += car.clean_rows(f"{task}, 04", folder, hidden, known, near, study.draws)
-        others = [name for name in study.rendered if name != "04"]
-        rows += car.clean_rows(f"{task}, without 04", folder, others, known, near, study.draws)
-    return rows
+    return car.drive_rows(task, folder, study.rendered, known, cache / "rendered", study.draws)
 
 
 def trials_of(study: Study, task: str) -> list[dict]:
@@ -194,5 +176,4 @@ def main() -> None:
         write_page(choice_page(rows, study), study.out / "choice.md")
         return
     rows = sorted(rows, key=COLUMNS.order)
-    COLUMNS.write(rows, study.out / "monitor.csv")
-    write_page(page(rows, study), study.out / "monitor.md")
+    report(study.out, COLUMNS, rows, page(rows, study), "monitor")

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean, median
 
+import pandas as pd
 import torch
 
 from benchmarks.common.arguments import command, parse
@@ -19,25 +18,17 @@ from torch_denkf.applications.car.kitti.drive import choose_camera, list_kitti_d
 from torch_denkf.applications.car.kitti.files import read_poses
 from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
 from torch_denkf.applications.car.metrics.odometry import kitti_endpoint_error
+from torch_denkf.applications.car.odometry.images import read_frames
 from torch_denkf.applications.car.odometry.paths import read_path
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
 from torch_denkf.applications.car.vision.poses import poses_to_state
 from torch_denkf.cli.main import main as denkf
+from torch_denkf.deployment.files import write_text
 
 WINDOW = 100  # steps of an end point error; half of a shorter drive
+ERRORS = ["translation_m_per_m", "rotation_deg_per_m"]
 COLUMNS = Columns(
-    names=(
-        "drive",
-        "height_m",
-        "frames",
-        "window",
-        "translation_m_per_m",
-        "rotation_deg_per_m",
-        "devkit_percent",
-        "devkit_deg_per_100m",
-        "scale",
-        "seconds",
-    ),
+    names=("drive", "height_m", "frames", "window", *ERRORS, "devkit_percent", "devkit_deg_per_100m", "scale"),
     text=("drive",),
     whole=("frames", "window"),
     order=lambda row: (row["height_m"], row["drive"]),
@@ -60,19 +51,19 @@ def track(study: Study, root: Path, drive: str, height: float) -> dict:
     """One run of the command, and its errors."""
     folder = root / "sequences" / drive
     camera = choose_camera(folder, None)
-    out = study.out / f"{drive}-{height:g}"
+    out, images = study.out / f"{drive}-{height:g}", read_frames(folder / camera)
+    poses = read_poses(root / "poses" / f"{drive}.txt")
+    clock = read_times(folder / "times.txt", len(poses))  # of the whole sequence, of which a part may have images
+    stamps = study.out / f"{drive}.txt"
+    write_text(stamps, "".join(f"{time}\n" for time in clock.times[images.first : images.first + images.count]))
     words: list[str] = [str(folder / camera), "--calibration", str(folder / "calib.txt"), "--camera", camera]
-    words += ["--times", str(folder / "times.txt"), "--height", f"{height:g}", "--out", str(out), "--no-pictures"]
+    words += ["--times", str(stamps), "--height", f"{height:g}", "--out", str(out), "--no-pictures"]
     if study.checkpoint is not None:
         words += ["--checkpoint", str(study.checkpoint)]
-    begun = time.time()
     if denkf(["odometry", *words]) != 0:
         raise SystemExit(f"denkf odometry {' '.join(words)} failed")
-    seconds = time.time() - begun
     path = read_path(out / "path.csv")
-    poses = read_poses(root / "poses" / f"{drive}.txt")
-    dt = read_times(folder / "times.txt", len(poses)).dt
-    truth = torch.from_numpy(poses_to_state(poses, dt[1:]))[path["frame"].squeeze(-1)][:, :3]
+    truth = torch.from_numpy(poses_to_state(poses, clock.dt[1:]))[path["frame"].squeeze(-1)][:, :3]
     believed = path["belief", "mean"][:, :3]
     window = WINDOW if len(truth) > WINDOW else (len(truth) - 1) // 2
     error = kitti_endpoint_error(believed, truth, window=window)
@@ -85,7 +76,6 @@ def track(study: Study, root: Path, drive: str, height: float) -> dict:
         "translation_m_per_m": float(error.translation),
         "rotation_deg_per_m": float(error.rotation),
         "scale": float((believed[1:, :2] - believed[:-1, :2]).norm(dim=-1).sum() / way),
-        "seconds": seconds,
     }
     if way > 100:
         devkit = kitti_devkit_error(believed, truth)
@@ -95,22 +85,21 @@ def track(study: Study, root: Path, drive: str, height: float) -> dict:
 
 def page(rows: Sequence[dict]) -> str:
     """A table of all drives at the first height, and the means at each."""
-    heights = list(dict.fromkeys(row["height_m"] for row in rows))
-    right = [row for row in rows if row["height_m"] == heights[0]]
-    lines = [f"`{command('odometry')}`", "", f"Camera {heights[0]:g} m over the road, as it is:", ""]
-    lines += head("drive", "frames", "window", "m/m", "deg/m", "devkit, %", "deg/100 m", "length / true", "frames/s")
-    for row in right:
-        devkit = [f"{row[key]:.2f}" if key in row else "" for key in ("devkit_percent", "devkit_deg_per_100m")]
-        errors = [f"{row['translation_m_per_m']:.3f}", f"{row['rotation_deg_per_m']:.3f}"]
-        speed = f"{row['frames'] / row['seconds']:.0f}"
-        lines.append(line(row["drive"], row["frames"], row["window"], *errors, *devkit, f"{row['scale']:.3f}", speed))
+    table = pd.DataFrame(rows, columns=COLUMNS.names)
+    table["devkit"] = table["devkit_percent"].map("{:.2f}".format).replace("nan", "")
+    table["devkit_turn"] = table["devkit_deg_per_100m"].map("{:.2f}".format).replace("nan", "")
+    first = table["height_m"][0]
+    lines = [f"`{command('odometry')}`", "", f"Camera {first:g} m over the road, as it is:", ""]
+    lines += head("drive", "frames", "window", "m/m", "deg/m", "devkit, %", "deg/100 m", "length / true")
+    for row in table[table["height_m"] == first].itertuples():
+        errors = f"{row.translation_m_per_m:.3f}", f"{row.rotation_deg_per_m:.3f}"
+        cells = (row.drive, row.frames, row.window, *errors, row.devkit, row.devkit_turn, f"{row.scale:.3f}")
+        lines.append(line(*cells))
     lines += ["", "A height that is guessed wrong scales the path; means and medians over the drives:", ""]
     lines += head("height given, m", "m/m, mean", "m/m, median", "deg/m, mean", "deg/m, median", "length / true")
-    for height in heights:
-        some = [row for row in rows if row["height_m"] == height]
-        errors = [[row[key] for row in some] for key in ("translation_m_per_m", "rotation_deg_per_m")]
-        centers = [f"{center(error):.3f}" for error in errors for center in (fmean, median)]
-        lines.append(line(f"{height:g}", *centers, f"{fmean(row['scale'] for row in some):.3f}"))
+    for height, some in table.groupby("height_m", sort=False):
+        numbers = [*some[ERRORS].agg(["mean", "median"]).T.stack(), some["scale"].mean()]
+        lines.append(line(f"{height:g}", *(f"{number:.3f}" for number in numbers)))
     return "\n".join(lines) + "\n"
 
 

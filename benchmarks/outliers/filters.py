@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import nn
 
-from benchmarks.outliers.task import SHARE, START, WRONG, Motion, ReadingNoise, SpeedNoise
+from benchmarks.outliers.task import SHARE, START, WRONG, ReadingNoise, SpeedNoise, moved
 from torch_denkf import Filter, Gated
 from torch_denkf.baselines import LSTMFilter
 from torch_denkf.imperfect import Contaminated, Visible
@@ -32,7 +32,7 @@ READING, DIVERGENCE = "reading", 0.01  # chosen on recordings(300, 1) among 0, 0
 
 def known(kind: str, members: int = 32) -> Filter:
     """Makes an extended or unscented Kalman filter, or an ensemble, with the true motion and noises."""
-    motion = LearnedTransition(Motion(), residual=False, action_key="action")
+    motion = LearnedTransition(moved, residual=False, action_key="action")
     if kind == "DEnKF":
         modules = {
             "transition": NoisyTransition(motion, SpeedNoise()),

@@ -12,9 +12,11 @@ from statistics import NormalDist
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from benchmarks.common.arguments import made_by, parse
-from benchmarks.common.tables import Columns, head, line, pick, write_page
+from benchmarks.common.descent import minimise
+from benchmarks.common.tables import Columns, head, line, pick, report
 from benchmarks.outliers.filters import UPDATES, known, learned, lstm
 from benchmarks.outliers.task import SHARE, SKIP, best, recordings
 from torch_denkf import Filter
@@ -64,26 +66,25 @@ def score(filter: Filter, data: TensorDict, draw: int) -> dict[str, float]:
     return {**scores(error, crps, error.abs() < HALF * belief["var"].sqrt()), "ms": 1e3 * took / data.shape[1]}
 
 
-def fit(filter: Filter, loss: nn.Module, study: Study, updates: int, rate: float, data: tuple) -> Filter:
+def fit(filter: Filter, loss: nn.Module, updates: int, rate: float, data: tuple) -> Filter:
     """Trains on windows of whole runs; validation data choose the update that is kept."""
     train, validation = data
-    optimizer = torch.optim.Adam(filter.parameters(), lr=rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, updates)
     least, kept, every = float("inf"), filter.state_dict(), max(1, updates // 7)
-    for update in range(1, updates + 1):
-        rows = train[torch.randint(len(train), (min(50, len(train)),))]
-        value = sum(loss(rows).values())
-        optimizer.zero_grad()
-        value.backward()
-        nn.utils.clip_grad_norm_(filter.parameters(), 1.0)
-        optimizer.step()
-        schedule.step()
+
+    def batch_loss() -> Tensor:
+        return sum(loss(train[torch.randint(len(train), (min(50, len(train)),))]).values())
+
+    def validate(update: int) -> None:
+        nonlocal least, kept
         if update % every == 0 or update == updates:
             with torch.random.fork_rng():
                 found = score(filter, validation, 0)
             error = found["crps_x"] / SCALE[0] + found["crps_v"] / SCALE[1]
             if error < least:
                 least, kept = error, {name: value.clone() for name, value in filter.state_dict().items()}
+
+    cosine = partial(CosineAnnealingLR, T_max=updates)
+    minimise(filter.parameters(), batch_loss, updates, rate, schedule=cosine, clip=1.0, after=validate)
     filter.load_state_dict(kept)
     return filter
 
@@ -96,7 +97,7 @@ def trained(kind: str, study: Study, draw: int, data: tuple) -> Filter:
     else:
         filter, loss = learned(), partial(DEnKFLoss, sensor=0.0)
     objective = loss(filter, transition=0.0, state_scale=SCALE)
-    return fit(filter, objective, study, study.updates[kind == "LSTM"], 3e-3 if kind == "LSTM" else 1e-2, data)
+    return fit(filter, objective, study.updates[kind == "LSTM"], 3e-3 if kind == "LSTM" else 1e-2, data)
 
 
 def planned(study: Study, test: TensorDict) -> dict[tuple, Callable[[], dict]]:
@@ -104,7 +105,7 @@ def planned(study: Study, test: TensorDict) -> dict[tuple, Callable[[], dict]]:
     told = test.clone().set("sound", torch.full((*test.shape, 1), 1 - SHARE))
     training = recordings(study.training, 100), recordings(study.training // 2, 101)
     jobs: dict[tuple, Callable[[], dict]] = {
-        ("", "truth", "", 0): lambda: scores(*best(test, study.particles).values()),
+        ("", "truth", "", 0): lambda: scores(*best(test, study.particles).values())
     }
     for kind in ("EKF", "UKF", "DEnKF"):
         for update, around in UPDATES.items():
@@ -162,6 +163,5 @@ def main() -> None:
             rows.append({**dict(zip(COLUMNS.names, name, strict=False)), **job()})
             print(rows[-1], flush=True)
             if file is not None:
-                file.parent.mkdir(parents=True, exist_ok=True)
                 COLUMNS.write(rows, file)
-    write_page(page(rows, study), None if study.out is None else study.out / "outliers.md")
+    report(study.out, COLUMNS, rows, page(rows, study), "outliers")

@@ -12,22 +12,22 @@ from torch import Tensor, nn
 from torch_denkf.functional.scores import crps_ensemble
 from torch_denkf.modules import SubModel
 
-__all__ = ["SHARE", "SKIP", "START", "WRONG", "Motion", "ReadingNoise", "SpeedNoise", "best", "recordings"]
+__all__ = ["SHARE", "SKIP", "START", "WRONG", "ReadingNoise", "SpeedNoise", "best", "moved", "recordings"]
 
 DT, STEPS, SKIP = 0.05, 40, 8  # s; steps of a run; steps that are not scored
 SHARE, WRONG = 0.2, 2.0  # of wrong readings, and their standard deviation, m
 START = [0.5, 0.5]  # standard deviations of position, m, and speed, m/s, at the start
 
 
-class Motion(nn.Module):
-    """Dry friction, drag, and a drive; below 0.05 m/s and 1.2 m/s^2 the cart sticks."""
+def moved(driven: Tensor) -> Tensor:
+    """Positions and speeds ``[*, 2]`` a step later than positions, speeds and drives ``[*, 3]``: dry friction and drag.
 
-    def forward(self, driven: Tensor) -> Tensor:
-        """Positions, speeds and drives ``[*, 3]``; positions and speeds ``[*, 2]`` one step later."""
-        x, v, u = driven.unbind(-1)
-        moved = v + DT * (u - 0.8 * v.sign() - 0.1 * v)
-        v = torch.where((v.abs() < 0.05) & (u.abs() < 1.2), 0.0, moved)
-        return torch.stack([x + DT * v, v], -1)
+    Below 0.05 m/s and 1.2 m/s^2 the cart sticks.
+    """
+    x, v, u = driven.unbind(-1)
+    slid = v + DT * (u - 0.8 * v.sign() - 0.1 * v)
+    v = torch.where((v.abs() < 0.05) & (u.abs() < 1.2), 0.0, slid)
+    return torch.stack([x + DT * v, v], -1)
 
 
 def speed_std(speed: Tensor) -> Tensor:
@@ -76,10 +76,10 @@ def drives(runs: int, steps: int, generator: torch.Generator) -> Tensor:
 def recordings(runs: int, seed: int, steps: int = STEPS) -> TensorDict:
     """True states ``[runs, steps, 2]``, drives, and readings, the first of which is at the start."""
     generator = torch.Generator().manual_seed(seed)
-    draw, move = partial(torch.randn, generator=generator), Motion()
+    draw = partial(torch.randn, generator=generator)
     action, states = drives(runs, steps, generator), [torch.tensor(START) * draw(runs, 2)]
     for t in range(steps - 1):
-        state = move(torch.cat([states[-1], action[:, t]], -1))
+        state = moved(torch.cat([states[-1], action[:, t]], -1))
         state[:, 1] += speed_std(states[-1][:, 1]) * draw(runs)
         states.append(state)
     state = torch.stack(states, 1)
@@ -91,14 +91,14 @@ def recordings(runs: int, seed: int, steps: int = STEPS) -> TensorDict:
 
 def best(data: TensorDict, particles: int, kept: int = 2000) -> dict[str, Tensor]:
     """Errors, CRPS and coverage ``[runs, steps, 2]`` of a particle filter with the true model, run by run."""
-    generator, move = torch.Generator().manual_seed(0), Motion()
+    generator = torch.Generator().manual_seed(0)
     draw, found = partial(torch.randn, generator=generator), {"error": [], "crps": [], "held": []}
     for run in data.unbind(0):
         state, rows = torch.tensor(START) * draw(particles, 2), {name: [] for name in found}
         for t in range(len(run)):
             if t:
                 std = speed_std(state[:, 1])
-                state = move(torch.cat([state, run["action"][t - 1].expand(particles, 1)], -1))
+                state = moved(torch.cat([state, run["action"][t - 1].expand(particles, 1)], -1))
                 state[:, 1] += std * draw(particles)
             off, sound = run["reading"][t] - state[:, 0], reading_std(state[:, 0])
             weight = (1 - SHARE) / sound * torch.exp(-0.5 * (off / sound).square())

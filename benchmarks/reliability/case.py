@@ -7,7 +7,6 @@ import json
 import os
 import re
 import resource
-import select
 import shutil
 import signal
 import sys
@@ -73,18 +72,31 @@ class Verdict:
     text: str = ""
 
 
+def forked(work: Callable[[], Any], log: Path | None = None) -> int:
+    """Starts something in a process of its own session, whose output goes to a file; returns its number."""
+    sys.stdout.flush()
+    child = os.fork()
+    if child:
+        return child
+    status = 1
+    try:
+        os.setsid()
+        if log:
+            with log.open("a") as file:
+                os.dup2(file.fileno(), 1)
+                os.dup2(file.fileno(), 2)
+        work()
+        status = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(status)
+
+
 def apart(work: Callable[[], Any]) -> None:
     """Runs something in a forked process: what it imports, compiles or computes with threads stays there."""
-    child = os.fork()
-    if child == 0:
-        status = 1
-        try:
-            work()
-            status = 0
-        finally:
-            sys.stderr.flush()
-            os._exit(status)
-    _, status = os.waitpid(child, 0)
+    _, status = os.waitpid(forked(work), 0)
     if status:
         raise RuntimeError(f"{work} failed; see above")
 
@@ -99,59 +111,36 @@ def workshop() -> Path:
 
 def judge(case: Case) -> Verdict:
     """Runs a case in a forked process, so that neither a crash nor a hang nor what it changes reaches another one."""
-    folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
-    read, write = os.pipe()
-    sys.stdout.flush()
-    child = os.fork()
-    if child == 0:
-        os.close(read)
-        os.setsid()
-        _run(case, folder, write)
-    os.close(write)
-    try:
-        return _listen(case, child, read)
-    finally:
-        os.close(read)
-        shutil.rmtree(folder, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix="fuzz-", ignore_cleanup_errors=True) as root:
+        folder, said = Path(root, "work"), Path(root, "verdict")
+        folder.mkdir()
+        child = forked(lambda: _run(case, folder, said), Path(os.devnull))
+        end, over, status = time.monotonic() + case.within, 0, 0
+        while not over and time.monotonic() < end:
+            time.sleep(0.002)
+            over, status = os.waitpid(child, os.WNOHANG)
+        with suppress(ProcessLookupError):  # its own children, too; it may be gone, or not as far as setsid
+            os.killpg(child, signal.SIGKILL)
+        if not over:
+            os.waitpid(child, 0)
+            return Verdict("hang", f"not over after {case.within:g} s")
+        if said.exists():
+            return Verdict(**json.loads(said.read_text()))
+        code = os.waitstatus_to_exitcode(status)
+        return Verdict("crash", f"ended by {signal.Signals(-code).name if code < 0 else f'exit status {code}'}")
 
 
-def _listen(case: Case, child: int, read: int) -> Verdict:
-    """The child's verdict, or what its end tells."""
-    heard, end, over = b"", time.monotonic() + case.within, False
-    while not over:
-        ready, _, _ = select.select([read], [], [], max(end - time.monotonic(), 0.0))
-        part = os.read(read, 1 << 16) if ready else b""
-        heard += part
-        over = not part
-    late = time.monotonic() >= end
-    with suppress(ProcessLookupError):  # its own children, too; it may be gone, or not as far as setsid
-        os.killpg(child, signal.SIGKILL)
-    _, status = os.waitpid(child, 0)
-    if heard:
-        return Verdict(**json.loads(heard))
-    if late:
-        return Verdict("hang", f"not over after {case.within:g} s")
-    number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
-    return Verdict("crash", f"ended by {signal.Signals(number).name if number else f'exit status {status >> 8}'}")
-
-
-def _run(case: Case, folder: Path, write: int) -> None:
-    """In the child: the case, its verdict into the pipe, and the end of the process."""
-    with open(os.devnull, "w") as nowhere:
-        os.dup2(nowhere.fileno(), 1)
-        os.dup2(nowhere.fileno(), 2)
+def _run(case: Case, folder: Path, said: Path) -> None:
+    """In the child: the case, and its verdict into a file."""
     held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, held + MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     warnings.simplefilter("ignore")
     os.chdir(folder)
-    try:
-        verdict = verdict_on(case, folder)
-        if (folder / MARK).exists():
-            verdict = Verdict("silent", "a hostile file got to run")
-        os.write(write, json.dumps(vars(verdict)).encode())
-    finally:
-        os._exit(0)
+    verdict = verdict_on(case, folder)
+    if (folder / MARK).exists():
+        verdict = Verdict("silent", "a hostile file got to run")
+    said.write_text(json.dumps(vars(verdict)))
 
 
 def verdict_on(case: Case, folder: Path) -> Verdict:

@@ -6,7 +6,7 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from torch import Tensor
 
 NAN, INF = math.nan, math.inf
 Named = st.SearchStrategy[tuple[str, Any]]
+Change = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)
@@ -32,40 +33,36 @@ class Wrong:
     others: Named = st.nothing()  # noqa: RUF009 - it cannot be changed
 
     def __or__(self, more: Wrong | Mapping[str, Any]) -> Wrong:
-        """With further ones."""
-        if isinstance(more, Wrong):
-            return Wrong({**self.named, **more.named}, self.others | more.others)
-        return Wrong({**self.named, **more}, self.others)
-
-    def but(self, *names: str) -> Wrong:
-        """Without those that are not wrong here; none is drawn, as it might be one of them."""
-        return Wrong({name: value for name, value in self.named.items() if name not in names})
+        """Adds further ones."""
+        more = more if isinstance(more, Wrong) else Wrong(more)
+        return Wrong({**self.named, **more.named}, self.others | more.others)
 
     def without(self, *names: str) -> Wrong:
-        """Without those that are not wrong here; others are drawn."""
-        return Wrong({name: value for name, value in self.named.items() if name not in names}, self.others)
+        """Leaves out those that are not wrong here; others are drawn."""
+        return replace(self, named={name: value for name, value in self.named.items() if name not in names})
+
+    def but(self, *names: str) -> Wrong:
+        """Leaves out those that are not wrong here; none is drawn, as it might be one of them."""
+        return Wrong(self.without(*names).named)
 
     def each(self, change: Callable[[Any], Any]) -> Wrong:
-        """With something made of every value."""
-        return Wrong(
-            {name: change(value) for name, value in self.named.items()},
-            self.others.map(lambda other: (other[0], change(other[1]))),
-        )
+        """Makes something of every value."""
+        others = self.others.map(lambda other: (other[0], change(other[1])))
+        return Wrong({name: change(value) for name, value in self.named.items()}, others)
 
     def some(self) -> Named:
-        """Any of them, with its name."""
+        """Draws any of them, with its name."""
         return st.sampled_from(sorted(self.named.items(), key=lambda one: one[0])) | self.others
 
 
 def drawn(values: st.SearchStrategy[Any]) -> Named:
-    """Values under their own names."""
+    """Draws values under their own names."""
     return values.map(lambda value: (_name(value), value))
 
 
-def of(*values: Any, drawn: st.SearchStrategy[Any] | None = None) -> Wrong:
+def of(*values: Any, others: st.SearchStrategy[Any] | None = None) -> Wrong:
     """Returns values under their own names."""
-    others = st.nothing() if drawn is None else drawn.map(lambda value: (_name(value), value))
-    return Wrong({_name(value): value for value in values}, others)
+    return Wrong({_name(value): value for value in values}, st.nothing() if others is None else drawn(others))
 
 
 def _name(value: Any) -> str:
@@ -79,7 +76,7 @@ BELOW = st.floats(max_value=-1e-30)
 NO_COUNT = st.integers(max_value=-1) | st.floats(0.01, 0.99).map(lambda part: 3 + part)
 
 POSITIVE = Wrong({"zero": 0.0, "negative": -1.0, "nan": NAN, "inf": INF, **TEXT}, drawn(BELOW | st.just(-0.0)))
-NOT_NEGATIVE = Wrong({"negative": -1.0, "nan": NAN, "inf": INF, **TEXT}, drawn(BELOW))
+NOT_NEGATIVE = POSITIVE.but("zero") | Wrong({}, drawn(BELOW))
 FINITE = Wrong({"nan": NAN, "inf": INF, **TEXT}, drawn(st.just(-INF)))
 SHARE = Wrong(
     {"negative": -0.1, "beyond one": 1.5, "nan": NAN, "inf": INF, **TEXT}, drawn(BELOW | st.floats(min_value=1.001))
@@ -87,23 +84,18 @@ SHARE = Wrong(
 RATE = SHARE | {"one": 1.0, "too small for eight bits": 0.001}
 COUNT = Wrong({"zero": 0, "negative": -3, "fraction": 2.5, **TEXT}, drawn(NO_COUNT))
 LARGE_COUNT = COUNT | {"one": 1}
-COUNT_OR_NONE = Wrong({"negative": -3, "fraction": 2.5, **TEXT}, drawn(NO_COUNT))
+COUNT_OR_NONE = COUNT.without("zero")
 CHOICE = Wrong({"unknown": "sideways", "a number": 3, "empty": ""}, drawn(st.text("xyz?", min_size=1)))
 MODULE = Wrong({"nothing": None, "text": "network"}, drawn(st.integers() | st.binary(max_size=4)))
-SIZE = Wrong(
-    {"zero": (0, 10), "negative": (-4, 10), "one number": (10,), "text": "ab"},
-    drawn(st.tuples(st.integers(max_value=0), st.integers(1, 20))),
-)
-CELLS = Wrong(
-    {"zero": (0,), "negative": (-4,), "fraction": (2.5,), "text": "wide"}, drawn(st.tuples(st.just(4), NO_COUNT))
-)
+PAIRS = st.tuples(st.integers(max_value=0), st.integers(1, 20))
+SIZE = of((0, 10), (-4, 10), (10,), "ab", others=PAIRS)
+CELLS = of((0,), (-4,), (2.5,), "wide", others=st.tuples(st.just(4), NO_COUNT))
 
 
 def indices(size: int) -> Wrong:
     """Indices of components, none of which fits ``size`` of them."""
     beyond = st.integers(min_value=size, max_value=99) | st.integers(-99, -size - 1)
-    named = {"beyond the end": [size], "far before the start": [-size - 1], "fraction": [0.5], "text": ["x"]}
-    return Wrong(named, drawn(beyond.map(lambda index: [0, index])))
+    return of([size], [-size - 1], [0.5], ["x"], others=beyond.map(lambda index: [0, index]))
 
 
 def dims(size: int) -> Wrong:
@@ -119,7 +111,7 @@ def vector(size: int, *, positive: bool = False, negative: bool = True, length: 
         out[place] = last
         return out
 
-    bad, named = st.sampled_from([NAN, -INF]), {"nan": of(NAN), "inf": of(INF), "text": "much"}
+    bad, named = st.sampled_from([NAN, -INF]), {"nan": of(NAN), "inf": of(INF), "complex": of(1 + 0.5j), **TEXT}
     if length:
         named |= {"too long": [1.0] * (size + 1), "a matrix": torch.ones(size, size + 1)}
     if not negative or positive:
@@ -129,51 +121,67 @@ def vector(size: int, *, positive: bool = False, negative: bool = True, length: 
     return Wrong(named, drawn(st.builds(of, bad, st.integers(0, size - 1))))
 
 
-def _with(made: Tensor, place: tuple[int, int], value: float) -> Tensor:
-    out = made.clone()
-    out[place] = value
-    return out
+# -------------------------------------------------------------------------------------------------------- arrays
+
+
+def spoiled(place: Any, value: Any) -> Change:
+    """Puts a value into a copy of an array or a tensor; a fraction is a place along all of its numbers."""
+
+    def change(array: Any) -> Any:
+        out = array.clone() if isinstance(array, Tensor) else array.copy()
+        flat = out.reshape(-1) if isinstance(place, float) else out
+        flat[int(place * (len(flat) - 1)) if isinstance(place, float) else place] = value
+        return flat.reshape(array.shape)
+
+    return change
+
+
+def broken(*at: int, places: st.SearchStrategy[tuple[int, ...]]) -> Wrong:
+    """NaN and infinity in an element ``at`` of an array, in all of it, and in drawn places."""
+    others = st.tuples(places | st.just(at), st.sampled_from([NAN, INF, -INF]))
+    return Wrong({"a NaN": ((*at, 0), NAN), "inf": ((*at, -1), INF)}, drawn(others)).each(lambda one: spoiled(*one))
+
+
+MISSING = object()
+#: Shapes that an entry ``[..., D]`` does not have.
+SHAPES = Wrong(
+    {
+        "missing": MISSING,
+        "too wide": lambda value: torch.cat([value, value[..., :1]], -1),
+        "too narrow": lambda value: value[..., :-1],
+        "without its last dimension": lambda value: value[..., 0],
+        "a dimension more": lambda value: value[..., None].expand(*value.shape, 3),
+    }
+)
 
 
 def matrix(rows: int, columns: int) -> Wrong:
     """Matrices that are none of ``rows`` by ``columns`` finite numbers."""
     eye = torch.eye(rows, columns)
     places = st.tuples(st.integers(0, rows - 1), st.integers(0, columns - 1))
-    return Wrong(
-        {
-            "nan": _with(eye, (0, -1), NAN),
-            "inf": _with(eye, (-1, 0), INF),
-            "a row more": torch.eye(rows + 1, columns),
-            "a column more": torch.eye(rows, columns + 1),
-            "a vector": torch.ones(columns + 1),
-            "three dimensions": torch.ones(2, rows, columns),
-            "text": "much",
-        },
-        drawn(st.builds(_with, st.just(eye), places, st.sampled_from([NAN, INF, -INF]))),
-    )
+    numbers = broken(0, places=places).each(lambda change: change(eye))
+    sizes = {"a row more": (rows + 1, columns), "a column more": (rows, columns + 1), "a vector": (columns + 1,)}
+    sizes["three dimensions"] = (2, rows, columns)
+    return numbers | {what: torch.ones(size) for what, size in sizes.items()} | {"complex": (1 + 0.5j) * eye, **TEXT}
 
 
 def covariance(size: int) -> Wrong:
     """Matrices that are no covariance of ``size`` components."""
-    eye = torch.eye(size)
+    eye, ones = torch.eye(size), torch.ones(size, size)
     return matrix(size, size) | {
-        "not symmetric": _with(eye, (0, -1), 0.5),
-        "negative variance": _with(eye, (-1, -1), -1.0),
-        "indefinite": 1.5 * torch.ones(size, size) - eye,
-        "zero beside a correlation": 0.1 * torch.ones(size, size) * (1 - eye) + eye * (torch.arange(size) > 0),
+        "not symmetric": spoiled((0, -1), 0.5)(eye),
+        "negative variance": spoiled((-1, -1), -1.0)(eye),
+        "indefinite": 1.5 * ones - eye,
+        "zero beside a correlation": spoiled((0, 0), 0.0)(0.1 * ones + 0.9 * eye),
     }
 
 
 # --------------------------------------------------------------------------------------------------------- files
 
-Change = Callable[[Any], Any]
-
 
 def copied(sound: Path, folder: Path) -> Path:
     """A copy of a folder that a case may damage."""
-    target = folder / sound.name
-    shutil.copytree(sound, target, symlinks=True)
-    return target
+    return Path(shutil.copytree(sound, folder / sound.name, symlinks=True))
 
 
 def gone(file: Path) -> None:
@@ -194,7 +202,14 @@ def instead(make: Change) -> Change:
     return lambda file: (gone(file), make(file))
 
 
+def renamed(name: str) -> Change:
+    """Gives a file another name."""
+    return lambda file: file.rename(file.with_name(name))
+
+
 def flipped(at: float, mask: int = 0xFF) -> Callable[[bytes], bytes]:
+    """Flips bits of the byte at a fraction of the file."""
+
     def flip(data: bytes) -> bytes:
         place = min(int(at * len(data)), len(data) - 1)
         return data[:place] + bytes([data[place] ^ mask]) + data[place + 1 :]
@@ -202,12 +217,8 @@ def flipped(at: float, mask: int = 0xFF) -> Callable[[bytes], bytes]:
     return flip
 
 
-def _cut(at: float) -> Callable[[bytes], bytes]:
-    return lambda data: data[: int(at * len(data))]
-
-
-#: What happens to a file's bytes.
-BYTES = Wrong(
+#: What happens to the bytes of a file whose format tells no flipped byte.
+CUT = Wrong(
     {
         "empty": lambda data: b"",
         "cut in half": lambda data: data[: len(data) // 2],
@@ -216,18 +227,20 @@ BYTES = Wrong(
         "zeros behind": lambda data: data[: len(data) // 2] + bytes(len(data) - len(data) // 2),
         "not UTF-8": lambda data: b"\xff\xfe\x80" + data,
         "another format": lambda data: b"GIF89a" + data[6:],
-        "a byte flipped at the start": flipped(0.0),
-        "a byte flipped in the middle": flipped(0.5),
-        "a byte flipped near the end": flipped(0.95),
-    },
+    }
+).each(written)
+FLIPPED = Wrong(
+    {f"a byte flipped at {at}": flipped(at) for at in (0.0, 0.5, 0.95)},
     st.floats(0.0, 0.99).map(lambda at: (f"a high bit flipped at {at}", flipped(at, 0x80))),
-)
+).each(written)
+#: What happens to a file's bytes.
+BYTES = CUT | FLIPPED
 #: Damage of files whose format or checksum tells every cut and every bit.
-SEALED = Wrong(
-    BYTES.named,
-    st.floats(0.0, 0.99).map(lambda at: (f"cut at {at}", _cut(at)))
+SEALED = BYTES.but() | Wrong(
+    {},
+    st.floats(0.0, 0.99).map(lambda at: (f"cut at {at}", written(lambda data: data[: int(at * len(data))])))
     | st.tuples(st.floats(0.0, 0.99), st.integers(0, 7)).map(
-        lambda place: (f"bit {place[1]} flipped at {place[0]}", flipped(place[0], 1 << place[1]))
+        lambda place: (f"bit {place[1]} flipped at {place[0]}", written(flipped(place[0], 1 << place[1])))
     ),
 )
 #: What stands in a file's place.
@@ -241,17 +254,23 @@ PLACES = Wrong(
         "a pipe": instead(os.mkfifo),
     }
 )
+#: Ways for a file not to be there.
+NOTHING = PLACES.but("a folder", "a link to a device", "a pipe")
 #: All that happens to a file.
-FILE = BYTES.each(written) | PLACES
+FILE = BYTES | PLACES
 
 
 # ----------------------------------------------------------------------------------------------- what has entries
 
-MISSING = object()
 
+def put(path: Any, value: Any) -> Change:
+    """Puts a value into nested entries, or takes it away; of a function, what it makes of the value.
 
-def put(path: tuple[Any, ...], value: Any) -> Change:
-    """Puts a value into nested dictionaries, or takes it away; of a function, what it makes of the value."""
+    Args:
+        path: keys and numbers; a single one may stand alone.
+        value: the value, a function of the old one, or ``MISSING``.
+    """
+    path = path if isinstance(path, tuple) else (path,)
 
     def change(content: Any) -> None:
         for name in path[:-1]:
@@ -263,26 +282,6 @@ def put(path: tuple[Any, ...], value: Any) -> Change:
             content[path[-1]] = changed
 
     return change
-
-
-def fields(wrong: Mapping[Any, Wrong], *, missing: bool = True) -> Wrong:
-    """Changes of what has entries: wrong values of some, and without them.
-
-    Args:
-        wrong: by key, or by path of keys.
-        missing: whether each is also taken away.
-    """
-    out = Wrong({})
-    for key, values in wrong.items():
-        path = key if isinstance(key, tuple) else (key,)
-        name = "/".join(path)
-        values |= {"missing": MISSING} if missing else {}
-        changes = values.each(lambda value, path=path: put(path, value))
-        out |= Wrong(
-            {f"{name} {what}": change for what, change in changes.named.items()},
-            changes.others.map(lambda one, name=name: (f"{name} {one[0]}", one[1])),
-        )
-    return out
 
 
 # --------------------------------------------------------------------------------------------------- comparisons
@@ -307,10 +306,10 @@ def finite(result: Any) -> bool:
 
 
 def same(result: Any, expected: Any, *, rtol: float = 0.0, atol: float = 0.0) -> bool:
-    """Tells whether two results have the same entries, with the same numbers."""
+    """Tells whether two results have the same entries of the same types, with the same numbers."""
     one, other = leaves(result), leaves(expected)
     return one.keys() == other.keys() and all(
-        one[key].shape == other[key].shape
+        (one[key].shape, one[key].dtype) == (other[key].shape, other[key].dtype)
         and torch.allclose(one[key].double(), other[key].double(), rtol=rtol, atol=atol, equal_nan=False)
         for key in one
     )

@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -21,27 +22,8 @@ from benchmarks.reliability.case import Case, Verdict, judge
 from benchmarks.reliability.target import Target
 
 #: Modules of tests/borders, whose cases the tests run, too; then those of benchmarks/reliability/borders.
-TESTED = ("filters_made", "sub_models")
-BORDERS = (
-    *TESTED,
-    "filters_fed",
-    "spaces",
-    "noises",
-    "smoothers",
-    "kitti",
-    "lerobot",
-    "ur5",
-    "recordings",
-    "logs",
-    "corners",
-    "caches",
-    "checkpoints",
-    "packages",
-    "pretrained",
-    "commands",
-    "around",
-    "legged",
-)
+TESTED = ("filters_made", "sub_models", "around_filters", "of_files")
+BORDERS = (*TESTED, "arrays", "recorded", "logs", "models", "legged", "commands")
 KINDS = ("clear", "right", "unclear", "silent", "hang", "crash")
 GOOD = KINDS[:2]
 RESULTS = Path(__file__).parent / "results"
@@ -117,44 +99,37 @@ def told(rows: Sequence[Row]) -> None:
             print(f"  again: python -m benchmarks.reliability fuzz {one['again']}", flush=True)
 
 
-def side_by_side(works: Sequence[Callable[[], list[Row]]], processes: int) -> list[Row]:
-    """The rows of all works, each of which goes to the first process that is free."""
-    rows: list[Row] = []
-    context, at = multiprocessing.get_context("fork"), time.monotonic()
-    with context.Pool(processes, _take, (works,)) as pool:
-        for number, some in enumerate(pool.imap(_work, range(len(works))), start=1):
-            rows += some
-            told(some)
-            if time.monotonic() - at > 10:
-                counts = dict(Counter(one["kind"] for one in rows))
-                print(f"{number} of {len(works)}: {counts}", flush=True)
-                at = time.monotonic()
-    return rows
-
-
-_WORKS: list[Callable[[], list[Row]]] = []  # of this process, which has them from its parent
-
-
-def _take(works: Sequence[Callable[[], list[Row]]]) -> None:
-    _WORKS[:] = works
+_WORKS: list[Callable[[], list[Row]]] = []  # which forked processes have from their parent
 
 
 def _work(number: int) -> list[Row]:
     return _WORKS[number]()
 
 
+def side_by_side(works: Sequence[Callable[[], list[Row]]], processes: int) -> list[Row]:
+    """The rows of all works, each of which goes to the first process that is free."""
+    rows: list[Row] = []
+    _WORKS[:], at = works, time.monotonic()
+    with multiprocessing.get_context("fork").Pool(processes) as pool:
+        for number, some in enumerate(pool.imap(_work, range(len(works))), start=1):
+            rows += some
+            told(some)
+            if time.monotonic() - at > 10:
+                print(f"{number} of {len(works)}: {dict(Counter(one['kind'] for one in rows))}", flush=True)
+                at = time.monotonic()
+    return rows
+
+
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """Counts of all, by border, and the cases that are neither clear nor right."""
 
-    def counts(kinds: Sequence[str]) -> dict[str, int]:
-        return {"records": len(kinds), **{kind: kinds.count(kind) for kind in KINDS}}
+    def counts(some: Sequence[Row]) -> dict[str, int]:
+        kinds = Counter(one["kind"] for one in some)
+        return {"records": len(some), **{kind: kinds[kind] for kind in KINDS}}
 
-    borders: dict[str, list[str]] = {}
-    for one in rows:
-        borders.setdefault(one["border"], []).append(one["kind"])
-    wrong = [one for one in rows if one["kind"] not in GOOD]
-    everything = counts([one["kind"] for one in rows])
-    return {**everything, "borders": {name: counts(kinds) for name, kinds in borders.items()}, "wrong": wrong}
+    names = dict.fromkeys(one["border"] for one in rows)
+    borders = {name: counts([one for one in rows if one["border"] == name]) for name in names}
+    return {**counts(rows), "borders": borders, "wrong": [one for one in rows if one["kind"] not in GOOD]}
 
 
 def table(found: dict[str, Any]) -> str:
@@ -165,21 +140,14 @@ def table(found: dict[str, Any]) -> str:
 
 
 def sampled(targets: Sequence[Target], count: int, seed: int) -> list[Callable[[], list[Row]]]:
-    """Works that draw so many cases, of each border its share, at least one; none that takes long to prepare."""
-    borders: dict[str, list[Target]] = {}
-    for target in targets:
-        if not target.slow:
-            borders.setdefault(target.border, []).append(target)
-    sizes = {border: sum(len(target.wrong.named) for target in some) for border, some in borders.items()}
-    return [
-        lambda some=some, border=border: search(
-            st.sampled_from(some).flatmap(Target.some),
-            max(1, round(count * sizes[border] / sum(sizes.values()))),
-            seed,
-            f"--sample {count} --seed {seed} --match {border!r}",
-        )
-        for border, some in borders.items()
-    ]
+    """Works that draw so many cases, of each border its share, at least one."""
+
+    def work(border: str) -> list[Row]:
+        some = [target for target in targets if target.border == border]
+        share, words = max(1, round(count * len(some) / len(targets))), f"--sample {count} --seed {seed}"
+        return search(st.sampled_from(some).flatmap(Target.some), share, seed, f"{words} --match {border!r}")
+
+    return [partial(work, border) for border in dict.fromkeys(target.border for target in targets)]
 
 
 @dataclass(frozen=True)
@@ -199,16 +167,13 @@ class Fuzz:
     def __call__(self) -> None:
         """Runs the suite."""
         began = time.time()
-        targets = [target.matching(self.match) for target in all_targets(self.borders)]
-        targets = [target for target in targets if target.wrong.named]
         sample = self.sample or (20 if self.smoke else 0)
-        slow = {target.needs for target in targets if target.needs and not (sample and target.slow)}
-        for needs in slow:
+        targets = [target.matching(self.match) for target in all_targets(self.borders)]
+        targets = [target for target in targets if target.wrong.named and not (sample and target.slow)]
+        for needs in {target.needs for target in targets if target.needs}:
             needs()  # once for all
-        if sample:
-            works = sampled(targets, sample, self.seed)
-        else:
-            works = [lambda target=target: attacked(target, self.drawn, self.seed) for target in targets]
+        whole = [partial(attacked, target, self.drawn, self.seed) for target in targets]
+        works = sampled(targets, sample, self.seed) if sample else whole
         found = summary(side_by_side(works, self.processes))
         found["seconds"] = round(time.time() - began)
         print(table(found))

@@ -6,7 +6,7 @@ import io
 import os
 import pickle
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -40,34 +40,37 @@ class Bomb:
 @cache
 def npz_of_zeros(size: int) -> bytes:
     """A small archive with an array of so many bytes."""
-    buffer, head = io.BytesIO(), io.BytesIO()
-    np.lib.format.write_array_header_1_0(head, {"descr": "|u1", "fortran_order": False, "shape": (size,)})
-    with (
-        zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive,
-        archive.open("pixels.npy", "w", force_zip64=True) as out,
-    ):
-        out.write(head.getvalue())
-        for _ in range(size >> 20):
-            out.write(bytes(1 << 20))
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, pixels=np.zeros(size, np.uint8))
     return buffer.getvalue()
+
+
+def archive(members: Mapping[str, str | bytes]) -> Callable[[Path], None]:
+    """Writes an archive of these members."""
+
+    def write(file: Path) -> None:
+        with zipfile.ZipFile(file, "w") as out:
+            for name, content in members.items():
+                out.writestr(name, content)
+
+    return write
+
+
+def members_of(file: Path | io.BytesIO) -> dict[str, bytes]:
+    """Returns the members of an archive."""
+    with zipfile.ZipFile(file) as stored:
+        return {name: stored.read(name) for name in stored.namelist()}
 
 
 def _saved(content: Any) -> Callable[[Path], None]:
     return lambda file: torch.save(content, file)
 
 
-def _zip(file: Path) -> None:
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("readme.txt", "hello")
-
-
 def _pickle_in_zip(file: Path) -> None:
     """Torch's layout, with a pickle of somebody else's."""
-    buffer = io.BytesIO()
-    torch.save({"format": "torch_denkf.training/1"}, buffer)
-    with zipfile.ZipFile(buffer) as archive, zipfile.ZipFile(file, "w") as out:
-        for name in archive.namelist():
-            out.writestr(name, Bomb.pickled() if name.endswith("data.pkl") else archive.read(name))
+    torch.save({"format": "torch_denkf.training/1"}, buffer := io.BytesIO())
+    members = members_of(buffer)
+    archive(members | {name: Bomb.pickled() for name in members if name.endswith("data.pkl")})(file)
 
 
 #: What writes a file in the place of weights.
@@ -76,7 +79,7 @@ PICKLES: dict[str, Callable[[Path], Any]] = {
     "torch's pickle of code": _saved(Bomb()),
     "torch's pickle of code, nested": _saved({"format": "torch_denkf.training/1", "model": {"a": Bomb()}}),
     "a pickle in torch's archive": _pickle_in_zip,
-    "another archive": _zip,
+    "another archive": archive({"readme.txt": "hello"}),
     "an archive that unpacks to a gigabyte": lambda file: file.write_bytes(npz_of_zeros(1 << 30)),
     "a whole module": _saved(torch.nn.Linear(2, 2)),
     "a list": _saved([1, 2]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -81,54 +82,74 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Folder:
-    """A folder, or a file, that is right, and how it is read.
+class Source:
+    """Something that is right, a folder or entries, and how it is read; damage is done to a copy.
 
     Args:
         border: of its targets.
         sound: makes it.
-        read: reads it; a damaged one is a copy.
+        read: reads it.
+        name: begins the names of its targets.
     """
 
     border: str
-    sound: Callable[[], Path]
+    sound: Callable[[], Any]
     read: Callable[..., Any]
+    name: str = ""
+
+    def damaged(self, change: d.Change, folder: Path | None = None, file: str = "", **options: Any) -> Any:
+        """Returns what a user reads of a changed copy.
+
+        Args:
+            change: of entries, or of a file; what it returns takes the place of entries, if that is anything.
+            folder: for the copy; by default one in the working folder.
+            file: the file in the folder that is changed, by default the folder itself.
+            **options: of what reads it.
+        """
+        whole = self.sound()
+        if isinstance(whole, Path):
+            whole = d.copied(whole, folder or Path(tempfile.mkdtemp(dir=".")))
+            change(whole / file)
+            return self.read(whole, **options)
+        whole = whole.copy()
+        changed = change(whole)
+        return self.read(whole if changed is None else changed, **options)
 
     def reference(self, **options: Any) -> Any:
         """Returns what is read without damage, once for all."""
         return _reference(self, tuple(options.items()))
 
-    def equal(self, result: Any, **options: Any) -> bool:
-        """Tells whether a result is that."""
-        return d.same(result, self.reference(**options))
+    def like(self, change: d.Change | None = None, near: float = 0.0, **options: Any) -> Callable[[Any], bool]:
+        """Right where a result is that of another change, by default of none; NaN never is."""
 
-    def damaged(self, change: d.Change, folder: Path, file: str = "", **options: Any) -> Any:
-        """Returns what a user reads of a changed copy."""
-        root = d.copied(self.sound(), folder)
-        change(root / file)
-        return self.read(root, **options)
+        def right(result: Any) -> bool:
+            expected = self.damaged(change, **options) if change else self.reference(**options)
+            return d.same(result, expected, rtol=near, atol=near)
+
+        return right
 
     def target(
         self,
         name: str,
-        wrong: d.Wrong | Mapping[str, d.Change],
+        wrong: d.Wrong | Mapping[str, d.Change] | d.Change,
         right: Right = None,
         words: str | tuple[str, ...] = (),
         file: str = "",
         options: Mapping[str, Any] | None = None,
         **more: Any,
     ) -> Target:
-        """A target whose wrong values are changes of the folder, or of a file in it."""
+        """A target whose wrong values are changes of it, or of a file in it; maybe of a single one."""
         words = (words,) if isinstance(words, str) else words
-        words = words or (Path(file).name,)
+        wrong = {"damaged": wrong} if callable(wrong) else wrong
         wrong = wrong if isinstance(wrong, d.Wrong) else d.Wrong(wrong)
         act = lambda change, folder: self.damaged(change, folder, file, **(options or {}))  # noqa: E731
-        return Target(self.border, name, words, act, wrong, right, **{"needs": self.sound, **more})
+        more = {"needs": self.sound, **more}
+        return Target(self.border, f"{self.name}{name}", words or (Path(file).name,), act, wrong, right, **more)
 
     def document(
         self,
         file: str,
-        right: Right,
+        right: Right = None,
         words: tuple[str, ...] = (),
         *,
         skip: Callable[[Place], bool] = lambda place: False,
@@ -154,34 +175,25 @@ class Folder:
             if not skip(place):
                 wrong = form.wrong(place, leaf).without(*but)
                 changes = wrong.each(lambda value, at=place: then(edited(d.put(at, value))))
-                named, name = tuple(map(str, place)), f"{root.name}/{file}"
-                yield self.target(
-                    f"{name}, {'/'.join(named)}",
-                    changes,
-                    right if loose(place) else None,
-                    (Path(file).name, *named, *words),
-                    file,
-                    **more,
-                )
+                named, judge = tuple(map(str, place)), right if loose(place) else None
+                said = (Path(file).name, *named, *words)
+                yield self.target(f"{root.name}/{file}, {'/'.join(named)}", changes, judge, said, file, **more)
 
     def arguments(self, name: str, **more: Any) -> Subject:
         """Returns what it is read with, as arguments of something by this name."""
         return Subject(lambda **given: self.read(self.sound(), **given), name=name, **more)
 
-    def one(self, name: str, change: d.Change, words: str | tuple[str, ...], **more: Any) -> Target:
-        """A target with one change."""
-        return self.target(name, {"damaged": change}, words=words, **more)
-
 
 @cache
-def _reference(folder: Folder, options: tuple[tuple[str, Any], ...]) -> Any:
-    return folder.read(folder.sound(), **dict(options))
+def _reference(source: Source, options: tuple[tuple[str, Any], ...]) -> Any:
+    whole = source.sound()
+    return source.read(whole if isinstance(whole, Path) else whole.copy(), **dict(options))
 
 
 #: Wrong values of arguments, by their annotation.
 OF_KINDS: dict[str, d.Wrong] = {
     "NestedKey": d.Wrong(
-        {"a number": 5, "empty": "", "an empty tuple": (), "numbers": ("info", 3), "a list": ["info"]},
+        {"a number": 5, "empty": "", "an empty tuple": (), "numbers": ("info", 3), "a list": ["info"]}
     ),
     "Sequence[NestedKey]": d.Wrong({"one key": "action", "a number": 5, "numbers": [1, 2]}),
     "bool": d.Wrong({"text": "yes", "a number": 2, "nothing": None}),

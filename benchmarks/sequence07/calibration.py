@@ -9,13 +9,17 @@ filter's noises, by the likelihood of its readings. ``... calibration noises`` f
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torch.optim.lr_scheduler import ExponentialLR
 
+from benchmarks.common.descent import minimise
 from benchmarks.sequence07.chosen import CAMERA, CORNERS, FILTER
 from benchmarks.sequence07.filters import car_filter, prepared
 from benchmarks.sequence07.task import calibrated, drive, readings
@@ -58,16 +62,15 @@ def lens(folder: Path = FOLDER, updates: int = 100) -> None:
     plain = torch.cat([torch.zeros(10), noise])
     scale = torch.cat([torch.tensor([0.001, 0.01, 0.01, 0.1, 0.1, 0.2, 0.5, 0.5, 1.0, 2.0]), torch.full((10,), 0.3)])
     away = torch.zeros(20, requires_grad=True)
-    optimiser = torch.optim.Adam([away], lr=0.1)
-    for update in range(updates):
-        value, motion = corner_likelihood(plain + scale * away, rows[::2], found.camera, start[::2], 2, memory=False)
-        optimiser.zero_grad()
-        (-value).backward()
-        optimiser.step()
-        optimiser.param_groups[0]["lr"] *= 0.985
+
+    def loss() -> Tensor:
+        value, motion = corner_likelihood(
+            plain + scale * away, rows[::2], found.camera, start[::2].clone(), 2, memory=False
+        )
         start[::2] = motion.detach()
-        if update % 20 == 0:
-            print(update, f"{value.item():.4f}", flush=True)
+        return -value
+
+    minimise([away], loss, updates, 0.1, schedule=partial(ExponentialLR, gamma=0.985))
     values = (plain + scale * away).detach()
     with torch.no_grad():
         odd = rows[1::2], found.camera, start[1::2], 8, False
@@ -78,6 +81,34 @@ def lens(folder: Path = FOLDER, updates: int = 100) -> None:
     print(f"odd rows {after:.4f}, with KITTI's lens {before:.4f}")
 
 
+def searched(score: Callable[[Tensor], Tensor], values: Tensor, step: float, least: float, rounds: int) -> Tensor:
+    """Maximises by steps: each number up and down by itself, then all that helped together; others' steps are halved.
+
+    Args:
+        score: of several choices ``[B, N]``: ``[B]``.
+        values: where to start, ``[N]``.
+        step: of each number at first; ends where all are an eighth of it.
+        least: gain that counts as help.
+        rounds: at most.
+    """
+    steps = torch.full_like(values, step)
+    for number in range(rounds):
+        moves = torch.cat([torch.zeros(1, len(values)), torch.diag(steps), -torch.diag(steps)])
+        scores = score(values + moves)
+        up, down = (scores[1:] - scores[0]).unflatten(0, (2, -1))
+        better = torch.maximum(up, down) > least
+        move = torch.where(better, torch.where(up > down, 1, -1) * steps, 0)
+        steps = torch.where(better, steps, steps / 2)
+        together = torch.stack([values + share * move for share in (0.0, 0.3, 0.6, 1.0)])
+        options = torch.cat([together, (values + moves)[scores.argmax()].unsqueeze(0)])
+        after = score(options)
+        values = options[after.argmax()]
+        print(number, f"{after.max().item():.4f}", flush=True)
+        if steps.max() < step / 8:
+            break
+    return values
+
+
 @torch.no_grad()
 def corners(folder: Path = FOLDER, rounds: int = 8, rows: int = 400) -> None:
     """The corners' noise, with what corners have shown before: found on the first rows, checked on the others."""
@@ -86,8 +117,6 @@ def corners(folder: Path = FOLDER, rounds: int = 8, rows: int = 400) -> None:
     before, after = (camera.corners(found.rows["corners"][:, :, row]) for row in (0, 1))
     start, _ = started_by_ransac(before, after, found.rows["seen"], camera)
     fixed = torch.tensor([*CAMERA["radial"], *CAMERA["disparity_offset"]])
-    names, values = list(CORNERS), torch.tensor(list(CORNERS.values())).log()
-    steps = torch.full((len(names),), 0.3)
 
     def scores(tried: Tensor, part: slice) -> Tensor:
         def one(noise: Tensor) -> Tensor:
@@ -95,21 +124,9 @@ def corners(folder: Path = FOLDER, rounds: int = 8, rows: int = 400) -> None:
 
         return torch.func.vmap(one)(tried).nan_to_num(-torch.inf)
 
-    for number in range(rounds):
-        moves = torch.cat([torch.zeros(1, len(names)), torch.diag(steps), -torch.diag(steps)])
-        score = scores(values + moves, slice(0, rows))
-        up, down = (score[1:] - score[0]).unflatten(0, (2, -1))
-        better = torch.maximum(up, down) > 1e-4
-        steps, move = (
-            torch.where(better, steps, steps / 2),
-            torch.where(better, torch.where(up > down, 1, -1) * steps, 0),
-        )
-        options = torch.stack([values, values + 0.3 * move, values + 0.6 * move, values + move])
-        options = torch.cat([options, (values + moves)[score.argmax()].unsqueeze(0)])
-        after = scores(options, slice(0, rows))
-        values = options[after.argmax()]
-        noise = {name: round(value, 4) for name, value in zip(names, values.exp().tolist(), strict=True)}
-        print(number, f"{after.max().item():.4f}", noise, flush=True)
+    values = torch.tensor(list(CORNERS.values())).log()
+    values = searched(partial(scores, part=slice(0, rows)), values, 0.3, 1e-4, rounds)
+    print({name: round(value, 4) for name, value in zip(CORNERS, values.exp().tolist(), strict=True)})
     print(f"other rows {scores(values.unsqueeze(0), slice(rows, None)).item():.4f}")
 
 
@@ -162,47 +179,23 @@ def other_lens(folder: Path = FOLDER) -> None:
 
 
 @torch.no_grad()
-def filter_likelihoods(tried: list[dict], data: TensorDict, skip: int = 20) -> Tensor:
-    """Log-likelihood of all readings ``[T]`` under the extended Kalman filter, for each of several choices ``[B]``."""
-    data = data.expand(len(tried), *data.shape).contiguous()
-    together = {name: torch.tensor([values[name] for values in tried], dtype=torch.float64) for name in tried[0]}
-    out = car_filter("EKF").sequence(prepared(data, together), keep=[("info", "log_likelihood")])
-    return out["info", "log_likelihood"][:, skip:].sum((1, 2)).nan_to_num(-torch.inf)
-
-
 def noises(folder: Path = FOLDER, rounds: int = 14) -> None:
-    """The filter's noises: each number a step up and down at once, then all steps that helped, together."""
-    found, best, data = dict(FILTER), -torch.inf, readings(folder, "0022")[0]
-    steps = dict.fromkeys(found, 0.8)
+    """The filter's noises, by the log-likelihood of all readings but the first under the extended Kalman filter."""
+    data, lost = readings(folder, "0022")[0], torch.tensor([name.startswith("kept") for name in FILTER])
+    start = torch.tensor(list(FILTER.values()))
 
-    def moved(values: dict, name: str, step: float) -> dict:
-        if name.startswith("kept"):  # on the scale of what is lost
-            odds = max(1 - values[name], 1e-3) * 2.0**step
-            return {**values, name: max(0.0, 1 - odds)}
-        return {**values, name: values[name] * 2.0**step}
+    def numbers(logs: Tensor) -> Tensor:
+        """Shares that are kept are searched on the scale of what is lost."""
+        return torch.where(lost, (1 - 2.0**logs).clamp(0, 0.999), 2.0**logs)
 
-    for number in range(rounds):
-        tried = [dict(found)] + [moved(found, name, sign * steps[name]) for name in found for sign in (1, -1)]
-        scores = filter_likelihoods(tried, data)
-        gains = (scores[1:] - scores[0]).reshape(-1, 2)
-        together = {}
-        for name, (up, down) in zip(found, gains.tolist(), strict=True):
-            if max(up, down) > 0.05:
-                together[name] = steps[name] if up > down else -steps[name]
-            else:
-                steps[name] /= 2
-        options = []
-        for share in (1.0, 0.6, 0.3):
-            values = dict(found)
-            for name, step in together.items():
-                values = moved(values, name, share * step)
-            options.append(values)
-        options.append(tried[int(scores.argmax())])
-        after = filter_likelihoods(options, data)
-        best, found = after.max().item(), options[int(after.argmax())]
-        print(number, f"{best:.1f}", {name: round(value, 6) for name, value in found.items()}, flush=True)
-        if max(steps.values()) < 0.1:
-            break
+    def likelihoods(tried: Tensor) -> Tensor:
+        several = data.expand(len(tried), *data.shape).contiguous()
+        choices = dict(zip(FILTER, numbers(tried).unbind(-1), strict=True))
+        out = car_filter("EKF").sequence(prepared(several, choices), keep=[("info", "log_likelihood")])
+        return out["info", "log_likelihood"][:, 20:].sum((1, 2)).nan_to_num(-torch.inf)
+
+    found = searched(likelihoods, torch.where(lost, 1 - start, start).log2(), 0.8, 0.05, rounds)
+    print({name: round(value, 6) for name, value in zip(FILTER, numbers(found).tolist(), strict=True)})
 
 
 if __name__ == "__main__":

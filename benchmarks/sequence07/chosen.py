@@ -4,10 +4,7 @@
 """
 
 #: What the lens's rectification has left, and what disparities are short of in pixels: by the likelihood of corners.
-CAMERA = {
-    "radial": (0.004, 0.0256, -0.0099),
-    "disparity_offset": (0.38, 0.382, 0.371, 0.659, -2.033, -3.549, 2.889),
-}
+CAMERA = {"radial": (0.004, 0.0256, -0.0099), "disparity_offset": (0.38, 0.382, 0.371, 0.659, -2.033, -3.549, 2.889)}
 
 #: Of corners, by the same likelihood: fields of CornerNoise.
 CORNERS = {

@@ -13,15 +13,7 @@ from torch import Tensor, nn
 from benchmarks.sequence07.chosen import FILTER, HALVES, LENS, SLIP_KEPT
 from torch_denkf import Filter, FusedFilter, FusedSensor
 from torch_denkf.functional.manifolds import SE3, Euclidean, Product
-from torch_denkf.modules import (
-    AroundState,
-    EnsembleAnalysis,
-    GaussianAround,
-    MappedNoise,
-    SubModel,
-    UKFTransition,
-)
-from torch_denkf.monitoring import Gated
+from torch_denkf.modules import AroundState, EnsembleAnalysis, GaussianAround, MappedNoise, SubModel, UKFTransition
 from torch_denkf.motions.motion import Motion
 from torch_denkf.submodel import Sensor
 
@@ -196,15 +188,12 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     return data
 
 
-def car_filter(
-    kind: Kind, members: int = 64, *, gate: dict | None = None, again: bool = False, slip: bool = True, **analysis
-) -> Filter:
+def car_filter(kind: Kind, members: int = 64, *, again: bool = False, slip: bool = True, **analysis) -> Filter:
     """A filter of all three parts of the state.
 
     Args:
         kind: of filter.
         members: of the ensemble.
-        gate: options of :class:`~torch_denkf.monitoring.Gated` around the corners' update; ``None`` for none.
         again: whether the start is a belief of a filter that has run before.
         slip: whether the state of an ensemble has it.
         **analysis: options of the ensemble's analyses.
@@ -222,11 +211,8 @@ def car_filter(
         initial = AroundState(std, ensemble_size=members, state_key=key, space=motion.space)
         sensors["motion"] = FusedSensor(WhitenedMotion(), [1.0] * 6, observation_key="whitened", **seen)
         made = partial(EnsembleAnalysis, "etkf", **analysis)
-        filter = FusedFilter(motion, sensors, initial=initial, process_noise=noise, analysis=made)
-    else:
-        initial = GaussianAround(std, state_key="start", space=SPACE)
-        if kind == "UKF":
-            filter = FusedFilter(UKFTransition(motion, noise, space=SPACE), sensors, initial=initial)
-        else:
-            filter = FusedFilter(motion, sensors, initial=initial, process_noise=noise)
-    return filter if gate is None else Gated(filter, **gate)
+        return FusedFilter(motion, sensors, initial=initial, process_noise=noise, analysis=made)
+    initial = GaussianAround(std, state_key="start", space=SPACE)
+    if kind == "UKF":
+        return FusedFilter(UKFTransition(motion, noise, space=SPACE), sensors, initial=initial)
+    return FusedFilter(motion, sensors, initial=initial, process_noise=noise)

@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.common.arguments import made_by, parse
-from benchmarks.common.tables import Columns, head, line, write_page
+from benchmarks.common.tables import Columns, head, line, report
 from benchmarks.sequence07.filters import BIAS, POSE, SPACE, car_filter, pose_of, prepared
 from benchmarks.sequence07.pictures import draw
 from benchmarks.sequence07.task import CONDITIONS, ROWS, chained, naive, readings, truth
@@ -46,7 +46,6 @@ class Study:
     out: Path | None = None  # folder for sequence07.csv, sequence07.md and sequence07.png
     seed: int = 0
     ukf: bool = False  # also the unscented filter, whose figures are the extended one's
-    only: str = ""  # run filters alone whose name has this; other rows are read from sequence07.csv, nothing is drawn
     smoke: bool = False  # a few rows and filters: does it run?
 
 
@@ -145,10 +144,8 @@ def filter_rows(
     for number, condition in enumerate(CONDITIONS):
         for prefix, name in named.items():
             each = slice(number, None, len(CONDITIONS))
-            paths, claim = (
-                pose_of(out[each], prefix)[0],
-                claimed(found[each].flatten(0, 1), true.repeat(draws, 1, 1), prefix),
-            )
+            paths = pose_of(out[each], prefix)[0]
+            claim = claimed(found[each].flatten(0, 1), true.repeat(draws, 1, 1), prefix)
             drifts = torch.tensor([list(drift(path, poses).values()) for path in paths])
             row = {"condition": condition, "filter": name}
             row |= dict(zip(("translation", "rotation"), drifts.mean(0).tolist(), strict=True))
@@ -225,23 +222,15 @@ def main() -> None:
     models.append(("DEnKF, 32 members", "DEnKF", "", {"members": 32}))
     models.append(("DEnKF, 32 members, no slip", "DEnKF", "", {"members": 32, "slip": False}))
     models.append(("DEnKF, 64 members", "DEnKF", "EnRTS, 64 members", {"members": 64}))
-    if study.only:
-        rows = COLUMNS.read(study.out / "sequence07.csv")
-        models = [model for model in models if study.only in model[0]]
-    else:
-        for row, path in alone(study, data, poses, count):
-            rows.append(row)
-            paths[row["condition"], row["filter"]] = path
+    for row, path in alone(study, data, poses, count):
+        rows.append(row)
+        paths[row["condition"], row["filter"]] = path
     for label, kind, smoother, options in models[:1] if study.smoke else models:
         for row, path, claim in filter_rows(label, kind, data, poses, smoother, **options):
-            rows = [other for other in rows if any(other[key] != row[key] for key in COLUMNS.text)] + [row]
+            rows.append(row)
             paths[row["condition"], row["filter"]], claims[row["condition"], row["filter"]] = path, claim
     for row in rows:
         print({key: f"{value:.3g}" if isinstance(value, float) else value for key, value in row.items()}, flush=True)
+    report(study.out, COLUMNS, rows, page(rows, count), "sequence07")
     if study.out is not None:
-        study.out.mkdir(parents=True, exist_ok=True)
-        COLUMNS.write(rows, study.out / "sequence07.csv")
-    if study.out is not None and not study.only:
         draw(paths, claims, poses, STEPS, study.out / "sequence07.png")
-    text = page(rows, count)
-    write_page(text, None if study.out is None else study.out / "sequence07.md")

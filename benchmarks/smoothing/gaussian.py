@@ -7,11 +7,14 @@ there. The sensor reads x + b with white noise; b is the slow part of its error.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
+from benchmarks.common.descent import minimise
 from torch_denkf.filters import KalmanFilter
 from torch_denkf.functional import kalman_predict, kalman_update
 from torch_denkf.functional.smoothing.rts import rts_smooth
@@ -109,18 +112,15 @@ def fit(series: Sequence[Series], lag: int, updates: int) -> Parameters:
     }
     parameters = {name: value.clone().requires_grad_() for name, value in parameters.items()}
     cut = [windows_of(each) for each in series]
-    optimiser = torch.optim.Adam(parameters.values(), 0.2)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
-    for _ in range(updates):
-        model = model_of(parameters, series)
-        scores = []
+
+    def loss() -> Tensor:
+        model, scores = model_of(parameters, series), []
         for each, (count, steps, size) in zip(cut, (each.truth.shape for each in series), strict=True):
             error = (believe(model, each, lag)[1] - each.truth)[:, min(BURN_IN, steps // 4) : -lag or None]
             scores.append(error.square().reshape(count, -1, size).mean(1).log())
-        optimiser.zero_grad()
-        torch.cat(scores).mean().backward()
-        optimiser.step()
-        schedule.step()
+        return torch.cat(scores).mean()
+
+    minimise(parameters.values(), loss, updates, 0.2, schedule=partial(CosineAnnealingLR, T_max=updates))
     return {name: value.detach() for name, value in parameters.items()}
 
 

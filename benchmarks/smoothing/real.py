@@ -5,36 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from statistics import fmean
 
+import pandas as pd
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.common.arguments import made_by
-from benchmarks.common.tables import Columns, head, line, pick
-from benchmarks.smoothing import gaussian, linear
+from benchmarks.common.tables import Columns, head, line
+from benchmarks.smoothing import gaussian
 from benchmarks.smoothing.gaussian import Series
 from benchmarks.smoothing.recordings import Group, Task, tasks
 from torch_denkf.smoothers import EnKS, EnRTS, RTSSmoother
 
 LAG = 10
-LESS = 0.15  # share of the filter's error that a smoother is to take away
+SENSOR = ("rmse_sensor", "sensor_error_acf1", "sensor_error_acf10")  # size, and correlation 1 and LAG steps later
 COLUMNS = Columns(
     names=(
-        "task",
-        "group",
-        "recording",
-        "quantity",
-        "method",
-        "members",
-        "lag",
-        "draws",
-        "rmse_filter",
-        "rmse_smoother",
-        "rmse_sensor",
-        "sensor_error_acf1",
-        "sensor_error_acf10",
+        *("task", "group", "recording", "quantity", "method", "members", "lag", "draws"),
+        *("rmse_filter", "rmse_smoother"),
+        *SENSOR,
     ),
     text=("task", "group", "recording", "quantity", "method"),
     whole=("members", "lag", "draws"),
@@ -100,30 +90,24 @@ def series_of(task: Task, batches: Group) -> dict[str, Series]:
 
 
 def gaussians(make: Callable[[], Task], readings: Path, updates: int) -> list[dict]:
-    """The Kalman filter behind the same sensor, its smoother, and the best weights of the readings."""
+    """The Kalman filter behind the same sensor, and its smoother; how large and how slow the sensor's errors are."""
     task, rows = make(), []
     groups = {name: series_of(task, each) for name, each in task.groups(task.members[0], readings).items()}
     chosen = list(groups["validation"].values())
     models = [gaussian.model_of(gaussian.fit(chosen, lag, updates), chosen) for lag in (0, LAG)]
-    found = [linear.weights(chosen, later) for later in (0, LAG)]
     for group, batches in groups.items():
         for names, series in batches.items():
             say = partial(rows_of, task, group, names)
             one, own = (kalman(model, series) for model in models)
             rows += say(*one, method="RTS, the filter's model")
-            rows += say(one[0], own[1], method="RTS")
-            error = (series.reading - series.truth)[:, 1:]
-            weighted = [linear.estimates(series, w, later) for w, later in zip(found, (0, LAG), strict=True)]
-            linears = say(*(mean_square(mean, series.truth) for mean in weighted), method="best weights")
-            sensor, *acf = (error.square().mean(1), correlation(error, 1), correlation(error, LAG))
-            shown = [each.mean(0, keepdim=True) if len(linears) < each.numel() else each for each in (sensor, *acf)]
-            for row, (square, near, far) in zip(linears, zip(*(s.flatten() for s in shown), strict=True), strict=True):
-                row |= {"rmse_sensor": float(square) ** 0.5}
-                row |= {"sensor_error_acf1": float(near), "sensor_error_acf10": float(far)}
-            rows += linears
-            # Fitted on the very recordings that they are scored on: no weights of these readings do better.
-            best = [linear.estimates(series, linear.weights([series], later), later) for later in (0, LAG)]
-            rows += say(*(mean_square(mean, series.truth) for mean in best), method="best weights, in hindsight")
+            error, smoothed = (series.reading - series.truth)[:, 1:], say(one[0], own[1], method="RTS")
+            sensor = torch.stack([error.square().mean(1).sqrt(), correlation(error, 1), correlation(error, LAG)], -1)
+            if len(smoothed) < sensor[..., 0].numel():  # a row for all recordings
+                sensor[..., 0] = sensor[..., 0].square().mean(0).sqrt()
+                sensor = sensor.mean(0, keepdim=True)
+            for row, numbers in zip(smoothed, sensor.flatten(0, 1).tolist(), strict=True):
+                row |= dict(zip(SENSOR, numbers, strict=True))
+            rows += smoothed
     return rows
 
 
@@ -168,22 +152,20 @@ def page(rows: Sequence[dict]) -> str:
         "# Smoothers behind trained sensors",
         "",
         f"Root mean square errors with {LAG} later readings, and those of the filter on the same frames; means over",
-        f'the recordings. "Less" is how much of the filter\'s error the smoother takes away; the target is {LESS:.0%}.',
+        "the recordings. *Less* is how much of the filter's error the smoother takes away.",
         "",
-        *head("task", "recordings", "quantity", "method", "members", "filter", "smoother", "less", "met"),
+        *head("task", "recordings", "quantity", "method", "members", "filter", "smoother", "less"),
     ]
-    keys = ("task", "group", "quantity", "method", "members")
-    for found in dict.fromkeys(tuple(row.get(key) for key in keys) for row in rows):
-        own = pick([{"members": None, **row} for row in rows], **dict(zip(keys, found, strict=True)))
-        before, after = (fmean(row[f"rmse_{name}"] for row in own) for name in ("filter", "smoother"))
-        less = 1 - fmean(row["rmse_smoother"] / row["rmse_filter"] for row in own)
-        cells = [*found[:4], found[4] or "", f"{before:.4f}", f"{after:.4f}", f"{less:.1%}"]
-        lines.append(line(*cells, "yes" if less >= LESS else "no"))
+    table, keys = pd.DataFrame(rows, columns=COLUMNS.names), ["task", "group", "quantity", "method", "members"]
+    table["less"] = 1 - table["rmse_smoother"] / table["rmse_filter"]
+    means = table.groupby(keys, sort=False, dropna=False)[["rmse_filter", "rmse_smoother", "less", *SENSOR]].mean()
+    for row in means.reset_index().itertuples():
+        members = "" if row.members != row.members else f"{row.members:.0f}"
+        cells = [f"{row.rmse_filter:.4f}", f"{row.rmse_smoother:.4f}", f"{row.less:.1%}"]
+        lines.append(line(row.task, row.group, row.quantity, row.method, members, *cells))
     lines += ["", "How long a sensor's errors last: their correlation one step and ten steps later.", ""]
     lines += head("task", "recordings", "quantity", "sensor", "one step", f"{LAG} steps")
-    sensors = [row for row in rows if "rmse_sensor" in row]
-    for found in dict.fromkeys(tuple(row[key] for key in keys[:3]) for row in sensors):
-        own = pick(sensors, **dict(zip(keys, found, strict=False)))
-        values = [fmean(row[key] for row in own) for key in COLUMNS.names[-3:]]
-        lines.append(line(*found, f"{values[0]:.4f}", *(f"{value:.2f}" for value in values[1:])))
+    for row in means.dropna(subset=SENSOR[0]).reset_index().itertuples():
+        cells = [f"{row.rmse_sensor:.4f}", f"{row.sensor_error_acf1:.2f}", f"{row.sensor_error_acf10:.2f}"]
+        lines.append(line(row.task, row.group, row.quantity, *cells))
     return "\n".join([*lines, "", *made_by("smoothing")]) + "\n"

@@ -1,6 +1,6 @@
 """Runs every pair in a process of its own, one after the other, and writes the report.
 
-python -m benchmarks.speed                      # all pairs: results/speed.{md,json}, docs/pictures/speed.png
+python -m benchmarks.speed                      # all pairs: results/speed.{md,json}
 python -m benchmarks.speed --only against_textbook packaged_step
 """
 
@@ -115,7 +115,6 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=12.0, help="to spend on each comparison (default: 12)")
     parser.add_argument("--only", nargs="+", default=PAIRS, choices=PAIRS, help="run these pairs, keep other rows")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results", help="folder of the results")
-    parser.add_argument("--plot", type=Path, default=ROOT / "docs" / "pictures" / "speed.png")
     parser.add_argument(
         "--no-compile", action="store_true", help="leave out compiled sequences: minutes each to compile"
     )
@@ -157,7 +156,7 @@ def main() -> None:
             rows = [row for row in old if row.get("pair") != name]
             rows += [{**row, "plain": plain.get(row["name"])} for row in new]
         rows.sort(key=lambda row: order.index(row["pair"]) if row.get("pair") in order else len(order))
-        write(rows, machine, command, time.perf_counter() - begun, args.out, args.plot)
+        write(rows, machine, command, time.perf_counter() - begun, args.out)
 
 
 if __name__ == "__main__":

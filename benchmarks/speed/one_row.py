@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from benchmarks.attitude.baselines import _exp, _matrix, _product, _right_jacobian, _skew
 from benchmarks.speed.pairs import Row, interleave
+from benchmarks.speed.quaternions import exp, matrix, product, right_jacobian, skew
 from benchmarks.speed.workload import make_filter, make_frames, make_gaussian_filter
 from torch_denkf.filters import Filter, KalmanFilter
 from torch_denkf.fusion import FusedFilter, FusedSensor
@@ -85,21 +85,21 @@ def numpy_attitude() -> Callable[[], np.ndarray]:
     def call() -> np.ndarray:
         turn, bias, cov = state
         angles = (row["gyro"] - bias) * DT
-        turn, move = _product(turn, _exp(angles)), np.eye(6)[None].copy()
-        move[:, :3, :3] = _matrix(_exp(-angles))
-        move[:, :3, 3:] = -DT * _right_jacobian(angles)
+        turn, move = product(turn, exp(angles)), np.eye(6)[None].copy()
+        move[:, :3, :3] = matrix(exp(-angles))
+        move[:, :3, 3:] = -DT * right_jacobian(angles)
         cov = move @ cov @ move.mT + q
         for reading, direction, std in constants:
-            expected = _matrix(turn).mT @ direction
-            reads = np.concatenate([_skew(expected), np.zeros((1, 3, 3))], -1)
+            expected = matrix(turn).mT @ direction
+            reads = np.concatenate([skew(expected), np.zeros((1, 3, 3))], -1)
             noise = std**2 * np.eye(3)
             gain = cov @ reads.mT @ np.linalg.inv(reads @ cov @ reads.mT + noise)
             change = (gain @ (reading - expected)[..., None])[..., 0]
             keep, reset = np.eye(6) - gain @ reads, np.eye(6)[None].copy()
-            reset[:, :3, :3] = _right_jacobian(change[:, :3])
+            reset[:, :3, :3] = right_jacobian(change[:, :3])
             cov = reset @ (keep @ cov @ keep.mT + gain @ noise @ gain.mT) @ reset.mT
             cov = 0.5 * (cov + cov.mT)
-            turn, bias = _product(turn, _exp(change[:, :3])), bias + change[:, 3:]
+            turn, bias = product(turn, exp(change[:, :3])), bias + change[:, 3:]
         state[:] = turn, bias, cov
         return turn
 

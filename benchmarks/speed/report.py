@@ -1,4 +1,4 @@
-"""The table as Markdown, JSON and a picture."""
+"""The table as Markdown and JSON."""
 
 from __future__ import annotations
 
@@ -44,31 +44,8 @@ def markdown(rows: list[dict], machine: dict, command: str, seconds: float) -> s
     return "\n".join(lines) + "\n"
 
 
-def picture(rows: list[dict], path: Path) -> None:
-    """Ratios as bars on a logarithmic axis, with a mark at each target."""
-    from benchmarks.common.plots import plt, save
-
-    rows = [row for row in rows if row["ratio"]][::-1]
-    figure, axes = plt.subplots(figsize=(9, 0.9 + 0.3 * len(rows)))
-    colours = [{True: "tab:green", False: "tab:red"}.get(row.get("met"), "tab:gray") for row in rows]
-    axes.barh(range(len(rows)), [row["ratio"] for row in rows], color=colours, height=0.65)
-    for place, row in enumerate(rows):
-        if row.get("target"):
-            axes.plot([row["target"]] * 2, [place - 0.42, place + 0.42], color="black", linewidth=2)
-        box = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}  # over the target's bar, if they meet
-        axes.text(row["ratio"] * 1.06, place, number(row["ratio"]), va="center", fontsize=8, bbox=box)
-    axes.axvline(1.0, color="gray", linewidth=0.8, linestyle=":")
-    axes.set_xscale("log")
-    axes.set_yticks(range(len(rows)), [row["name"] for row in rows], fontsize=8)
-    axes.set_xlabel("ours / theirs (black: target; green: met)")
-    axes.margins(x=0.12, y=0.01)
-    figure.tight_layout()
-    save(figure, path, dpi=120)
-
-
-def write(rows: list[dict], machine: dict, command: str, seconds: float, results: Path, plot: Path) -> None:
-    """Writes speed.json, speed.md and the picture."""
+def write(rows: list[dict], machine: dict, command: str, seconds: float, results: Path) -> None:
+    """Writes speed.json and speed.md."""
     write_text(results / "speed.json", json.dumps(rows, indent=1) + "\n")
     write_text(results / "speed_machine.json", json.dumps(machine, indent=1) + "\n")
     write_text(results / "speed.md", markdown(rows, machine, command, seconds))
-    picture(rows, plot)

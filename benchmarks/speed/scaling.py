@@ -1,6 +1,6 @@
 """The analysis for S = O = 10 to a million: time, memory and digits; 32 members, diagonal R, one thread.
 
-    python -m benchmarks.speed.scaling --out benchmarks/speed/results/scaling.md --plot docs/pictures/scaling.png
+    python -m benchmarks.speed.scaling --out benchmarks/speed/results/scaling.md
 
 Time: processor time of a call, median of rounds that go through all sizes in turn. Memory: what torch's allocator
 holds at most during a call (torch.profiler, every allocation and release), plus the call's arguments; for the largest
@@ -179,46 +179,19 @@ def table(found: dict[str, dict], command: str, seconds: float) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw(found: dict[str, dict], path: Path) -> None:
-    """Time, memory and error over the size."""
-    from benchmarks.common.plots import plt, save
-
-    figure, axes = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
-    for scheme, values in found.items():
-        sizes = values["sizes"]
-        axes[0].loglog(sizes, [1e3 * value for value in values["seconds"]], "o-", label=scheme)
-        axes[1].loglog(sizes, [value / 2**20 for value in values["bytes"]], "o-", label=scheme)
-        for noise, style in zip(NOISES, ("-", "--", ":"), strict=True):
-            axes[2].loglog(sizes, values["errors"][noise], style, marker="o", label=f"{scheme}, R = {noise:g}")
-    ensemble = [4 * MEMBERS * size / 2**20 for size in sizes]
-    axes[1].loglog(sizes, [COPIES * value for value in ensemble], "k:", label=f"{COPIES} ensembles")
-    last = max(values["seconds"][-1] for values in found.values())
-    line = [1e3 * last * size / sizes[-1] for size in sizes if size >= LINEAR_FROM / 10]
-    axes[0].loglog(sizes[-len(line) :], line, "k:", label="linear")
-    axes[2].set_ylim(1e-8, 1e-4)
-    for axis, title in zip(axes, ("time of a call, ms", "memory held, MiB", "error of the increment"), strict=True):
-        axis.set(xlabel="S = O", title=title)
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=8)
-    save(figure, path, dpi=110)
-
-
 @dataclass
 class Scaling:
     """The analysis for S = O = 10 to a million: time, memory and digits."""
 
     rounds: int = 9  # measurements of each time
     out: Path | None = None  # write the tables to this Markdown file
-    plot: Path | None = None  # write the picture to this file
     smoke: bool = False  # small sizes, one round: does it run?
 
     def __call__(self) -> None:
-        """Measures, prints and draws."""
+        """Measures and prints."""
         began = time.perf_counter()
         found = measure(1 if self.smoke else self.rounds, (10, 100, 10_000, 20_000) if self.smoke else SIZES)
         write_page(table(found, command("speed.scaling"), time.perf_counter() - began), self.out)
-        if self.plot:
-            draw(found, self.plot)
 
 
 if __name__ == "__main__":

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
 from torch_denkf import FusedFilter
 from torch_denkf.fusion import FusedSensor
@@ -31,26 +30,11 @@ MEAN, STD = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0], [0.5, 0.5, 0.1, 0.3, 0.1, 0.02,
 GYRO, WHEELS, GPS = (0.01, 1), (0.05, 5), (0.5, 100)
 
 
-class Motion(nn.Module):
-    """A unicycle whose speed goes to 1 m/s and whose turn rate goes to zero, both within seconds."""
-
-    def forward(self, state: Tensor) -> Tensor:
-        """The states ``[*, 7]`` one step later."""
-        x, y, heading, speed, turn, bias, scale = state.unbind(-1)
-        moved = x + DT * speed * heading.cos(), y + DT * speed * heading.sin(), heading + DT * turn
-        return torch.stack([*moved, speed + 0.2 * DT * (1 - speed), turn - 0.2 * DT * turn, bias, scale], -1)
-
-
-class Reads(nn.Module):
-    """What a sensor reads of states ``[*, 7]``."""
-
-    def __init__(self, function: Callable[[Tensor], Tensor]):
-        super().__init__()
-        self.function = function
-
-    def forward(self, state: Tensor) -> Tensor:
-        """The reading ``[*, 1]``."""
-        return self.function(state)
+def moved(state: Tensor) -> Tensor:
+    """States ``[*, 7]`` of a unicycle one step later: its speed goes to 1 m/s and its turn rate to zero in seconds."""
+    x, y, heading, speed, turn, bias, scale = state.unbind(-1)
+    place = x + DT * speed * heading.cos(), y + DT * speed * heading.sin(), heading + DT * turn
+    return torch.stack([*place, speed + 0.2 * DT * (1 - speed), turn - 0.2 * DT * turn, bias, scale], -1)
 
 
 def turn_rate(state: Tensor) -> Tensor:
@@ -66,10 +50,10 @@ def wheel_speed(state: Tensor) -> Tensor:
 def recordings(runs: int, steps: int, seed: int) -> TensorDict:
     """True states ``[runs, steps, 7]``, readings and their masks."""
     generator = torch.Generator().manual_seed(seed)
-    draw, motion = partial(torch.randn, generator=generator), Motion()
+    draw = partial(torch.randn, generator=generator)
     state, states = torch.tensor(MEAN) + torch.tensor(STD) * draw(runs, 7), []
     for _ in range(steps):
-        state = motion(state) + torch.tensor(PROCESS) * draw(runs, 7)
+        state = moved(state) + torch.tensor(PROCESS) * draw(runs, 7)
         states.append(state)
     data = TensorDict({"state": torch.stack(states, 1)}, [runs, steps])
     truths = {"gyro": turn_rate(data["state"]), "wheels": wheel_speed(data["state"]), "gps": data["state"][..., :2]}
@@ -81,8 +65,8 @@ def recordings(runs: int, steps: int, seed: int) -> TensorDict:
 
 def _sensors() -> dict[str, FusedSensor]:
     return {
-        "gyro": FusedSensor(LearnedObservation(Reads(turn_rate)), [GYRO[0]]),
-        "wheels": FusedSensor(LearnedObservation(Reads(wheel_speed)), [WHEELS[0]]),
+        "gyro": FusedSensor(LearnedObservation(turn_rate), [GYRO[0]]),
+        "wheels": FusedSensor(LearnedObservation(wheel_speed), [WHEELS[0]]),
         "gps": FusedSensor(Select([0, 1]), [GPS[0]] * 2),
     }
 
@@ -90,7 +74,7 @@ def _sensors() -> dict[str, FusedSensor]:
 def ensemble_filter(members: int, **options) -> FusedFilter:
     """Square root updates of an ensemble, a sensor after the other; ``options`` of its analyses."""
     return FusedFilter(
-        LearnedTransition(Motion(), residual=False),
+        LearnedTransition(moved, residual=False),
         _sensors(),
         initial=GaussianPrior(MEAN, STD, ensemble_size=members),
         process_noise=PROCESS,
@@ -101,7 +85,7 @@ def ensemble_filter(members: int, **options) -> FusedFilter:
 def gaussian_filter() -> FusedFilter:
     """The extended Kalman filter."""
     return FusedFilter(
-        LearnedTransition(Motion(), residual=False),
+        LearnedTransition(moved, residual=False),
         _sensors(),
         initial=MomentPrior(torch.tensor(MEAN), torch.tensor(STD).square().diag()),
         process_noise=PROCESS,

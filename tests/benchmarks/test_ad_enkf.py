@@ -5,13 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch.distributions import MultivariateNormal
 
-from benchmarks.lorenz96.learned import (
-    forcing_of,
-    make_filter,
-    observe,
-    simulate,
-    tapers,
-)
+from benchmarks.lorenz96.learned import forcing_of, make_filter, observe, simulate, tapers
 from tests.filters.factories import linear_denkf, linear_system
 from torch_denkf.functional import kalman_predict, kalman_update
 from torch_denkf.functional.localisation import gaspari_cohn

@@ -3,13 +3,13 @@ import torch
 
 from benchmarks.outliers.filters import UPDATES, known
 from benchmarks.outliers.study import score, scores
-from benchmarks.outliers.task import SHARE, Motion, best, recordings
+from benchmarks.outliers.task import SHARE, best, moved, recordings
 
 
 def test_the_cart_sticks_and_slides():
     states = torch.tensor([[1.0, 0.04, 1.1], [1.0, 0.04, 1.3], [0.0, 2.0, 1.0]])
     expected = [[1.0, 0.0], [1 + 0.05 * (0.04 + 0.05 * 0.496), 0.04 + 0.05 * 0.496], [0.05 * 2.0, 2.0]]
-    torch.testing.assert_close(Motion()(states), torch.tensor(expected))
+    torch.testing.assert_close(moved(states), torch.tensor(expected))
 
 
 def test_one_reading_in_five_is_wrong():

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import copy
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -10,9 +13,11 @@ from tensordict import TensorDict
 from torch import nn
 
 from benchmarks.reliability import damage as d
+from benchmarks.reliability.damage import NAN
 from benchmarks.reliability.target import Subject, Target, targets_of
-from tests.borders.filters_made import IMAGE_SHAPE, SIGMA
+from tests.borders.filters_made import EYE, IMAGE_SHAPE, SIGMA
 from torch_denkf import modules as m
+from torch_denkf._arguments import _signature
 from torch_denkf.applications.car import FlowSensor, UnicycleMotion, UnicycleNoise, UnicycleTransition
 from torch_denkf.applications.car.modules.member_gain import MemberGain
 from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, with_history
@@ -22,10 +27,21 @@ from torch_denkf.modules.keypoints import SpatialSoftArgmax
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
 from torch_denkf.modules.stochastic import FlipoutLinear
 
-EYE, NAN = torch.eye(2), float("nan")
 BY_COLUMNS = d.matrix(2, 2).but("a row more")
 STDS = d.vector(2, positive=True) | {"a matrix": torch.ones(2, 3)}
 FLOOR = d.of(-0.1, NAN, 5.0, "much")
+NET, NOISE = (
+    m.StochasticMLP(2, 2, (4,)),
+    m.ConstantNoise([0.1] * 2, in_key=("belief", "mean"), out_key=("forecast", "noise")),
+)
+#: Right values of arguments, by their names.
+GIVEN: dict[str, Any] = {
+    **{"mean": [0.0, 0.0], "std": [1.0, 1.0], "cov": EYE, "matrix": EYE, "near": torch.ones(2, 2), "r": [0.5, 0.5]},
+    **{"dims": [0, 1], "lags": 2, "hidden_size": 4, "dt": 0.1, "ensemble_size": 8, "reach": [1.0], "channels": 3},
+    **{"in_features": 2, "out_features": 2, "observation_dim": 2, "encoding_dim": 4, "dim": 2, "state_dim": 2},
+    **{"network": NET, "velocity": NET, "transition": m.LearnedTransition(NET), "noise": NOISE, "process_noise": NOISE},
+    **{"initial": m.GaussianPrior([0.0] * 2, [1.0] * 2, ensemble_size=8), "observation": m.Select([0, 1])},
+}
 
 
 def row(states: int = 2) -> TensorDict:
@@ -66,94 +82,61 @@ def on_images(network: Any) -> Any:
     return network(torch.zeros(2, 3, 24, 24))
 
 
-def moments(size: int = 2) -> dict[str, Any]:
-    """A mean and a covariance."""
-    return {"mean": torch.zeros(size), "cov": torch.eye(size)}
+def not_run(module: Any) -> Any:
+    """Only makes it."""
 
 
-def prior() -> dict[str, Any]:
-    """A mean and standard deviations."""
-    return {"mean": [0.0, 0.0], "std": [1.0, 1.0]}
-
-
-def cloud() -> dict[str, Any]:
-    """A prior of eight members, for those that add to one."""
-    return {"initial": m.GaussianPrior(**prior(), ensemble_size=8)}
-
-
-def noise() -> Any:
-    """The noise of a motion."""
-    return m.ConstantNoise([0.1, 0.1], in_key=("belief", "mean"), out_key=("forecast", "noise"))
-
-
-def net() -> nn.Module:
-    """The network of a motion."""
-    return m.StochasticMLP(2, 2, (4,))
-
-
-def motion() -> dict[str, Any]:
-    """A motion, for those that add to one."""
-    return {"transition": m.LearnedTransition(net())}
-
-
-def _priors() -> Iterator[Subject]:
-    memory = lambda: {"initial": m.MomentPrior(**moments()), "hidden_size": 4}  # noqa: E731
-    cloned = lambda: {"initial": m.MomentPrior(**moments(5)), "lags": 2}  # noqa: E731
-    covariance = {"cov": d.covariance(2)}
-    yield Subject(m.GaussianPrior, prior, on_row)
-    yield Subject(m.AroundState, lambda: {"std": [1.0, 1.0]}, on_row)
-    yield Subject(m.FromSensor, lambda: {**prior(), "dims": [0, 1]}, on_row, {"dims": d.dims(2)})
-    yield Subject(m.MomentPrior, moments, on_row, covariance, {"mean": ("cov",)})  # of two sizes, either may be wrong
-    yield Subject(m.GaussianAround, lambda: {"std": [1.0, 1.0]}, on_row)
-    yield Subject(with_memory, memory, on_row)
-    yield Subject(with_history, lambda: {**cloud(), "lags": 2}, on_row)
-    yield Subject(ClonedPrior, cloned, on_row)
-    yield Subject(with_weights, cloud, on_row)
+def of(
+    make: Callable[..., Any],
+    use: Callable[[Any], Any] = on_row,
+    wrong: Mapping[str, d.Wrong | None] | None = None,
+    also: Mapping[str, tuple[str, ...]] | None = None,
+    **given: Any,
+) -> Subject:
+    """A sub-model; arguments that have no default are those of ``GIVEN``, but for some."""
+    signature = _signature(make)[0] if isinstance(make, type) else inspect.signature(make)
+    needed = [name for name, one in signature.parameters.items() if one.default is one.empty and name in GIVEN]
+    sound = partial(copy.deepcopy, {**{name: GIVEN[name] for name in needed}, **given})
+    return Subject(make, sound, use, wrong or {}, also or {})
 
 
 def _motions() -> Iterator[Subject]:
+    moments, car = m.MomentPrior(torch.zeros(2), EYE), m.MomentPrior(torch.zeros(5), torch.eye(5))
     linear = {"matrix": d.matrix(2, 2), "noise": d.covariance(2), "control": d.matrix(2, 1).but("a column more")}
-    given = lambda: {"matrix": 0.9 * EYE, "noise": 0.1 * EYE, "control": torch.ones(2, 1)}  # noqa: E731
-    noisy = lambda: {**motion(), "process_noise": noise()}  # noqa: E731
-    module = {"process_noise": d.MODULE}
-    yield Subject(m.LearnedTransition, lambda: {"network": net()}, on_row)
-    yield Subject(UnicycleTransition, lambda: {"velocity": net(), "dt": 0.1}, on_car)
-    yield Subject(UnicycleMotion, lambda: {"dt": 0.1}, on_car)
-    yield Subject(UnicyclePose, lambda: {"dt": 0.1})
-    yield Subject(m.LinearTransition, given, on_row, linear)
-    yield Subject(m.EKFTransition, noisy, on_row, module)
-    yield Subject(m.UKFTransition, noisy, on_row, {**SIGMA, **module})
-    dims = lambda: {**motion(), "noise": noise(), "dims": [0, 1]}  # noqa: E731
-    yield Subject(m.NoisyTransition, dims, on_row, {"dims": d.dims(2)})
-    yield Subject(ResampledTransition, motion, on_row, {"alpha": d.SHARE})
-    yield Subject(ClonedTransition, motion)
+    dims, module = {"dims": d.dims(2)}, {"process_noise": d.MODULE}
+    for make in (m.GaussianPrior, m.AroundState, m.GaussianAround, with_history, with_weights, m.LearnedTransition):
+        yield of(make)
+    yield of(m.FromSensor, wrong=dims)
+    zeros = torch.zeros(2)
+    yield of(m.MomentPrior, wrong={"cov": d.covariance(2)}, also={"mean": ("cov",)}, mean=zeros)  # either may be wrong
+    yield of(with_memory, initial=moments)
+    yield of(ClonedPrior, initial=car)
+    yield of(UnicycleTransition, on_car)
+    yield of(UnicycleMotion, on_car)
+    yield of(UnicyclePose, not_run)
+    yield of(m.LinearTransition, wrong=linear, matrix=0.9 * EYE, noise=0.1 * EYE, control=torch.ones(2, 1))
+    yield of(m.EKFTransition, wrong=module)
+    yield of(m.UKFTransition, wrong={**SIGMA, **module})
+    yield of(m.NoisyTransition, wrong=dims, dims=[0, 1])
+    yield of(ResampledTransition, wrong={"alpha": d.SHARE})
+    yield of(ClonedTransition, not_run)
 
 
 def _observations() -> Iterator[Subject]:
-    reach = d.of([NAN], [-1.0], [0.0], "far")
-    yield Subject(m.Select, lambda: {"dims": [0, 1]}, on_row, {"dims": d.indices(2)})
-    yield Subject(m.LinearObservation, lambda: {"matrix": EYE.clone()}, on_row, {"matrix": BY_COLUMNS})
-    yield Subject(m.LearnedObservation, lambda: {"network": nn.Linear(2, 2)}, on_row)
-    yield Subject(PairObservation, lambda: {"reach": [1.0]}, wrong={"reach": reach})
-
-
-def _noises() -> Iterator[Subject]:
-    cholesky = {"r": STDS, "floor": FLOOR, "loc": None, "scale": None, "in_features": None, "num_cells": None}
-    scaled = lambda: {"noise": m.ConstantNoise([0.5, 0.5]), "factor": 1.0}  # noqa: E731
-    mapped = lambda: {"noise": noise(), "matrix": EYE.clone()}  # noqa: E731
-    diagonal = {"r": STDS, "floor": FLOOR}
-    yield Subject(m.DiagonalNoise, lambda: {"observation_dim": 2}, on_row, diagonal)
-    yield Subject(m.ConstantNoise, lambda: {"r": [0.5, 0.5]}, on_row, {"r": STDS.but("too long", "a matrix", "zero")})
-    yield Subject(m.CholeskyNoise, lambda: {"dim": 2}, on_row, cholesky)
-    yield Subject(m.ScaledNoise, scaled, on_row)
-    yield Subject(m.MappedNoise, mapped, on_row, {"matrix": BY_COLUMNS})
-    yield Subject(UnicycleNoise, lambda: {"noise": noise(), "dt": 0.1}, on_car)
+    cholesky = {"r": STDS, "floor": FLOOR, **dict.fromkeys(("loc", "scale", "in_features", "num_cells"))}
+    yield of(m.Select, wrong={"dims": d.indices(2)})
+    yield of(m.LinearObservation, wrong={"matrix": BY_COLUMNS})
+    yield of(m.LearnedObservation, network=nn.Linear(2, 2))
+    yield of(PairObservation, not_run, {"reach": d.of([NAN], [-1.0], [0.0], "far")})
+    yield of(m.DiagonalNoise, wrong={"r": STDS, "floor": FLOOR})
+    yield of(m.ConstantNoise, wrong={"r": STDS.but("too long", "a matrix", "zero")})
+    yield of(m.CholeskyNoise, wrong=cholesky)
+    yield of(m.ScaledNoise, noise=m.ConstantNoise([0.5, 0.5]), factor=1.0)
+    yield of(m.MappedNoise, wrong={"matrix": BY_COLUMNS})
+    yield of(UnicycleNoise, on_car)
 
 
 def _networks() -> Iterator[Subject]:
-    features = lambda: {"in_features": 2, "out_features": 2}  # noqa: E731
-    image = lambda: {"observation_dim": 2, "image_shape": (3, 24, 24), "ensemble_size": 4}  # noqa: E731
-    vector = lambda: {"in_features": 4, "observation_dim": 2, "ensemble_size": 4}  # noqa: E731
     trunk = {"in_channels": 3, "channels": (8, 8), "keypoints": 4, "features": 8, "pooled": 2}
     images = {
         "ensemble_size": d.COUNT,
@@ -164,44 +147,34 @@ def _networks() -> Iterator[Subject]:
     readings = {"ensemble_size": d.COUNT, "loc": d.vector(4), "scale": d.vector(4, positive=True)}
     flow = {"dt": d.POSITIVE, "ensemble_size": d.COUNT, "trunk_dropout": d.SHARE | {"one": 1.0}}
     update = dict.fromkeys(("features", "observation_dim", "extra_features"), d.COUNT_OR_NONE)
-    yield Subject(m.StochasticMLP, features, on_vectors, {"output_gain": d.FINITE})
-    yield Subject(FlipoutLinear, features, on_vectors)
-    yield Subject(m.ImageSensor, image, on_row, images)
-    yield Subject(m.VectorSensor, vector, on_row, readings)
-    yield Subject(FlowSensor, lambda: {"dt": 0.1}, wrong=flow)
-    yield Subject(MemberGain, lambda: {"std": [0.1, 0.1], "ensemble_size": 8, "in_key": ("sensor", "ensemble")}, on_row)
-    yield Subject(m.KeypointTrunk, lambda: trunk, on_images, {"channels": d.CELLS})
-    yield Subject(SpatialSoftArgmax, lambda: {"channels": 3}, on_images, {"channels": d.COUNT})
-    yield Subject(LSTMUpdate, lambda: {"state_dim": 2, "features": 4}, wrong=update)
+    yield of(m.StochasticMLP, on_vectors, {"output_gain": d.FINITE})
+    yield of(FlipoutLinear, on_vectors)
+    yield of(m.ImageSensor, wrong=images, image_shape=(3, 24, 24), ensemble_size=4)
+    yield of(m.VectorSensor, wrong=readings, in_features=4, ensemble_size=4)
+    yield of(FlowSensor, not_run, flow)
+    yield of(MemberGain, in_key=("sensor", "ensemble"), std=[0.1, 0.1])
+    yield of(m.KeypointTrunk, on_images, {"channels": d.CELLS}, **trunk)
+    yield of(SpatialSoftArgmax, on_images, {"channels": d.COUNT})
+    yield of(LSTMUpdate, not_run, update, features=4)
 
 
 def _updates() -> Iterator[Subject]:
-    taper = {
-        "one matrix": torch.ones(2, 2),
-        "wrong shapes": (torch.ones(3, 2), torch.ones(2, 2)),
-        "nan": (torch.full((2, 2), NAN), torch.ones(2, 2)),
-        "text": "near",
-    }
-    near = {
-        "nan": torch.full((2, 2), NAN),
-        "negative": -torch.ones(2, 2),
-        "a vector": torch.ones(2),
-        "text": "near",
-    }
+    ones, nan = torch.ones(2, 2), torch.full((2, 2), NAN)
+    taper = {"one matrix": ones, "wrong shapes": (torch.ones(3, 2), ones), "nan": (nan, ones), "text": "near"}
+    near = {"nan": nan, "negative": -ones, "a vector": torch.ones(2), "text": "near"}
     linear = {"matrix": BY_COLUMNS, "noise": d.covariance(2)}
-    select = lambda: {"observation": m.Select([0, 1])}  # noqa: E731
     learned = {"bound": d.CHOICE, "num_cells": None, "network": None}
-    yield Subject(m.EnsembleAnalysis, lambda: {"scheme": "sensor"}, on_row, {"taper": d.Wrong(taper)})
-    yield Subject(m.LocalEnsembleAnalysis, lambda: {"near": torch.ones(2, 2)}, on_row, {"near": d.Wrong(near)})
-    yield Subject(m.KalmanAnalysis, lambda: {"matrix": EYE.clone(), "noise": EYE.clone()}, on_row, linear)
-    yield Subject(m.EKFAnalysis, select, on_row)
-    yield Subject(m.UKFAnalysis, select, on_row, SIGMA)
-    yield Subject(m.GaussianLikelihood, use=on_row)
-    yield Subject(m.LearnedLikelihood, lambda: {"encoding_dim": 4, "observation_dim": 2}, on_row, learned)
-    yield Subject(ParticleAnalysis, use=on_likelihoods)
+    yield of(m.EnsembleAnalysis, wrong={"taper": d.Wrong(taper)}, scheme="sensor")
+    yield of(m.LocalEnsembleAnalysis, wrong={"near": d.Wrong(near)})
+    yield of(m.KalmanAnalysis, wrong=linear, noise=EYE)
+    yield of(m.EKFAnalysis)
+    yield of(m.UKFAnalysis, wrong=SIGMA)
+    yield of(m.GaussianLikelihood)
+    yield of(m.LearnedLikelihood, wrong=learned)
+    yield of(ParticleAnalysis, on_likelihoods)
 
 
 def targets() -> Iterator[Target]:
     """The arguments of all sub-models."""
-    for subjects in (_priors, _motions, _observations, _noises, _networks, _updates):
+    for subjects in (_motions, _observations, _networks, _updates):
         yield from targets_of("sub-models", *subjects())

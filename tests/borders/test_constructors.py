@@ -1,37 +1,32 @@
-"""Arguments of constructors that depend on others, complex numbers, and covariances that are right."""
+"""Arguments of constructors that depend on others, and arguments, weights and covariances that are right."""
 
 import copy
 import pickle
+from functools import partial
 
 import pytest
 import torch
 from tensordict import TensorDict
 
+from benchmarks.common.lorenz96 import lorenz96_step
+from benchmarks.reliability.borders.models import signed
+from benchmarks.reliability.damage import INF, NAN, put
+from benchmarks.reliability.documents import edited
+from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.gaussian_for_tests import linear_filter
 from torch_denkf.applications.car import UnicycleMotion
+from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
+from torch_denkf.applications.car.odometry.training import train_car_filter
 from torch_denkf.baselines.lstm_cell import LSTMUpdate
-from torch_denkf.envs import LinearGaussianEnv
+from torch_denkf.deployment.folder import WEIGHTS, load_folder, save_folder
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.functional.manifolds import Circle, Flat
 from torch_denkf.imperfect import FadingBias
-from torch_denkf.modules import (
-    DiagonalNoise,
-    GaussianPrior,
-    LinearObservation,
-    MomentPrior,
-    Select,
-)
+from torch_denkf.modules import DiagonalNoise, GaussianPrior, MomentPrior, Select
+from torch_denkf.objectives import GaussianLoss, TransitionLoss
 
 EYE, ZERO, ONE = torch.eye(2), torch.zeros(2), torch.ones(2)
-NAN, INF = float("nan"), float("inf")
-PARTS = {
-    "transition": EYE,
-    "process_noise_cov": EYE,
-    "observation": EYE,
-    "noise_cov": EYE,
-    "mean": ZERO,
-    "cov": EYE,
-}
+PARTS = {"transition": EYE, "process_noise_cov": EYE, "observation": EYE, "noise_cov": EYE, "mean": ZERO, "cov": EYE}
 
 
 def refused(make, *words, error=ValueError):
@@ -44,17 +39,9 @@ def refused(make, *words, error=ValueError):
     return message
 
 
-def refuses(make, *words, error=ValueError):
-    """The message begins with the argument's name and holds these words."""
-    assert refused(make, *words, error=error).startswith(words[0])
-
-
 @pytest.mark.parametrize(
     ("noises", "words"),
-    [
-        ({"process_noise": [1.0], "noise": [1.0, 1.0]}, "not both"),
-        ({}, "Give noise, standard deviations"),
-    ],
+    [({"process_noise": [1.0], "noise": [1.0, 1.0]}, "not both"), ({}, "Give noise, standard deviations")],
 )
 def test_noises_of_a_kalman_filter(noises, words):
     parts = {name: value for name, value in PARTS.items() if name != "noise_cov"}
@@ -62,49 +49,28 @@ def test_noises_of_a_kalman_filter(noises, words):
         KalmanFilter(**parts, **noises)
 
 
-@pytest.mark.parametrize("name", [*PARTS, "control"])
-@pytest.mark.parametrize("of", [torch.Tensor.clone, torch.Tensor.numpy, torch.Tensor.tolist])
-def test_an_imaginary_part_is_not_dropped(name, of):
-    value = of((1 + 0.5j) * PARTS.get(name, EYE))
-    refuses(lambda: KalmanFilter(**{**PARTS, name: value}), name, "complex", error=TypeError)
-
-
-def test_an_imaginary_part_is_not_dropped_elsewhere():
-    one = (1 + 0.5j) * ONE
-    for name, make in (
-        ("mean", lambda: GaussianPrior(one, ONE, ensemble_size=4)),
-        ("std", lambda: GaussianPrior(ONE, one.numpy(), ensemble_size=4)),
-        ("cov", lambda: MomentPrior(ZERO, 1j * EYE)),
-        ("matrix", lambda: LinearObservation(1j * EYE)),
-        ("observation", lambda: LinearGaussianEnv(EYE, 1j * EYE, [1.0, 1.0], [1.0, 1.0])),
-        ("transition_std", lambda: LinearGaussianEnv(EYE, EYE, one, [1.0, 1.0])),
-        ("process_noise", lambda: linear_filter("EKF", process_noise=one)),
-    ):
-        refuses(make, name, "complex", error=TypeError)
-
-
+KALMAN = partial(KalmanFilter, **PARTS)
 REFUSED = {
     "circular": (lambda: Flat(2, circular=[-1]), "circular", "got -1"),
-    "a space of fewer": (lambda: KalmanFilter(**PARTS, reading_space=Circle()), "reading_space", "2 rows of matrix"),
+    "a space of fewer": (lambda: KALMAN(reading_space=Circle()), "reading_space", "2 rows of matrix"),
     "no double": (lambda: DiagonalNoise(2, r=0.1, floor=0.02), "r^2 - floor of DiagonalNoise", "-0.0"),
     "endless layers": (lambda: LSTMUpdate(2, features=2, num_layers=2**63), "num_layers", "at most 1000", f"{2**63}"),
-}
-WRONG_TYPES = {
     "dt": (lambda: UnicycleMotion(torch.tensor(0.1)), "dt", "Tensor"),
-    "error of a sensor": (lambda: KalmanFilter(**PARTS, sensor_error=1.0), "sensor_error is a FadingBias", "float"),
-    "a class": (lambda: KalmanFilter(**PARTS, sensor_error=FadingBias), "sensor_error is a FadingBias", "FadingBias"),
+    "error of a sensor": (lambda: KALMAN(sensor_error=1.0), "sensor_error is a FadingBias", "float"),
+    "a class": (lambda: KALMAN(sensor_error=FadingBias), "sensor_error is a FadingBias", "FadingBias"),
     "visibility": (lambda: linear_filter("UKF", visibility=Select([0])), "visibility is a Visibility", "Select"),
+    "step": (lambda: lorenz96_step(torch.zeros(4), dt=-0.05), "dt", "got -0.05"),
+    "pitch": (lambda: evaluate_car_filter(None, "nowhere", ["00"], pitch=NAN), "pitch", "got nan"),
+    "no root": (lambda: train_car_filter("out", rendered=3, leave_out=["09"]), "{'leave_out': ['09']}", "--root"),
 }
+WRONG_TYPES = ("dt", "error of a sensor", "a class", "visibility")
 
 
-@pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED)
-def test_refused(case):
-    refuses(*case)
-
-
-@pytest.mark.parametrize("case", WRONG_TYPES.values(), ids=WRONG_TYPES)
-def test_wrong_types(case):
-    refuses(*case, error=TypeError)
+@pytest.mark.parametrize("name", REFUSED)
+def test_refused(name):
+    """The message begins with the argument's name, and has its value."""
+    make, *words = REFUSED[name]
+    assert refused(make, *words, error=TypeError if name in WRONG_TYPES else ValueError).startswith(words[0])
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
@@ -124,17 +90,34 @@ def test_constants_without_values_pass():
     with torch.device("meta"):
         prior = GaussianPrior([0.0], [1.0], ensemble_size=4)
         DEnKF.paper(state_dim=3, observation_dim=2)
-        KalmanFilter(
-            torch.eye(2),
-            torch.eye(2),
-            process_noise_cov=torch.eye(2),
-            noise_cov=torch.eye(2),
-            mean=torch.zeros(2),
-            cov=torch.eye(2),
-        )
+        KalmanFilter(**{name: value.to("meta") for name, value in PARTS.items()})
     assert prior.std.is_meta
     kf = KalmanFilter(**PARTS)
     for other in (copy.deepcopy(kf), pickle.loads(pickle.dumps(kf))):
         assert other.state_dict().keys() == kf.state_dict().keys()
         td = other.initialise(TensorDict({"observation": ONE}))
         assert other.step(td.clone())["belief", "mean"].equal(kf.step(td.clone())["belief", "mean"])
+
+
+def test_a_scale_of_one_number_and_one_member_for_the_mean_pass():
+    batch = TensorDict({"observation": torch.zeros(2, 3, 2), "state": torch.zeros(2, 3, 2)}, [2, 3])
+    losses = [GaussianLoss(linear_kalman(), sensor=0.0, state_scale=scale)(batch) for scale in ([2.0], [2.0, 2.0])]
+    assert torch.equal(*(loss["loss_state"] for loss in losses))
+    one_step = TransitionLoss(linear_denkf("etkf"), members=1, score="mse")
+    assert one_step(batch)["loss_transition"].isfinite()
+
+
+@pytest.mark.parametrize("change", [lambda value: value + INF, lambda value: value.long(), lambda value: value * NAN])
+@pytest.mark.parametrize("name", ["weight", "constant"])
+def test_weights_of_another_kind(tmp_path, name, change):
+    def build():
+        model = torch.nn.Linear(2, 2)
+        model.register_buffer("constant", torch.ones(2))
+        model.register_buffer("hidden", torch.tensor([1.0, INF]))
+        return model
+
+    save_folder(build(), tmp_path, builder="line", settings={})
+    load_folder(tmp_path, {"line": build})  # where what is built is infinite, what is stored may be
+    signed(edited(put(name, change)))(tmp_path / WEIGHTS)
+    with pytest.raises(ValueError, match=rf"{WEIGHTS} holds NaN, infinity or whole numbers in \['{name}'\]"):
+        load_folder(tmp_path, {"line": build})

@@ -7,15 +7,13 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import ExcludeTransform, TransformedEnv
 
-from tests.filters.factories import M, S, linear_denkf, linear_system, toy_denkf
+from tests.filters.factories import M, S, toy_denkf
 from tests.filters.test_contract import FILTERS as CONTRACT
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf import RejectReadings
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter, ParticleFilter
 from torch_denkf.modules import (
     ConstantNoise,
-    EnsembleAnalysis,
-    FromSensor,
     GaussianPrior,
     LearnedLikelihood,
     LearnedTransition,
@@ -53,11 +51,6 @@ def local():
         ),
         initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=16),
     )
-
-
-def from_sensor(**kwargs):
-    start = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, observation_key="observation")
-    return linear_denkf("etkf", initial=start, **kwargs)
 
 
 ONE = ("Kalman", "EKF", "UKF", "Backprop KF", "DEnKF etkf", "DEnKF perturbed", "DEnKF sakov", "LSTM")
@@ -181,41 +174,6 @@ def test_gradients_do_not_meet_what_was_rejected():
         torch.testing.assert_close(gradient, gradients[0][name])
 
 
-def test_two_sensors_with_masks_of_their_own():
-    """One is broken, the other goes on: as a filter that has it alone."""
-    _, _, H, R = linear_system()
-
-    def two():
-        def analysis(key, start, end):
-            keys = {"observed_key": f"{key}_seen", "observation_key": key, "noise_variance_key": (key + "_noise",)}
-            return EnsembleAnalysis("etkf", forecast_key=start, belief_prefix=end, **keys)
-
-        single = linear_denkf("etkf")
-        return Filter(
-            {
-                "noise_a": ConstantNoise(R.sqrt(), in_key="a", out_key="a_noise"),
-                "noise_b": ConstantNoise(R.sqrt(), in_key="b", out_key="b_noise"),
-                "transition": single["transition"],
-                "observation_a": LinearObservation(H),
-                "first": analysis("a", ("forecast", "ensemble"), "half"),
-                "observation_b": LinearObservation(H, in_key=("half", "ensemble")),
-                "second": analysis("b", ("half", "ensemble"), "belief"),
-            },
-            initial=single.initial,
-        )
-
-    clean = TensorDict({"a": torch.randn(3, 8, 2), "b": torch.randn(3, 8, 2)}, [3, 8])
-    spoiled = clean.clone()
-    spoiled["a"][:, 2:5] = torch.nan
-    masked = clean.clone()
-    masked["a_seen"] = torch.ones(3, 8, 1, dtype=torch.bool)
-    masked["a_seen"][:, 2:5] = False
-    reject = RejectReadings({"a": "a_seen", "b": "b_seen"}, by_component=["a", "b"])
-    got, expected = two().sequence(reject(spoiled)), two().sequence(masked)
-    torch.testing.assert_close(got["belief", "ensemble"], expected["belief", "ensemble"], rtol=0, atol=0)
-    assert got[REJECTED][:, :, 0].tolist() == [[0, 0, 2, 2, 2, 0, 0, 0]] * 3
-
-
 def test_a_reading_that_no_particle_can_explain():
     """0 / 0 of Bayes' rule: the weights stay, and the log-likelihood tells."""
     prior = torch.tensor([0.2, 0.3, 0.5]).log()
@@ -230,21 +188,3 @@ def test_a_reading_that_no_particle_can_explain():
     assert out["belief", "log_weight"].equal(prior)
     torch.testing.assert_close(out["belief", "mean"], torch.tensor([1.3]))
     assert out["info", "log_likelihood"].item() == -torch.inf
-
-
-def test_only_what_nobody_can_look_at_is_passed_over():
-    """Under vmap and of tensors without values nothing is said."""
-    filter, check = linear_denkf(), RejectReadings({"observation": "observed"}, on_bad="raise")
-
-    def means(observation):
-        return filter.sequence(check(TensorDict({"observation": observation}, observation.shape[:-1])))[
-            "belief", "mean"
-        ]
-
-    readings = torch.randn(3, 4, 5, 2)
-    readings[1, 2, 3] = torch.nan
-    torch.vmap(means)(readings)
-    torch.func.vmap(torch.func.jacrev(means))(readings[:, 0])
-    for run in (means, torch.func.jacrev(means)):
-        with pytest.raises(ValueError, match="observation"):
-            run(readings[1])

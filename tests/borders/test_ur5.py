@@ -1,10 +1,7 @@
 """Damaged collections of UR5 demos: refused by file and line."""
 
-import json
-from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import pytest
 
 from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
@@ -21,46 +18,11 @@ def root(tmp_path):
     return tmp_path
 
 
-def refuses(root, *words):
-    refused(lambda: open_all(root), *words, COMMAND)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("key", ["state", "action"])
-def test_numbers_that_are_not_finite(tmp_path, key, value):
-    demo = make_demo(1, 8)
-    values = getattr(demo, key).copy()
-    values[3, 2] = value
-    write_folder(tmp_path, [make_demo(0, 8), replace(demo, **{key: values})])
-    refuses(tmp_path, "demo-000001.npz", f"'{key}'", "row 3", str(value))
-
-
-LINES = {
-    "cut": ('{"demo": 1, "fi', f"{MANIFEST}:2", '{"demo": 1, "fi'),
-    "empty": ("", f"{MANIFEST}:2", "''"),
-    "a number": ("17", f"{MANIFEST}:2", "no entry"),
-    "another field": ('{"demo": 1, "seed": 3}', f"{MANIFEST}:2", "seed"),
-    "negative": ({"demo": -1}, f"{MANIFEST}:2", "demo must be", "got -1"),
-    "rows 0": ({"rows": 0}, f"{MANIFEST}:2", "rows must be", "got 0"),
-    "rows a float": ({"rows": 8.5}, f"{MANIFEST}:2", "rows must be", "8.5"),
-    "above": ({"file": "../demo-000001.npz"}, f"{MANIFEST}:2", "../demo-000001.npz"),
-    "a zero byte": ({"file": "demo\0.npz"}, f"{MANIFEST}:2", "outside of its folder"),
-    "twice": ({"demo": 0}, f"{MANIFEST}:2", "demo 0 is listed in another line"),
-}
-
-
-def damage(root, change):
+def test_a_damaged_line(root):
+    """It dropped its demo; collecting goes on without it and makes it again."""
     lines = (root / MANIFEST).read_text().splitlines()
-    lines[1] = change if isinstance(change, str) else json.dumps(json.loads(lines[1]) | change)
-    (root / MANIFEST).write_text("\n".join(lines) + "\n")
-
-
-@pytest.mark.parametrize("case", LINES.values(), ids=LINES)
-def test_damaged_lines(root, case):
-    """They dropped their demo; collecting goes on without them and makes it again."""
-    change, *words = case
-    damage(root, change)
-    refuses(root, *words)
+    (root / MANIFEST).write_text("\n".join([lines[0], '{"demo": 1, "fi', *lines[2:], ""]))
+    refused(lambda: open_all(root), f"{MANIFEST}:2", '{"demo": 1, "fi', COMMAND)
     with pytest.warns(UserWarning, match=rf"{MANIFEST}:2 is damaged .*; its demo is made again"):
         assert list(read_manifest(root, skip_damaged=True)) == [0, 2, 3]
 

@@ -77,7 +77,7 @@ def test_what_changes_after_compiling_is_noticed(monkeypatch):
     monkeypatch.setattr(torch, "compile", traced)
     filter = linear_denkf()
     filter = filter.with_modules(observation=LearnedObservation(StochasticMLP(2, 2, (4,), layer="none")))
-    frames = TensorDict({"observation": torch.randn(2, 2, 2)}, [2, 2])
+    frames = TensorDict({"observation": torch.randn(2, 3, 2)}, [2, 3])
     compiled = pickle.loads(pickle.dumps(filter)).compile(chunk=1)
     means = []
 

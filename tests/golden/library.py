@@ -195,7 +195,8 @@ def of_chaotic_systems() -> dict[str, list[float]]:
     out = {}
     for case in CASES:
         rows = smoothing.rows(case, [0, 1], cycles=26)
-        scored = [row[f"rmse_{case.scored}"] for row in rows]
+        measure = "rmse_filter" if case.method in ("IEnKS", "particles") else "rmse_smoother"
+        scored = [row[measure] for row in rows]
         out[f"smoothing, {case.name}"] = numbers(torch.tensor(scored))
     random = schemes.Random(2, stream=0)
     states = [8 + random.randn(schemes.VARIABLES)]

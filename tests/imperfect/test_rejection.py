@@ -10,12 +10,12 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import ExcludeTransform, TransformedEnv, check_env_specs
 from torchrl.modules.utils import get_env_transforms_from_module
 
-from tests.borders.test_readings import from_sensor
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.transforms.envs_for_tests import base_env, toy_base_env, toy_filter
 from torch_denkf import DEnKFTransform, RejectReadings
 from torch_denkf.functional.manifolds import SE2, SE3, SO3, Circle, Euclidean, Product
+from torch_denkf.modules import FromSensor
 
 NAN, INF = torch.nan, torch.inf
 COUNT = ("info", "rejected")
@@ -274,6 +274,11 @@ def rejecting_env(filter, *, silent=True, **options):
         env.append_transform(ExcludeTransform("observed"))
         env.append_transform(RejectReadings({"observation": "observed"}, **options))
     return env.append_transform(DEnKFTransform(filter))
+
+
+def from_sensor(**kwargs):
+    start = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, observation_key="observation")
+    return linear_denkf("etkf", initial=start, **kwargs)
 
 
 @pytest.mark.parametrize("apart", [False, True])

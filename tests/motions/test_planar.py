@@ -33,7 +33,7 @@ def test_it_is_the_motion_of_the_wheels_study_in_the_limit_of_short_steps(monkey
     start = torch.tensor([0.1, 0.2, 0.3, 1.4, 0.5, 0.02, 1.1])
     for dt in (2e-3, 1e-3):
         monkeypatch.setattr(task, "DT", dt)
-        motion, known = PlanarMotion(dt, damping=0.2, usual_speed=1.0), task.Motion()
+        motion, known = PlanarMotion(dt, damping=0.2, usual_speed=1.0), task.moved
         state, expected = start[order].unsqueeze(0), start
         for _ in range(round(1 / dt)):
             state, expected = step(motion, state), known(expected)

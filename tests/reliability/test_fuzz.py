@@ -24,12 +24,12 @@ def test_a_sample_is_refused_clearly_or_right(tmp_path):
     The sample is the same each time. It has cases with names, and others.
     """
     file = tmp_path / "fuzz.json"
-    command = [sys.executable, "-m", "benchmarks.reliability", "fuzz", "--sample", "80"]
+    command = [sys.executable, "-m", "benchmarks.reliability", "fuzz", "--sample", "60"]
     command += ["--processes", "1", "--out", str(file)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     found = json.loads(file.read_text())
-    assert found["records"] >= 70
+    assert found["records"] >= 55
     wrong = json.dumps(found["wrong"], indent=1)
     assert (found["hang"], found["crash"]) == (0, 0), wrong
     assert found["silent"] + found["unclear"] == 0, wrong
@@ -38,9 +38,9 @@ def test_a_sample_is_refused_clearly_or_right(tmp_path):
 def test_the_suite_is_large_and_each_case_has_a_name():
     targets = all_targets()
     names = [(case.border, case.name) for target in targets for case in target.named()]
-    assert len(names) >= 10000
+    assert len(names) >= 8000
     assert len(set(names)) == len(names)
-    assert sum(not target.wrong.others.is_empty for target in targets) >= 500
+    assert sum(not target.wrong.others.is_empty for target in targets) >= 1000
 
 
 def _numbers(act=lambda value, folder: check_number("lags", value, least=5)):

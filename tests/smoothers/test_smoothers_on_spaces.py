@@ -120,7 +120,7 @@ def test_the_iterated_smoother_of_many_members_is_that_of_moments():
 @pytest.mark.parametrize("turn", [[2.0, -1.0, 0.5], [torch.pi, 0.0, 0.0]])
 def test_a_turned_world_turns_the_iterated_smoother_and_nothing_else(turn):
     filter, turn = iterated(inflation=1.1, rotate=True), SO3().exp(torch.tensor(turn))
-    data = filter.draw_noise(log())
+    data = filter.draw_noise(log(steps=6))
     here, there = turned_beliefs(filter, turn, data)
     assert_turned(here, there, turn, 1e-8)
     close(there["info"], here["info"], ["nis", "log_likelihood"], atol=1e-7)

@@ -33,8 +33,6 @@ class KITTIRecipe(Recipe):
     """
 
     dims = VELOCITIES
-    repair = False  # whether its sensor leaves out what shows nothing, and sees behind what hides the street
-    weights_of: str | None = None  # whose weights it takes, if it is not trained itself
 
     def __init__(self, sensor: SubModel, facts: Statistics):
         self.sensor, self.facts, self.unit = sensor, facts, facts.unit

@@ -21,15 +21,13 @@ class DEnKF(KITTIRecipe):
 
     Attributes:
         size: members; the sensor has as many samples.
-        scheme: of the update.
         lags: past steps that an innovation may still correct.
-        threshold: of the significance of a correlation, in standard deviations; ``None`` believes all of them.
     """
 
-    size, scheme, lags, threshold = SAMPLES, "sensor", 4, None
+    size, lags = SAMPLES, 4
 
     def modules(self):
-        analysis = velocity_analysis(self.lags, self.scheme, self.threshold)
+        analysis = velocity_analysis(self.lags)
         return OrderedDict(
             noise=self.noise(),
             # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
@@ -48,13 +46,3 @@ class DEnKF(KITTIRecipe):
 
     def set_inflation(self, model, factor):
         next(module for module in model.modules() if isinstance(module, EnsembleAnalysis)).inflation = factor
-
-
-@register
-class DEnKF_Gated(DEnKF):
-    """The DEnKF as it was trained, on pictures that are checked.
-
-    Those that are black or white are left out, and the flow is continued behind what stands still before the camera.
-    """
-
-    repair, weights_of = True, "denkf"

@@ -55,13 +55,6 @@ class DEKF(_Gaussian):
 
 
 @register
-class DEKF_Gated(DEKF):
-    """The dEKF as it was trained, on checked pictures like the DEnKF's."""
-
-    repair, weights_of = True, "dekf"
-
-
-@register
 class BKF(_Gaussian):
     """Backprop-KF (Haarnoja et al. 2016): R from the frame, Q a learned constant; the pose's motion is linearised."""
 

@@ -1,21 +1,21 @@
-"""Legged robots: their models, noises and errors, what their filters read, and simulated ones."""
+"""Legged robots: their models, noises and errors, and what makes a robot, its log and what reads it."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import fields
 from functools import cache, partial
 from typing import Any
 
 import mujoco
 import torch
-from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from benchmarks.reliability import damage as d
+from benchmarks.reliability.damage import NAN
 from benchmarks.reliability.target import Subject, Target, targets_of
 from torch_denkf.applications.legged import (
     LearnedContacts,
@@ -31,10 +31,8 @@ from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.applications.legged.learned import last_rows, with_last_rows
 from torch_denkf.imperfect import RejectReadings
 
-BORDER, T, JOINTS, FEET = "legged robots", 5, 4, ["left", "right"]
-NAN, INF = float("nan"), float("inf")
+T, JOINTS, FEET = 5, 4, ["left", "right"]
 NAMES: dict[str, Any] = {"feet": FEET, "imu": "imu"}
-KEYS = ("imu", "joints", "joint_rates", "contact")
 _LEG = """<body pos="0 {y} 0"><joint name="{side}_hip" axis="0 1 0" damping="2"/><geom size=".05"/><body pos="0 0 -.2">
   <joint name="{side}_knee" type="slide" axis="0 0 1" range="-.1 .1" damping="20" stiffness="400"/><geom size=".05"/>
   <site name="{side}" pos="0 0 -.2"/></body></body>"""
@@ -65,196 +63,114 @@ def log() -> TensorDict:
     return rows
 
 
+def lasting_log() -> TensorDict:
+    """Returns the log with the last rows of each row."""
+    return with_last_rows(log(), 2)
+
+
+def run(kind: str, rows: TensorDict) -> TensorDict:
+    """Filters a log whose steps may differ in length."""
+    torch.manual_seed(0)
+    made = legged_filter(model(), **NAMES, dt="dt", kind=kind, ensemble_size=8)  # type: ignore[arg-type]
+    return filtered(made, rows)
+
+
+def filtered(filter: Any, rows: TensorDict | None = None) -> TensorDict:
+    """Beliefs of a log, behind a rejection that raises."""
+    torch.manual_seed(0)
+    readings = dict.fromkeys(("imu", "joints", "joint_rates"), "contact")
+    with torch.no_grad():
+        rows = RejectReadings(readings, on_bad="raise")((log() if rows is None else rows).clone())
+        return filter.sequence(rows).select(*filter.belief_keys)
+
+
+def learned_loss(rows: TensorDict) -> Tensor:
+    """A loss of a network of contacts, whose gradients are taken."""
+    torch.manual_seed(0)
+    loss = LearnedContacts(model(), **NAMES, rows=2, num_cells=(4,)).loss(rows)
+    loss.backward()
+    return loss.detach()
+
+
+def standing() -> TensorDict:
+    """Returns the robot at its start, with an action."""
+    return LeggedEnv(model(), **NAMES).reset().set("action", torch.zeros(1))
+
+
+def acted(row: TensorDict) -> TensorDict:
+    """Returns the robot after that action."""
+    env = LeggedEnv(model(), **NAMES)
+    env.reset()
+    return env.step(row)["next"]
+
+
 # -------------------------------------------------------------------------------------------------------- arguments
 
-NAME = d.of("tail", 3, None, "")
-FOOT_NAMES = d.of(["left", "tail"], "left", [1, 2], [], ["left"] * 2)
-JOINT_NAMES = d.of(
-    ["left_hip", "left_knee", "right_hip", "tail"],
-    ["left_hip", "left_knee"],
-    ["left_hip", "left_knee", "right_hip", "right_knee", "left_hip"],
-    "left_hip",
-    [0, 1, 2, 3],
-)
-MODEL = d.Wrong({"nothing": None, "text": "robot.xml", "a module": torch.nn.Linear(1, 1)})
 OTHERS = d.of(0.1, "none", {"gyro": 0.1})
-ROBOT: dict[str, d.Wrong | None] = {"model": MODEL, "feet": FOOT_NAMES, "imu": NAME}
-SEED = d.of("x", 0.5, -1)
-
-
-def _rolled(env: Any) -> Any:
-    return env.rollout(3)
-
-
-def _filtered(filter: Any, rows: TensorDict | None = None) -> TensorDict:
-    torch.manual_seed(0)
-    rows = (log() if rows is None else rows).clone()
-    with torch.no_grad():
-        rows = RejectReadings(dict.fromkeys(KEYS[:3], "contact"), on_bad="raise")(rows)
-        return filter.sequence(rows).select(*filter.belief_keys)
+JOINT_NAMES = ["left_hip", "left_knee", "right_hip"]
+ROBOT: dict[str, d.Wrong | None] = {
+    "model": d.of(None, "robot.xml", torch.nn.Linear(1, 1)),
+    "feet": d.of(["left", "tail"], "left", [1, 2], [], ["left"] * 2),
+    "imu": d.of("tail", 3, None, ""),
+    "joints": d.of(
+        [*JOINT_NAMES, "tail"], JOINT_NAMES[:2], [*JOINT_NAMES, "right_knee", "left_hip"], "left_hip", [0, 1, 2, 3]
+    ),
+}
+SWITCH = {"on": d.FINITE | {"below the other": 5.0}, "off": d.FINITE | {"above the other": 50.0}}
+MADE = {"pushes": d.NOT_NEGATIVE, "seed": d.of("x", 0.5, -1), "errors": OTHERS | {"noises": LeggedNoises()}}
 
 
 def _of_last(made: LearnedContacts) -> Tensor:
     return made(with_last_rows(log(), made.rows))["legs", "moves"]
 
 
-def _kept(made: Any) -> TensorDict:
-    return TransformedEnv(LeggedEnv(model(), **NAMES), made).rollout(2)
-
-
 def _subjects() -> Iterator[Subject]:
     kept = dict.fromkeys(("rows", "every"), d.COUNT)
-    env = {
-        **ROBOT,
-        "dt": d.POSITIVE | {"no multiple": 0.0033},
-        "errors": OTHERS | {"noises": LeggedNoises()},
-        "on": d.FINITE | {"below the other": 5.0},
-        "off": d.FINITE | {"above the other": 50.0},
-        "pushes": d.NOT_NEGATIVE,
-        "seed": SEED,
-    }
     whole = {
         **ROBOT,
-        "joints": JOINT_NAMES,
         "kind": d.CHOICE,
         "threshold": d.POSITIVE,
         "noises": OTHERS | {"errors": LeggedErrors()},
         "contacts": OTHERS | {"a module": torch.nn.Linear(1, 1)},
         "gravity": d.FINITE | {"nothing": None},
     }
-    learned = {**ROBOT, "joints": JOINT_NAMES, "rows": d.COUNT, "rate": d.POSITIVE, "lasts": d.POSITIVE | {"less": 0.5}}
+    env = {**ROBOT, **MADE, **SWITCH, "dt": d.POSITIVE | {"no multiple": 0.0033}, "joints": None}
+    learned = {**ROBOT, "rows": d.COUNT, "rate": d.POSITIVE, "lasts": d.POSITIVE | {"less": 0.5}}
     forces = d.of("much", 3.0, torch.ones(2), torch.full((3, 2), NAN))
     before = d.of(torch.ones(2), torch.ones(3, dtype=torch.bool), "all")
-    threshold = {"on": d.FINITE | {"below the other": 5.0}, "off": d.FINITE | {"above the other": 50.0}}
     some = {"force": torch.tensor([[0.0, 30.0]] * 3), "on": 20.0, "off": 10.0}
-    built = lambda **more: {"model": model(), **NAMES, **more}  # noqa: E731
+    built = partial(dict, model=model(), **NAMES)
     for each in (LeggedNoises, LeggedErrors):
         yield Subject(each, wrong={one.name: d.NOT_NEGATIVE for one in fields(each)})
-    yield Subject(LegKinematics, built, lambda legs: legs(torch.zeros(JOINTS)), {**ROBOT, "joints": JOINT_NAMES})
-    yield Subject(LeggedEnv, partial(built, errors=LeggedErrors()), _rolled, env)
-    yield Subject(contacts, lambda: dict(some), wrong={"force": forces, **threshold, "before": before})
-    for kind in ("EKF", "DEnKF"):
-        yield Subject(
-            legged_filter,
-            partial(built, dt=0.01, kind=kind, ensemble_size=8),
-            _filtered,
-            {**whole, "ensemble_size": d.LARGE_COUNT if kind == "DEnKF" else None},
-            name=f"legged_filter, {kind}",
-        )
+    yield Subject(LegKinematics, built, lambda legs: legs(torch.zeros(JOINTS)), ROBOT)
+    yield Subject(LeggedEnv, partial(built, errors=LeggedErrors()), lambda env: env.rollout(3), env)
+    yield Subject(contacts, lambda: dict(some), wrong={"force": forces, **SWITCH, "before": before})
+    for kind, members in (("EKF", None), ("DEnKF", d.LARGE_COUNT)):
+        sound, wrong = partial(built, dt=0.01, kind=kind, ensemble_size=8), {**whole, "ensemble_size": members}
+        yield Subject(legged_filter, sound, filtered, wrong, name=f"legged_filter, {kind}")
     yield Subject(LearnedContacts, partial(built, rows=2, num_cells=(4,)), _of_last, learned)
-    yield Subject(last_rows, lambda: {"rows": 3}, _kept, kept)
+    inside = lambda made: TransformedEnv(LeggedEnv(**built()), made).rollout(2)  # noqa: E731
+    yield Subject(last_rows, lambda: {"rows": 3}, inside, kept)
     yield Subject(with_last_rows, lambda: {"log": log(), "rows": 3}, wrong=kept)
 
 
 def _robots() -> Iterator[Subject]:
     """Simulated ones of dm_control, which take seconds to make."""
-    made = {"friction": d.POSITIVE, "softness": d.POSITIVE, "pushes": d.NOT_NEGATIVE, "errors": OTHERS, "seed": SEED}
-    settings = {"rows": d.COUNT, "kind": d.CHOICE, "slip": d.NOT_NEGATIVE}
-    yield Subject(quadruped.quadruped_env, use=_rolled, wrong=made)
-    yield Subject(humanoid.humanoid_env, use=_rolled, wrong={**made, "speed": d.FINITE, "turn": d.FINITE})
-    yield Subject(quadruped.quadruped, wrong=settings)
-    for steps in (quadruped.trot, humanoid.stroll):
-        numbers = dict.fromkeys(("time", "pace", "stride", "height", "lift"), d.FINITE)
-        wrong = {name: numbers[name] for name in inspect.signature(steps).parameters if name in numbers}
-        yield Subject(steps, lambda: {"time": 0.1}, wrong=wrong)
+    made = {**MADE, "friction": d.POSITIVE, "softness": d.POSITIVE, "speed": d.FINITE, "turn": d.FINITE}
+    yield Subject(quadruped.quadruped, wrong={"rows": d.COUNT, "kind": d.CHOICE, "slip": d.NOT_NEGATIVE})
+    steps = dict.fromkeys(("time", "pace", "stride", "height", "lift"), d.FINITE)
+    for make, wrong, sound in (
+        (quadruped.quadruped_env, made, {}),
+        (humanoid.humanoid_env, made, {}),
+        (quadruped.trot, steps, {"time": 0.1}),
+        (humanoid.stroll, steps, {"time": 0.1}),
+    ):
+        taken = {name: wrong[name] for name in inspect.signature(make).parameters if name in wrong}
+        use = (lambda env: env.rollout(3)) if wrong is made else (lambda result: result)
+        yield Subject(make, partial(dict, sound), use, taken)
 
 
-# ------------------------------------------------------------------------------------------------------------ entries
-
-Change = Callable[[TensorDict], Any]
-
-
-def _put(key: Any, change: Callable[[Tensor], Tensor | None]) -> Change:
-    def act(rows: TensorDict) -> TensorDict:
-        changed = change(rows[key])
-        return rows.exclude(key) if changed is None else rows.set(key, changed)
-
-    return act
-
-
-def _at(number: float, place: int = 0, row: int = 2) -> Callable[[Tensor], Tensor]:
-    def change(value: Tensor) -> Tensor:
-        out = value.clone()
-        out.view(-1, value.shape[-1])[row, place % value.shape[-1]] = number
-        return out
-
-    return change
-
-
-WIDTHS = {
-    "missing": lambda value: None,
-    "too wide": lambda value: torch.cat([value, value[..., :1]], -1),
-    "too narrow": lambda value: value[..., :-1],
-    "without its last dimension": lambda value: value[..., 0],
-}
-NUMBERS = d.Wrong(
-    {**WIDTHS, "nan": _at(NAN), "inf": _at(INF), "first row nan": _at(NAN, 0, 0)},
-    st.tuples(st.sampled_from([NAN, INF, -INF]), st.integers(0, 3), st.integers(0, T - 1)).map(
-        lambda one: (f"{one[0]} in component {one[1]} at {one[2]}", _at(*one))
-    ),
-)
-OTHER_TYPES = d.Wrong({"float64": Tensor.double})
-MASKS = d.Wrong({**WIDTHS, "float": Tensor.float, "int64": Tensor.long, "nan": lambda value: value.float() * NAN})
-TIMES = d.Wrong({**WIDTHS, "nan": _at(NAN), "inf": _at(INF), "zero": _at(0.0), "negative": _at(-0.01)})
-VALUES = {"imu": NUMBERS, "joints": NUMBERS, "joint_rates": NUMBERS, "contact": MASKS, "dt": TIMES.but("too narrow")}
-
-
-def _made(kind: str) -> Any:
-    return legged_filter(model(), **NAMES, dt="dt", kind=kind, ensemble_size=8)  # type: ignore[arg-type]
-
-
-def _run(kind: str, change: Change) -> TensorDict:
-    torch.manual_seed(0)
-    return _filtered(_made(kind), change(log().clone()))
-
-
-def _right(kind: str, near: float = 1e-4) -> Callable[[Any], bool]:
-    def right(result: Any) -> bool:
-        return d.finite(result) and d.same(result, _run(kind, lambda rows: rows), rtol=near, atol=near)
-
-    return right
-
-
-def _loss(change: Change) -> Tensor:
-    torch.manual_seed(0)
-    learned = LearnedContacts(model(), **NAMES, rows=2, num_cells=(4,))
-    loss = learned.loss(change(with_last_rows(log(), 2)))
-    loss.backward()
-    return loss
-
-
-def _learned_right(loss: Any) -> bool:
-    return bool(loss == _loss(lambda rows: rows))
-
-
-def _acted(change: Change) -> TensorDict:
-    env = LeggedEnv(model(), **NAMES)
-    return env.step(change(env.reset().set("action", torch.zeros(1))))["next"]
-
-
-def _entries() -> Iterator[Target]:
-    for kind in ("EKF", "UKF", "DEnKF"):
-        act = lambda change, folder, kind=kind: _run(kind, change)  # noqa: E731
-        for key, wrong in VALUES.items():
-            rights = {"float": _right(kind), "int64": _right(kind)}
-            changes = wrong.each(partial(_put, key))
-            yield Target(BORDER, f"{kind} reads {key}", (key, "legs"), act, changes, None, rights)
-            if key != "contact":
-                changes = OTHER_TYPES.each(partial(_put, key))
-                yield Target(BORDER, f"{kind} reads {key} in another type", (key,), act, changes, _right(kind))
-    learns: dict[Any, d.Wrong] = {("true", "velocity"): NUMBERS, **{("last", key): VALUES[key] for key in KEYS}}
-    for key, wrong in learns.items():
-        act = lambda change, folder: _loss(change)  # noqa: E731
-        rights = dict.fromkeys(("float", "int64"), _learned_right)
-        changes = wrong.each(partial(_put, key))
-        yield Target(BORDER, f"LearnedContacts learns from {'/'.join(key)}", (key[-1],), act, changes, None, rights)
-    actions = d.Wrong({**WIDTHS, "nan": lambda value: value * NAN, "inf": lambda value: value + INF})
-    act = lambda change, folder: _acted(change)  # noqa: E731
-    changes = actions.but("without its last dimension").each(partial(_put, "action"))
-    yield Target(BORDER, "LeggedEnv takes an action", ("action",), act, changes)
-
-
-def targets() -> list[Target]:
-    """All of them."""
-    slow = targets_of(BORDER, *_robots(), needs=quadruped.quadruped_env, slow=True)
-    return [*targets_of(BORDER, *_subjects()), *slow, *_entries()]
+def targets() -> Iterator[Target]:
+    """All arguments."""
+    yield from targets_of("legged robots", *_subjects())
+    yield from targets_of("legged robots", *_robots(), needs=quadruped.quadruped_env, slow=True)

@@ -10,7 +10,6 @@ are counted of each row: 64 rows that step once are 64 steps, and one exchange.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
@@ -50,17 +49,8 @@ def _many(kind: type, inside: bool, first: int = 0) -> EnvBase:
     return env if inside else filtered(env)
 
 
-def _collected(make: Callable[[], EnvBase], total: int) -> Iterator[TensorDictBase]:
-    collector = Collector(make, None, frames_per_batch=FRAMES, total_frames=total)
-    try:
-        yield from collector
-    finally:
-        collector.shutdown()
-
-
-def _collected_by_workers(makes: list[Callable[[], EnvBase]], total: int, sync: bool) -> Iterator[TensorDictBase]:
-    frames = {"frames_per_batch": FRAMES, "total_frames": total}
-    collector = MultiCollector(makes, None, **frames, sync=sync, **({"cat_results": 0} if sync else {}))
+def _collected(kind: type, make: Any, total: int, **options: Any) -> Iterator[TensorDictBase]:
+    collector = kind(make, None, frames_per_batch=FRAMES, total_frames=total, **options)
     try:
         yield from collector
     finally:
@@ -82,19 +72,25 @@ def _rollouts(make: Callable[[], EnvBase], total: int) -> Iterator[TensorDictBas
             env.close()
 
 
-LAYOUTS: dict[str, Callable[[int], Iterator[TensorDictBase]]] = {
-    "Collector": lambda total: _collected(filtered, total),
-    "Collector over SerialEnv, filter inside": lambda total: _collected(partial(_many, SerialEnv, True), total),
-    "Collector over ParallelEnv, filter inside": lambda total: _collected(partial(_many, ParallelEnv, True), total),
-    "Collector over ParallelEnv, filter outside": lambda total: _collected(partial(_many, ParallelEnv, False), total),
-    "ParallelEnv by hand, filter inside": lambda total: _rollouts(partial(_many, ParallelEnv, True), total),
+#: Environments by where the filter is: in the collector's process, in each of several, or around all of them.
+PLACES: dict[str, Callable[[], EnvBase]] = {
+    "": filtered,
+    " over SerialEnv, filter inside": partial(_many, SerialEnv, True),
+    " over ParallelEnv, filter inside": partial(_many, ParallelEnv, True),
+    " over ParallelEnv, filter outside": partial(_many, ParallelEnv, False),
 }
-for sync in (True, False):
+LAYOUTS: dict[str, Callable[[int], Iterator[TensorDictBase]]] = {
+    **{f"Collector{name}": partial(_collected, Collector, make) for name, make in PLACES.items()},
+    "ParallelEnv by hand, filter inside": partial(_rollouts, PLACES[" over ParallelEnv, filter inside"]),
+}
+for sync, options in ((True, {"cat_results": 0}), (False, {})):
     kind = f"MultiCollector, 2 workers, {'in turn' if sync else 'as they come'}"
     alone = [partial(filtered, seed=k) for k in range(WORKERS)]
     nested = [partial(_many, ParallelEnv, True, k * ENVIRONMENTS) for k in range(WORKERS)]
-    LAYOUTS[kind] = partial(_collected_by_workers, alone, sync=sync)
-    LAYOUTS[f"{kind}, each over ParallelEnv, filter inside"] = partial(_collected_by_workers, nested, sync=sync)
+    LAYOUTS[kind] = partial(_collected, MultiCollector, alone, sync=sync, **options)
+    LAYOUTS[f"{kind}, each over ParallelEnv, filter inside"] = partial(
+        _collected, MultiCollector, nested, sync=sync, **options
+    )
 
 
 class Reference:
@@ -152,19 +148,17 @@ def _goes_on(end: TensorDictBase, start: TensorDictBase) -> bool:
 def soak(name: str, steps: int) -> dict[str, Any]:
     """A row of the table: a layout, for so many steps of all its environments together."""
     torch.manual_seed(0)
-    reference, began = Reference(), time.time()
+    reference = Reference()
     for batch in LAYOUTS[name](steps):
         reference.look(batch)
     worst = {f"largest error, {what}": value for what, value in reference.worst.items()}
     right = reference.frames >= steps and all(value < CLOSE for value in worst.values())
     return {
-        "name": name,
         "steps": reference.frames,
         "resets": reference.resets,
         "missing readings": reference.missing,
         **worst,
         "right": right and len(reference.ends) == (WORKERS if "as they come" in name else 1),
-        "seconds": round(time.time() - began, 1),
     }
 
 

@@ -28,7 +28,8 @@ class Killed(Exception):
     """As if the process had ended."""
 
 
-@pytest.mark.parametrize("stage", ["filter", pytest.param("end_to_end", marks=pytest.mark.slow)])
+@pytest.mark.slow  # tests/training/test_resume.py kills a training in all its stages
+@pytest.mark.parametrize("stage", ["filter", "end_to_end"])
 def test_a_killed_training_goes_on_to_the_same_weights(stage, root, trained, tmp_path, monkeypatch):
     shutil.copytree(trained[0] / "cache", tmp_path / "cache")  # the optical flow
     plain = FilterTrainer._update

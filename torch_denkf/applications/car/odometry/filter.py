@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass, fields, replace
-from typing import Literal
 
 import torch
 from tensordict.nn import TensorDictSequential
@@ -88,20 +87,15 @@ class CarSettings:
         return torch.cat([torch.zeros(3), _START * torch.tensor(self.velocity_std)])
 
 
-def velocity_analysis(
-    lags: int, scheme: Literal["sensor", "perturbed", "sakov"] = "sensor", threshold: float | None = None
-) -> EnsembleAnalysis:
+def velocity_analysis(lags: int) -> EnsembleAnalysis:
     """Returns the update of a car's velocities, and those of the last ``lags`` steps, by readings of frame pairs.
 
     Errors of speed and of turn rate have nothing to do with each other; few members would see correlations. Inflation
-    multiplies the present velocities alone: those of past steps would be multiplied again in each step. A threshold
-    localises by significance.
+    multiplies the present velocities alone: those of past steps would be multiplied again in each step.
     """
     own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + lags, 1)])
     return EnsembleAnalysis(
-        scheme,
-        localisation=None if threshold is None else "significance",
-        threshold=1.0 if threshold is None else threshold,
+        "sensor",
         taper=(own, torch.eye(2)),
         inflated=VELOCITIES,
         forecast_key=("forecast", "clone"),

@@ -1,1 +1,0 @@
-"""What does a filter believe of a ball behind a pillar?"""
