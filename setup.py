@@ -28,7 +28,7 @@ setup(
         "Topic :: Scientific/Engineering :: Artificial Intelligence",
         "Typing :: Typed",
     ],
-    python_requires=">=3.11,<3.13",  # labmaze, which dm-control needs, has no wheel for 3.13
+    python_requires=">=3.11",  # labmaze, which dm-control needs, has no wheel for 3.13
     packages=find_packages(include=["torch_denkf", "torch_denkf.*"]),
     package_data={
         "torch_denkf": ["py.typed", "**/*.pyi"],

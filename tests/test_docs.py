@@ -23,12 +23,17 @@ def name(path):
     return str(path.relative_to(ROOT))
 
 
+#: Pages whose programs train for more than eight seconds.
+LONG = {"train_motion_first", "wheeled_robot", "three_ways", "labels_by_hand", "own_dynamics", "own_loss", "outliers"}
+
+
 def blocks():
     for path in PAGES:
         text = path.read_text()
         for match in BLOCK.finditer(text):
             line = text.count("\n", 0, match.start("code"))
             marks = [pytest.mark.skip(reason=match["why"])] if match["why"] else []
+            marks += [pytest.mark.slow] if path.stem in LONG else []
             yield pytest.param(path, line, match["code"], id=f"{name(path)}:{line}", marks=marks)
 
 

@@ -97,9 +97,8 @@ def test_the_graph(name, tmp_path):
     assert_the_same(FILTERS[name](), tmp_path, compiled=False)
 
 
+@pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize(
-    "name", ["EKF of a known motion", *(pytest.param(name, marks=pytest.mark.slow) for name in ("dEKF", "LSTMFilter"))]
-)
+@pytest.mark.parametrize("name", ["EKF of a known motion", "dEKF", "LSTMFilter"])
 def test_compiled(name, tmp_path):
     assert_the_same(FILTERS[name](), tmp_path)

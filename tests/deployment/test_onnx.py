@@ -102,10 +102,10 @@ def test_what_onnx_lacks_is_named(tmp_path):
     etkf = DEnKF(**parts(bend), analysis=EnsembleAnalysis("etkf", observation_key="reading"), initial=members())
     with pytest.raises(RuntimeError, match=r'aten\._linalg_eigh.* choose "perturbed".*format="pt2"'):
         export_step(etkf, frame, path, format="onnx")
-    eye = torch.eye(5)
-    wide = KalmanFilter(eye, eye, process_noise_cov=eye, noise_cov=eye, mean=torch.zeros(5), cov=eye)
-    with pytest.raises(RuntimeError, match=r"aten\.cholesky_solve.* up to 4 .*FusedSensor"):
-        export_step(wide, TensorDict({"observation": torch.zeros(5)}), path, format="onnx")
+    eye = torch.eye(13)
+    wide = KalmanFilter(eye, eye, process_noise_cov=eye, noise_cov=eye, mean=torch.zeros(13), cov=eye)
+    with pytest.raises(RuntimeError, match=r"aten\.cholesky_solve.* up to 12 .*FusedSensor"):
+        export_step(wide, TensorDict({"observation": torch.zeros(13)}), path, format="onnx")
     restless = DEnKF(
         **{**parts(bend), "transition": LearnedTransition(lambda x: x + torch.randn_like(x))},
         initial=members(),

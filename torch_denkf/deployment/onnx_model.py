@@ -12,7 +12,7 @@ from importlib.util import find_spec
 import torch
 
 from torch_denkf.deployment.package import NEEDS_ONNX, SIGNATURE
-from torch_denkf.functional.kernels.small_system import LARGEST, LARGEST_FACTOR
+from torch_denkf.functional.kernels.small_system import LARGEST_ELIMINATED, LARGEST_FACTOR
 
 __all__ = ["need_onnx", "onnx_model"]
 
@@ -21,7 +21,7 @@ _OTHERWISE = 'Or write format="pt2", which holds all operators of torch.'
 _CURES = {
     "eigh": 'The scheme "etkf" needs it, and a FusedFilter of an ensemble: choose "perturbed", "sakov" or "sensor".',
     "cholesky|triangular": (
-        f"It is written out for readings of up to {LARGEST} numbers, and for factors of up to {LARGEST_FACTOR} x "
+        f"It is written out for readings of up to {LARGEST_ELIMINATED} numbers, and for factors of up to {LARGEST_FACTOR} x "
         f"{LARGEST_FACTOR}: read more numbers in parts, each a FusedSensor of a FusedFilter."
     ),
     "searchsorted": 'Particles are resampled with it: choose resampling="transport".',
