@@ -21,8 +21,8 @@ _OTHERWISE = 'Or write format="pt2", which holds all operators of torch.'
 _CURES = {
     "eigh": 'The scheme "etkf" needs it, and a FusedFilter of an ensemble: choose "perturbed", "sakov" or "sensor".',
     "cholesky|triangular": (
-        f"It is written out for readings of up to {LARGEST_ELIMINATED} numbers, and for factors of up to {LARGEST_FACTOR} x "
-        f"{LARGEST_FACTOR}: read more numbers in parts, each a FusedSensor of a FusedFilter."
+        f"It is written out for readings of up to {LARGEST_ELIMINATED} numbers, and for factors of up to "
+        f"{LARGEST_FACTOR} x {LARGEST_FACTOR}: read more numbers in parts, each a FusedSensor of a FusedFilter."
     ),
     "searchsorted": 'Particles are resampled with it: choose resampling="transport".',
     "igamma": "An InnovationMonitor needs it: write the filter that is monitored.",
