@@ -1,4 +1,4 @@
-# `make demo` (watch it work), `make test` (everything CI runs), `make test-all` (and the slow tests), `make docs`
+# `make demo` (watch it work), `make test` (everything CI runs), `make test-all` (and what is slow), `make docs`
 # (the site, in docs/_build/html), `make bench` (speed, beside its peers), `make fuzz` and `make soak` (reliability),
 # `make test-nightly` (all tests beside the nightlies of torchrl and tensordict).
 PYTHON ?= python3
@@ -15,7 +15,7 @@ endif
 NIGHTLY_VENV := .venv-nightly
 NIGHTLY_STAMP := $(NIGHTLY_VENV)/.installed
 
-.PHONY: demo test test-all test-nightly lint layers unit unit-all smoke bench fuzz soak docs clean
+.PHONY: demo test test-all test-nightly lint layers unit unit-all smoke smoke-all bench fuzz soak docs clean
 
 demo: $(STAMP)
 	$(BIN)/denkf demo --out runs/demo
@@ -25,7 +25,7 @@ test: $(VENV)/.docs
 	$(MAKE) --jobs=2 --output-sync=target lint layers docs unit smoke
 
 test-all: $(VENV)/.docs
-	$(MAKE) --jobs=2 --output-sync=target lint layers docs unit-all smoke
+	$(MAKE) --jobs=2 --output-sync=target lint layers docs unit-all smoke-all
 
 # Exact versions come from constraints.txt. On a machine without a GPU,
 # `make demo PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"` saves the CUDA download.
@@ -73,6 +73,9 @@ $(NIGHTLY_STAMP): setup.py constraints.txt
 
 smoke: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.common.smoke
+
+smoke-all: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.common.smoke --all
 
 # Damaged inputs at every border: about a quarter of an hour. The tests run a sample.
 fuzz: $(STAMP)
