@@ -37,6 +37,17 @@ def test_each_state_is_that_of_the_joint_gaussian(float64, name, lag):
     assert_close(out["belief", "mean"], filtered["belief", "mean"], rtol=0, atol=0)
 
 
+def test_a_compiled_filter_is_compiled_once_for_sequences_of_any_length(float64, monkeypatch):
+    made, own = [], torch.compile
+    monkeypatch.setattr(torch, "compile", lambda *args, **options: made.append(args) or own(*args, **options))
+    smoother = RTSSmoother(linear_kalman().compile(chunk=1, backend="eager"))
+    for count in (9, 5):
+        frames = drive(4, count, resets=False)
+        out = smoother(frames.copy())
+        assert_close(out["smoothed", "mean"], joint_beliefs(frames)[0], rtol=0, atol=1e-10)
+    assert len(made) == 1
+
+
 @pytest.mark.parametrize("name", FILTERS)
 def test_online_lag_says_it_that_much_later(float64, name):
     lag, frames = 3, drive(4, 9)

@@ -39,6 +39,9 @@ class Smoother(Checked, TensorDictModuleBase):
         ValueError: if ``lag`` is negative.
     """
 
+    #: Whether the filter that runs depends on the lag; without one, then on the sequence's length.
+    _by_lag = False
+
     def __init__(self, filter: Filter, lag: int | None, needed: Iterable[NestedKey], written: Iterable[str]):
         super().__init__()
         check_lag(lag)
@@ -93,7 +96,8 @@ class Smoother(Checked, TensorDictModuleBase):
 
     def _filter_for(self, count: int) -> Filter:
         """Returns the filter that runs on sequences of ``count`` steps; made again where a module has been replaced."""
-        lag = self.lag if self.lag is not None else max(count - 1, 1)
+        own = self.lag if self.lag is not None else max(count - 1, 1)
+        lag = own if self._by_lag else None  # another filter would compile anew
         if self._running[0] != lag or self._running[1] is not self.filter.structure:
             self._running = (lag, self.filter.structure, self._extended(lag))
         filter, compiled = self._running[2], self.filter.compiled
@@ -101,7 +105,7 @@ class Smoother(Checked, TensorDictModuleBase):
             filter.compile(**({"chunk": 0} if compiled is None else {"chunk": compiled.chunk, **compiled.options}))
         return filter
 
-    def _extended(self, lag: int) -> Filter:
+    def _extended(self, lag: int | None) -> Filter:
         """Returns the filter, or one of the same modules that also writes what the smoother needs."""
         return self.filter
 

@@ -108,6 +108,8 @@ class EnKS(Smoother):
         torch.Size([2, 3, 5])
     """
 
+    _by_lag = True
+
     def __init__(self, filter: Filter, lag: int | None = None):
         self.prefix = prefix_of(filter, "ensemble", self)
         keys = [(self.prefix, "ensemble")] + [(self.prefix, "past")] * (lag != 0)
