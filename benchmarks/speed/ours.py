@@ -13,7 +13,7 @@ from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 
 #: Steps in one compiled graph.
-CHUNK = 4
+CHUNK = 20
 
 
 def sequences(batch: int, *, scheme: str = "sensor", backward: bool = False) -> dict[str, Callable[[], Tensor]]:
