@@ -89,7 +89,7 @@ def draw(shapes: dict[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
 
 
 def run(path: Path, seconds: float) -> None:
-    """What runs on the robot: a step every millisecond, as far as this computer keeps time."""
+    """Returns what runs on the robot: a step every millisecond, as far as this computer keeps time."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     step, count = load_step(path), int(seconds / DT)

@@ -158,7 +158,7 @@ def make_filter(data: LeRobotReplay) -> DEnKF:
 
 @torch.no_grad()
 def read(denkf: DEnKF, data: LeRobotReplay, **options) -> EpisodeReplay:
-    """What the sensor reads in every picture, once: a filter learns from that many times as fast as from pictures."""
+    """Reads every picture by the sensor, once: a filter learns from readings many times as fast as from pictures."""
     parts = [denkf["sensor"](data[rows]).exclude("pixels") for rows in torch.arange(len(data)).split(256)]
     return EpisodeReplay(torch.cat(parts), data.episodes, for_tests=lambda episode: False, **options)
 

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, unravel_key
 from torch import nn
 
-from tests.functional.checks import assert_refused
+from tests.functional.checks import assert_raises
 from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import PairObservation
 from torch_denkf.modules import (
@@ -244,4 +244,4 @@ class Returns(SubModel):
 )
 def test_too_few_or_too_many_values_name_the_module_and_its_keys(out, got):
     keys = r"\[\('belief', 'mean'\), \('belief', 'var'\)\], 2 values; it returned "
-    assert_refused(ValueError, r"Returns.compute\(\) .*" + keys + got, Returns(out), TensorDict({"x": torch.zeros(2)}))
+    assert_raises(ValueError, r"Returns.compute\(\) .*" + keys + got, Returns(out), TensorDict({"x": torch.zeros(2)}))

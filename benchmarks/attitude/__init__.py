@@ -1,1 +1,1 @@
-"""Which way is up, by a gyro and an accelerometer?"""
+"""Estimates which way is up, by a gyro and an accelerometer."""

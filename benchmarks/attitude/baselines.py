@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy import ndarray
 
+from benchmarks.common.quaternions import exp, matrix, product, right_jacobian, skew
+
 __all__ = ["error_state_filter", "integrate", "mahony"]
 
 
@@ -18,7 +20,7 @@ def integrate(gyro: ndarray, dt: ndarray, start: ndarray) -> ndarray:
     """Orientations ``[R, T, 4]`` by the gyro alone, ``[R, T, 3]``; ``start`` ``[R, 4]`` is that of the first row."""
     found = [start]
     for row in range(1, gyro.shape[1]):
-        found.append(_product(found[-1], _exp(gyro[:, row] * dt[:, row])))
+        found.append(product(found[-1], exp(gyro[:, row] * dt[:, row])))
     return np.stack(found, 1)
 
 
@@ -39,7 +41,7 @@ def mahony(
     for row in range(1, gyro.shape[1]):
         away = np.cross(_unit(force[:, row]), _up(found[-1]))
         bias = bias - integral * away * dt[:, row]
-        found.append(_product(found[-1], _exp((gyro[:, row] - bias + proportional * away) * dt[:, row])))
+        found.append(product(found[-1], exp((gyro[:, row] - bias + proportional * away) * dt[:, row])))
     return np.stack(found, 1)
 
 
@@ -77,58 +79,29 @@ def error_state_filter(
     for row in range(1, gyro.shape[1]):
         step = dt[:, row]
         angles = (gyro[:, row] - bias) * step
-        turn = _product(turn, _exp(angles))
+        turn = product(turn, exp(angles))
         move = np.tile(np.eye(6), (runs, 1, 1))
-        move[:, :3, :3] = _matrix(_exp(-angles))
-        move[:, :3, 3:] = -step[..., None] * _right_jacobian(angles)
+        move[:, :3, :3] = matrix(exp(-angles))
+        move[:, :3, 3:] = -step[..., None] * right_jacobian(angles)
         cov = move @ cov @ move.mT
         cov[:, range(6), range(6)] += np.array([gyro_noise**2] * 3 + [gyro_walk**2] * 3) * step
         up = _up(turn)
-        reads = np.concatenate([_skew(up), np.zeros((runs, 3, 3))], -1)
+        reads = np.concatenate([skew(up), np.zeros((runs, 3, 3))], -1)
         gain = cov @ reads.mT @ np.linalg.inv(reads @ cov @ reads.mT + up_noise**2 * np.eye(3))
         change = (gain @ (_unit(force[:, row]) - up)[..., None])[..., 0]
         reset = np.tile(np.eye(6), (runs, 1, 1))
-        reset[:, :3, :3] = _right_jacobian(change[:, :3])
+        reset[:, :3, :3] = right_jacobian(change[:, :3])
         cov = reset @ (np.eye(6) - gain @ reads) @ cov @ reset.mT
         cov = 0.5 * (cov + cov.mT)
-        turn, bias = _product(turn, _exp(change[:, :3])), bias + change[:, 3:]
+        turn, bias = product(turn, exp(change[:, :3])), bias + change[:, 3:]
         found.append((turn, bias, cov))
     turns, biases, covs = (np.stack(each, 1) for each in zip(*found, strict=True))
     return turns, biases, covs
 
 
-def _product(a: ndarray, b: ndarray) -> ndarray:
-    w = a[..., :1] * b[..., :1] - (a[..., 1:] * b[..., 1:]).sum(-1, keepdims=True)
-    return _unit(
-        np.concatenate([w, a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + np.cross(a[..., 1:], b[..., 1:])], -1)
-    )
-
-
-def _exp(angles: ndarray) -> ndarray:
-    half = np.linalg.norm(angles, axis=-1, keepdims=True) / 2
-    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * angles], -1)
-
-
-def _matrix(q: ndarray) -> ndarray:
-    cross = _skew(q[..., 1:])
-    return np.eye(3) + 2 * q[..., :1, None] * cross + 2 * cross @ cross
-
-
-def _right_jacobian(angles: ndarray) -> ndarray:
-    """Of small turns, up to the fourth power."""
-    cross, square = _skew(angles), (angles**2).sum(-1)[..., None, None]
-    return np.eye(3) - (1 / 2 - square / 24) * cross + (1 / 6 - square / 120) * cross @ cross
-
-
 def _up(q: ndarray) -> ndarray:
     """The world's z in the body's axes."""
-    return _matrix(q)[..., 2, :]
-
-
-def _skew(v: ndarray) -> ndarray:
-    x, y, z = np.moveaxis(v, -1, 0)
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*v.shape[:-1], 3, 3)
+    return matrix(q)[..., 2, :]
 
 
 def _unit(v: ndarray) -> ndarray:

@@ -55,7 +55,7 @@ FUSED = (
 
 @dataclass(frozen=True)
 class Study:
-    """Which way is up, by a gyro and an accelerometer?"""
+    """Estimates which way is up, by a gyro and an accelerometer."""
 
     out: Path | None = None  # folder for attitude.csv, attitude.md and attitude.png
     icub: Path = Path("../shared/data/icub")  # with walking.npz and model.urdf; left out where they are missing

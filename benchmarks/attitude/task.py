@@ -140,7 +140,7 @@ def tilt_error(orientation: Tensor, truth: Tensor) -> Tensor:
 
 
 def _run(model: mujoco.MjModel, rows: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """What perfect sensors read, ``[T, 9]``, and position, velocity and orientation, ``[T, 10]``."""
+    """Returns what perfect sensors read, ``[T, 9]``, and position, velocity and orientation, ``[T, 10]``."""
     data = mujoco.MjData(model)
     quaternion = random.standard_normal(4)
     data.qpos[3:] = quaternion / np.linalg.norm(quaternion)

@@ -16,7 +16,7 @@ MEMORY = 64  # units of an LSTM
 
 @dataclass(frozen=True)
 class Arm:
-    """What an arm reads.
+    """Holds what an arm reads.
 
     Attributes:
         key: entry of the environment.
@@ -72,7 +72,7 @@ def memory(width: int, name: str) -> LSTMModule:
 
 
 def reader(arm: Arm, inputs: Inputs, name: str) -> tuple[list[LSTMModule], NestedKey, int, Tensor | None]:
-    """What stands before the layers of an actor or a critic; the entry that these read, its width, and its units."""
+    """Returns the modules in front of an actor or a critic, and the key, width and units of the entry that it reads."""
     if arm.memory:
         return [memory(inputs.seen, name)], f"{name}_memory", MEMORY, None
     if arm.key == "seen":

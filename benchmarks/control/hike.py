@@ -16,7 +16,7 @@ RIDGES = (((-0.4, -0.8), (0.16, 0.01)), ((0.0, 0.0), (0.01, 0.64)), ((0.4, 0.8),
 
 
 def altitude(position: Tensor) -> Tensor:
-    """How high the ground is at ``[*, 2]``: three ridges make a path from the lower left to the upper right."""
+    """Tells how high the ground is at ``[*, 2]``: three ridges make a path from the lower left to the upper right."""
     ridges = []
     for center, spread in RIDGES:
         mean, variance = position.new_tensor(center), position.new_tensor(spread)

@@ -45,7 +45,7 @@ def told(filter: Filter | None, noise: float) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Budget:
-    """What all arms of all tasks may use.
+    """Holds what all arms of all tasks may use.
 
     Attributes:
         env_steps: in the place of the task's; ``None`` for those.
@@ -65,7 +65,7 @@ class Budget:
 
 
 def batches_of(task: Task, budget: Budget) -> tuple[int, list[int]]:
-    """How many batches of episodes a run has, and after which of them it is tested."""
+    """Tells how many batches of episodes a run has, and after which of them it is tested."""
     batches = max(1, (budget.env_steps or task.env_steps) // (task.count * task.steps))
     return batches, [number for number in range(1, batches + 1) if number * budget.tests % batches < budget.tests]
 

@@ -59,7 +59,7 @@ def arms_of(task: str, cell: tuple[float, float]) -> tuple[str, ...]:
 
 
 def part(study: Study, task: str, cell: tuple[float, float], arm: str, seed: int) -> Path:
-    """Where a run leaves its rows."""
+    """Tells where a run leaves its rows."""
     name = arm.replace(", ", "-").replace(" ", "-")
     return study.out / "parts" / task / f"{cell[0]:g}-{cell[1]:g}" / f"{name}-{seed}.json"
 

@@ -1,4 +1,4 @@
-"""What both tasks say about themselves, and what can happen to a sensor."""
+"""Describes both tasks, and what can happen to a sensor."""
 
 from __future__ import annotations
 

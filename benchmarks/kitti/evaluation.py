@@ -136,7 +136,7 @@ def errors(states: Tensor, truth: Tensor) -> list[dict]:
 
 
 def calibration(belief: TensorDict) -> dict[str, float]:
-    """How far the spread of (v, theta_dot) tells the error, over all rows but the first, which is given."""
+    """Tells how far the spread of (v, theta_dot) tells the error, over all rows but the first, which is given."""
     equal = "ensemble" in belief["belief"] and "log_weight" not in belief["belief"]
     members = belief["belief", "ensemble"].shape[1] if equal else None
     mean, variance, truth = (value.double() for value in counted(belief, VELOCITIES, FLOOR))

@@ -30,7 +30,7 @@ class Statistics:
 
     @property
     def unit(self) -> torch.Tensor:
-        """What counts as an error of one, in (m/s, rad/s)."""
+        """Returns what counts as an error of one, in (m/s, rad/s)."""
         return self.scale * torch.tensor(UNITS)
 
 

@@ -54,7 +54,7 @@ def sensor_loss(sensor: SubModel, unit: Tensor) -> SensorLoss:
 
 @dataclass(frozen=True)
 class SensorTraining:
-    """How the sensors of a study are trained: alone, and as stand-ins.
+    """Tells how the sensors of a study are trained: alone, and as stand-ins.
 
     Args:
         kind: name of the sensor.
@@ -127,7 +127,7 @@ class SensorTraining:
 
 @dataclass
 class SensorOfFold:
-    """What all filters of a fold share: the trained sensor and its readings of drives that it has not seen."""
+    """Holds what all filters of a fold share: the trained sensor and its readings of drives that it has not seen."""
 
     kind: str
     sensor: SubModel

@@ -58,7 +58,7 @@ class Study:
 
     @property
     def begun(self) -> Path:
-        """Where the rendered drives and the first training of the sensor are."""
+        """Tells where the rendered drives and the first training of the sensor are."""
         return self.first or self.out
 
     def rendered_parts(self) -> tuple[list[Part], list[Part]]:

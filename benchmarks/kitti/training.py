@@ -82,7 +82,7 @@ def calibration_error(recipe: KITTIRecipe, model: Filter, readings: Sequence[Ten
 
 
 def log_gains(fold: Fold, base: SensorOfFold) -> Tensor:
-    """How far off a sensor's speed is over each whole drive that it has not seen: logarithms of read by driven."""
+    """Returns logarithms of the speed read by the speed driven, over each whole drive that a sensor has not seen."""
     drives = zip(fold.tune, base.readings[::2], strict=True)
     clean = [torch.cat([first, last]) for part, (first, last, _) in drives if part.stream.condition == "clean"]
     return torch.stack([gain_of(reading) for reading in clean])

@@ -1,1 +1,1 @@
-"""How fast is a walking robot's base, by its inertial sensor, joints and feet?"""
+"""Estimates how fast a walking robot's base is, by its inertial sensor, joints and feet."""

@@ -55,7 +55,7 @@ SPREADS = (0.05,) * 3  # m/s
 
 @dataclass(frozen=True)
 class Study:
-    """How well does a policy walk on a belief about its base's velocity?"""
+    """Tests how well a policy walks on a belief about its base's velocity."""
 
     out: Path = Path("runs/walk")  # folder for policy.md, walk.gif and weights; what is finished is not run again
     robots: int = 32  # side by side

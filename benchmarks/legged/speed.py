@@ -1,4 +1,4 @@
-"""What a step costs: thousands of robots in one batch, a loop of single filters, and a packaged step.
+"""Measures what a step costs: thousands of robots in one batch, a loop of single filters, and a packaged step.
 
 python -m benchmarks.legged.speed --out benchmarks/legged/results
 """
@@ -23,7 +23,7 @@ from torch_denkf.deployment import export_step, load_step
 
 @dataclass(frozen=True)
 class Speed:
-    """What does a step of a legged robot's filter cost?"""
+    """Measures what a step of a legged robot's filter costs."""
 
     out: Path | None = None  # folder for speed.md
     robots: int = 4096  # in a batch
@@ -34,7 +34,7 @@ class Speed:
 
 @torch.no_grad()
 def rows(study: Speed) -> pd.DataFrame:
-    """Of each filter microseconds a robot and step in a batch and alone, and milliseconds packaged."""
+    """Times each filter: microseconds a robot and step in a batch and alone, and milliseconds packaged."""
     robot, found = simulated("quadruped", 1, 0.1, 0, FIRM), {}
     readings = robot.log[0, 5:7].select("imu", "joints", "joint_rates", "contact")
     for name, options in KINDS.items():

@@ -28,7 +28,7 @@ KEPT = [("belief", "mean"), ("belief", "velocity")]
 
 @dataclass(frozen=True)
 class Start:
-    """How long does a filter take to find where up is?"""
+    """Measures how long a filter takes to find where up is."""
 
     out: Path | None = None  # folder for start.md
     runs: int = 8

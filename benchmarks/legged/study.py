@@ -64,7 +64,7 @@ Part = Literal["quadruped", "humanoid", "icub"]
 
 @dataclass(frozen=True)
 class Study:
-    """How fast is a walking robot's base, by its inertial sensor, joints and feet?"""
+    """Estimates how fast a walking robot's base is, by its inertial sensor, joints and feet."""
 
     out: Path = Path("runs/legged")  # folder for legged.csv, legged.md and legged.png
     icub: Path = Path("../shared/data/icub")  # with walking.npz and model.urdf; left out where they are missing

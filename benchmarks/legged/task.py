@@ -169,7 +169,7 @@ def base_pose(robot: Robot, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def scores(robot: Robot, velocity: Tensor, var: Tensor, mean: Tensor | None = None) -> dict[str, float]:
-    """How wrong the base's velocity, tilt and path are, and how wide the velocity's intervals.
+    """Tells how wrong the base's velocity, tilt and path are, and how wide the velocity's intervals.
 
     Args:
         robot: with its log.

@@ -118,7 +118,7 @@ class Walk(EnvBase):
 
 
 def up_of(turn: Tensor) -> Tensor:
-    """Where up is in the axes of an orientation ``[*, 4]``."""
+    """Returns where up is in the axes of an orientation ``[*, 4]``."""
     return rotate(SO3().inverse(turn), turn.new_tensor([0.0, 0.0, 1.0]).expand(*turn.shape[:-1], 3))
 
 

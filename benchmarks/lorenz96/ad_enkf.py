@@ -53,7 +53,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """What is observed, and what is learned."""
+        """Returns what is observed, and what is learned."""
         observed = "all" if self.every == 1 else f"1 in {self.every}"
         return f"{observed} | {self.radius or 'none'} | {'F, Q' if self.learn_noise else 'F'}"
 

@@ -66,7 +66,7 @@ def simulate(variables: int, steps: int, records: int, rng: torch.Generator) -> 
 
 
 def observe(states: torch.Tensor, every: int, rng: torch.Generator) -> TensorDict:
-    """What the filter gets: ``observation`` ``[*B, T, variables / every]``, and nothing else."""
+    """Returns what the filter gets: ``observation`` ``[*B, T, variables / every]``, and nothing else."""
     seen = states[..., ::every]
     return TensorDict({"observation": seen + R * torch.randn(seen.shape, generator=rng)}, states.shape[:-1])
 

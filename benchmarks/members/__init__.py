@@ -1,1 +1,1 @@
-"""How many members does an ensemble need?"""
+"""Tells how many members an ensemble needs."""

@@ -26,7 +26,7 @@ TITLES = {"walks": "ten walks", "lorenz96": "Lorenz-96", "ur5": "UR5 arm"}  # ot
 
 @dataclass(frozen=True)
 class Study:
-    """How many members does an ensemble need, with and without localisation by significance?"""
+    """Tells how many members an ensemble needs, with and without localisation by significance."""
 
     out: Path | None = None  # folder for members.csv, members.md and members.png; rows that are there stay
     runs: Path = Path("runs/members")  # demos of the UR5 and the trained motion of the manipulator, made where missing

@@ -43,7 +43,7 @@ WALKS, WALK_STD, READING_STD = 10, 0.1, 0.5  # walks, each step of one, each rea
 
 @dataclass(frozen=True)
 class Score:
-    """How good a filter is: its error in the task's unit, and the share of the truth in its 90 % intervals."""
+    """Tells how good a filter is: its error in the task's unit, and the share of the truth in its 90 % intervals."""
 
     error: float
     held: float

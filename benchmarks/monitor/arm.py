@@ -30,7 +30,7 @@ FAULTS = ("camera pushed", "encoder slipped")
 
 @dataclass(frozen=True)
 class ArmGuard:
-    """What is chosen on validation demos, see :mod:`benchmarks.monitor.choice`.
+    """Holds what is chosen on validation demos, see :mod:`benchmarks.monitor.choice`.
 
     Attributes:
         rate: false alarms a step that the monitor is calibrated for, before the margin.
@@ -82,7 +82,7 @@ def arm_filter() -> Filter:
 
 
 def arm_sensors() -> dict[str, MonitoredSensor]:
-    """What to watch."""
+    """Returns what to watch."""
     return {
         "camera": MonitoredSensor(
             ("info", "analysis"), 10, noise_key=("sensor", "noise"), sign_key="moved", signs=1, floor=MOVED
@@ -93,7 +93,7 @@ def arm_sensors() -> dict[str, MonitoredSensor]:
 
 @torch.no_grad()
 def read_demos(folder: Path, split: str, fault: str, cache: Path) -> TensorDict:
-    """What camera and encoders read of whole demos ``[N, T]``, with ``"fault"`` ``[N, T, 1]``."""
+    """Returns what camera and encoders read of whole demos ``[N, T]``, with ``"fault"`` ``[N, T, 1]``."""
     model = from_pretrained("ur5-table")
     data = UR5ExperienceReplay(folder, split=split, cache=cache, progress=False)
     generator, demos = torch.Generator().manual_seed(0), []
@@ -161,7 +161,7 @@ def arm_gate(known: TensorDict, guard: ArmGuard = CHOSEN) -> Filter:
 
 
 def demo_runs(monitor: InnovationMonitor, beliefs: dict[str, TensorDict]) -> dict[str, list[Run]]:
-    """What the monitor says, by fault."""
+    """Returns what the monitor says, by fault."""
     return {fault: runs_of(monitor, each) for fault, each in beliefs.items()}
 
 
@@ -201,7 +201,7 @@ def believe(model: Filter, demos: TensorDict, draws: int, seed: int = 0) -> Tens
 
 
 def runs_of(monitor: InnovationMonitor, beliefs: TensorDict) -> list[Run]:
-    """What a monitor says of beliefs ``[N, T]``."""
+    """Returns what a monitor says of beliefs ``[N, T]``."""
     said = monitor.replay(beliefs)["monitor"]
     evidence = torch.maximum(said["camera", "evidence"], said["encoders", "evidence"])
     parts = (evidence, said["alarm"], beliefs["fault"])

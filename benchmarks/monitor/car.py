@@ -30,7 +30,7 @@ MOVING = 2.0  # m/s: slower cars tell nothing of a scale
 
 @dataclass(frozen=True)
 class CarGuard:
-    """What is chosen on validation drives, see :mod:`benchmarks.monitor.choice`.
+    """Holds what is chosen on validation drives, see :mod:`benchmarks.monitor.choice`.
 
     Attributes:
         rate: share of the clean readings whose speed is taken from the flow, because it contradicts the road.
@@ -47,7 +47,7 @@ CHOSEN = CarGuard()
 
 
 class CarGates(NamedTuple):
-    """What answers to signs.
+    """Holds what answers to signs.
 
     Attributes:
         pictures: takes out readings by what their pictures show.
@@ -60,7 +60,7 @@ class CarGates(NamedTuple):
     scale: float
 
     def seen(self, reading: TensorDict) -> Tensor:
-        """Which readings the pictures leave, ``[N, 1]``."""
+        """Tells which readings the pictures leave, ``[N, 1]``."""
         signs = TensorDict({"signs": reading["signs"][:, BLIND], "observed": reading["observed"]}, [len(reading)])
         return self.pictures(signs)["seen"]
 
@@ -181,7 +181,7 @@ def compared(plain: Sequence[TensorDict], gated: Sequence[TensorDict]) -> dict[s
 
 
 def runs_of(monitor: InnovationMonitor, beliefs: TensorDict) -> list[Run]:
-    """What the monitor says of beliefs ``[K, N]``."""
+    """Returns what the monitor says of beliefs ``[K, N]``."""
     said = monitor.replay(beliefs)["monitor"]
     parts = (said["camera", "evidence"], said["alarm"], beliefs["fault"])
     return [Run(*row) for row in zip(*(part.squeeze(-1) for part in parts), strict=True)]

@@ -47,13 +47,13 @@ ALWAYS: dict[str, Callable] = {
 
 
 def stretches(frames: int) -> Tensor:
-    """Which of so many frames are of a fault, ``[frames]``."""
+    """Tells which of so many frames are of a fault, ``[frames]``."""
     number = torch.arange(frames)
     return (number % PERIOD >= PERIOD - LENGTH) & (number < frames // PERIOD * PERIOD)
 
 
 def failing(root: Path, name: str, fault: str, cache: Path, steps: int = 1, *, repair: bool = False) -> TensorDict:
-    """What the trained sensor reads of a whole drive ``[N]``.
+    """Returns what the trained sensor reads of a whole drive ``[N]``.
 
     ``"fault"`` ``[N, 1]`` says which pairs of pictures are of the fault; ``"signs"`` ``[N, 6]`` are those of ``SIGNS``.
     The last two, of the flow, are NaN where a plain reading is of the fault, and of pairs of more than one step.
@@ -146,7 +146,7 @@ def _motion(
 def _read(
     root: Path, name: str, fault: str, steps: int, known: TensorDict | None, cache: Path, *, repair: bool = False
 ) -> TensorDict:
-    """What the sensor reads, of a drive of which some may be known ``[N]``."""
+    """Returns what the sensor reads, of a drive of which some may be known ``[N]``."""
     car, motion = from_pretrained("car-odometry"), _motion(root, name, fault, steps, known, cache, repair=repair)
     out = read_sensor(car.sensor, motion, car.settings.longest).set("fault", motion["fault"])
     if known is None:

@@ -1,4 +1,4 @@
-"""What a gate costs a car whose camera is sound: ``python -m benchmarks.monitor.responses --root RENDERED``."""
+"""Measures the cost of a gate where the camera is sound: ``python -m benchmarks.monitor.responses --root RENDERED``."""
 
 from __future__ import annotations
 

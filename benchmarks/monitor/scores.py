@@ -1,4 +1,4 @@
-"""How soon and how surely an alarm tells a fault, and what a gate makes of it."""
+"""Tells how soon and how surely an alarm tells a fault, and what a gate makes of it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ AFTER = 10  # steps after a fault in which an alarm is neither right nor wrong, 
 
 
 class Run(NamedTuple):
-    """What a monitor said of one run; all ``[T]``.
+    """Holds what a monitor said of one run; all ``[T]``.
 
     Attributes:
         evidence: of which 1 is the limit.

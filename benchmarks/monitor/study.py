@@ -79,7 +79,7 @@ def rows_of(study: Study, task: str) -> list[dict]:
 
 
 def trials_of(study: Study, task: str) -> list[dict]:
-    """What is tried for one task on drives or demos that are in no test, and in the last row what is chosen."""
+    """Returns what is tried for one task on drives or demos that are in no test, and in the last row what is chosen."""
     if task == "ur5":
         from benchmarks.monitor.arm import chosen_on, own_demos
         from benchmarks.monitor.choice import choose_arm

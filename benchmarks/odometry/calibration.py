@@ -1,4 +1,4 @@
-"""How wrong the speed is for longer than a second, on drives with known poses.
+"""Tells how wrong the speed is for longer than a second, on drives with known poses.
 
 ``python -m benchmarks.odometry.calibration --root KITTI --out FOLDER``
 

@@ -40,8 +40,7 @@ class Case:
         name: what is damaged, and how; unique in its border.
         words: arguments, keys or files that were damaged: a clear message has one of them as a word.
         act: does what a user would do, in an empty folder that it is given.
-        right: whether a result is right, as the sound part of the input tells; ``None`` where the input must be
-            refused.
+        right: whether a result is right, as the sound part of the input tells; ``None`` where it must raise.
         within: s in which it must be over.
     """
 

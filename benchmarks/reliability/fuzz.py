@@ -43,7 +43,7 @@ def row(case: Case, verdict: Verdict, again: str) -> Row:
 
 
 class Found(AssertionError):
-    """An input that is neither refused clearly nor right."""
+    """Holds an input that neither raises clearly nor is right."""
 
 
 def search(cases: st.SearchStrategy[Case], count: int, seed: int, words: str) -> list[Row]:

@@ -169,7 +169,7 @@ def slip(folder: Path = FOLDER, seed: int = 0) -> None:
 
 @torch.no_grad()
 def other_lens(folder: Path = FOLDER) -> None:
-    """What KITTI's lens does to each meter: the lens of another day may be as far off."""
+    """Returns what KITTI's lens does to each meter: the lens of another day may be as far off."""
     found = drive(folder, "0022")
     lenses = calibrated(found.camera), found.camera
     motions = [corner_motions(found.rows, lens, CornerNoise(**CORNERS)).motion for lens in lenses]

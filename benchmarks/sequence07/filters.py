@@ -70,12 +70,12 @@ class LastMotion(SubModel):
         super().__init__(nn.Identity(), [("forecast", "ensemble"), "dt"], [("forecast", "observation")])
 
     def compute(self, ensemble, dt):
-        """Where the twist leads in the time of a row."""
+        """Tells where the twist leads in the time of a row."""
         return SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2))
 
 
 class WhitenedMotion(SubModel):
-    """How far a member's motion is from the reading, ``[*B, E, 6]``, in standard deviations that are independent.
+    """Tells how far a member's motion is from the reading, ``[*B, E, 6]``, in standard deviations that are independent.
 
     An ensemble's update takes variances and no covariance. The reading of this model is zero, with variances of one.
     """
@@ -92,7 +92,7 @@ class WhitenedMotion(SubModel):
 
 
 class TurnRate(SubModel):
-    """What the gyro reads, ``[*B, E, 3]`` in rad/s."""
+    """Predicts what the gyro reads, ``[*B, E, 3]`` in rad/s."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])

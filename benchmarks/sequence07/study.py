@@ -40,7 +40,7 @@ COLUMNS = Columns(
 
 @dataclass(frozen=True)
 class Study:
-    """How far off is a car that sees stereo corners and turn rates, on KITTI's odometry sequence 07?"""
+    """Measures how far off a car is that sees stereo corners and turn rates, on KITTI's odometry sequence 07."""
 
     data: Path = Path("../shared/data")  # with kitti_inertial/0027.npz and kitti/poses/07.txt
     out: Path | None = None  # folder for sequence07.csv, sequence07.md and sequence07.png
@@ -98,7 +98,7 @@ def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict
 
 
 def claimed(out: TensorDict, true: Tensor, prefix: str = "belief") -> Claim:
-    """What a filter claims of windows ``[W, K]``, over each of ``STEPS``."""
+    """Returns what a filter claims of windows ``[W, K]``, over each of ``STEPS``."""
     mean, var = pose_of(out, prefix)
     at = torch.tensor(STEPS)
     return Claim(mean[:, at], var[:, at], true[:, at])
@@ -106,7 +106,7 @@ def claimed(out: TensorDict, true: Tensor, prefix: str = "belief") -> Claim:
 
 @torch.no_grad()
 def run(model: Filter, data: TensorDict) -> TensorDict:
-    """What the study needs of what is written, from the same seed."""
+    """Returns what the study needs of what is written, from the same seed."""
     torch.manual_seed(0)
     wanted = {("belief", "mean"), ("forecast", "mean"), ("forecast", "cov"), ("forecast", "ensemble")}
     return model.sequence(data.clone(), keep=[key for key in model.out_keys if key in wanted])

@@ -81,7 +81,7 @@ def in_condition(rows: TensorDict, condition: Condition, seed: int) -> TensorDic
 def readings(
     folder: Path, name: str, conditions: Sequence[Condition] = ("as it is",), count: int | None = None, seed: int = 0
 ) -> TensorDict:
-    """What a filter reads in each condition, ``[C, T]``: motion with covariance, turn rates, masks, time steps.
+    """Returns what a filter reads in each condition, ``[C, T]``: motion with covariance, turn rates, masks, time steps.
 
     The camera triggers regularly, and its stamps tremble by a millisecond: each row is given the median step.
     """

@@ -11,7 +11,7 @@ from benchmarks.smoothing.systems import SYSTEMS, simulate
 
 
 def installed() -> bool:
-    """Whether DAPPER is there."""
+    """Tells whether DAPPER is there."""
     return importlib.util.find_spec("dapper") is not None
 
 

@@ -32,7 +32,7 @@ class Case:
     ess_threshold: float | None = None
 
     def labels(self) -> dict:
-        """What tells this case's rows from others'."""
+        """Returns what tells this case's rows from others'."""
         return {"system": self.system, "method": self.method, **({} if self.lag is None else {"lag": self.lag})}
 
     @property

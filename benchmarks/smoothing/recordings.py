@@ -1,4 +1,4 @@
-"""What the trained sensors of the package read of whole recordings: KITTI's drives, and demonstrations of the UR5."""
+"""Reads whole recordings by the package's trained sensors: KITTI's drives, and demonstrations of the UR5."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def kitti(root: Path, out: Path, *, smoke: bool = False) -> Task:
 
 
 def drive(car: CarFilter, root: Path, name: str, cache: Path) -> TensorDict:
-    """What the sensor reads of a drive; the first state is the true pose with the velocities that it reads first."""
+    """Returns the readings of a drive; the first state is the true pose with the velocities that are read first."""
     data = Drive(root, name, car.settings.size, cache).read()
     reading = all_frames(read_spans(car.sensor, [data], car.settings.longest))
     start = reading["state"].clone()
@@ -142,6 +142,6 @@ def side_by_side(recordings: Iterable[tuple[str, TensorDict]]) -> Group:
 
 
 def tasks(root: Path | None, out: Path, *, smoke: bool = False) -> list[Callable[[], Task]]:
-    """What makes each task; KITTI's where there are data."""
+    """Returns what makes each task; KITTI's where there are data."""
     made: list[Callable[[], Task]] = [partial(ur5, out / "ur5", smoke=smoke)]
     return [partial(kitti, root, out / "kitti", smoke=smoke), *made] if root else made

@@ -1,4 +1,4 @@
-"""What the machine can do, measured in the same run: matrix peak and memory bandwidth of one thread."""
+"""Measures what the machine can do, measured in the same run: matrix peak and memory bandwidth of one thread."""
 
 from __future__ import annotations
 

@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from benchmarks.common.quaternions import exp, matrix, product, right_jacobian, skew
 from benchmarks.speed.pairs import Row, interleave
-from benchmarks.speed.quaternions import exp, matrix, product, right_jacobian, skew
 from benchmarks.speed.workload import make_filter, make_frames, make_gaussian_filter
 from torch_denkf.filters import Filter, KalmanFilter
 from torch_denkf.fusion import FusedFilter, FusedSensor

@@ -43,7 +43,7 @@ class Row:
 
     @property
     def met(self) -> bool | None:
-        """Whether the target is met; ``None`` without a target or a measurement."""
+        """Tells whether the target is met; ``None`` without a target or a measurement."""
         return None if self.target is None or self.ratio is None else self.least <= self.ratio <= self.target
 
     @property
@@ -52,7 +52,7 @@ class Row:
         return MET[self.met]
 
     def as_dict(self) -> dict:
-        """What is written to JSON."""
+        """Returns what is written to JSON."""
         return {name: value for name, value in asdict(self).items() if name != "least"} | {"met": self.met}
 
 

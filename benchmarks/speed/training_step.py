@@ -112,7 +112,7 @@ step(), step()
 
 
 def resident_mib(name: str, batch: int, steps: int) -> float:
-    """What a training step takes beyond model and batch, in MiB, in a process of its own."""
+    """Returns what a training step takes beyond model and batch, in MiB, in a process of its own."""
     return resident_peak(PREPARE.format(name=name, batch=batch, steps=steps), ACT) / 2**20
 
 

@@ -1,4 +1,4 @@
-"""What DEnKFTransform adds to an environment's step at B = 1: a replay of KITTI's layout, and dm_control's reacher.
+"""Measures the cost of DEnKFTransform in an environment's step at B = 1: a KITTI replay, and dm_control's reacher.
 
     python -m benchmarks.speed.transform_cost --out benchmarks/speed/results/transform_cost.md
 
@@ -104,7 +104,7 @@ class Stepper:
 
 
 def example_step(env: EnvBase, filter: DEnKF) -> TensorDict:
-    """What a step of the environment gives the filter, to export from."""
+    """Returns what a step of the environment gives the filter, to export from."""
     start = env.rand_action(env.reset())
     frame = env.step(start.copy())["next"].select("reading", "encoder", "observed", strict=False)
     return filter.initialise(frame.update(start.select("action", "state", strict=False)))
@@ -183,7 +183,7 @@ def table(found: dict[str, Timings], command: str, elapsed: float) -> str:
 
 @dataclass
 class TransformCost:
-    """What DEnKFTransform adds to an environment's step at B = 1."""
+    """Measures what DEnKFTransform adds to an environment's step at B = 1."""
 
     rounds: int = 41  # measurements of each
     out: Path | None = None  # write the table to this Markdown file

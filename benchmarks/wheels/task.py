@@ -38,12 +38,12 @@ def moved(state: Tensor) -> Tensor:
 
 
 def turn_rate(state: Tensor) -> Tensor:
-    """What the gyro reads, with its bias."""
+    """Returns what the gyro reads, with its bias."""
     return state[..., 4:5] + state[..., 5:6]
 
 
 def wheel_speed(state: Tensor) -> Tensor:
-    """What the wheels read, by their scale."""
+    """Returns what the wheels read, by their scale."""
     return state[..., 3:4] * state[..., 6:7]
 
 

@@ -90,7 +90,7 @@ def names():
 
 
 def comment(package, name):
-    """What stands behind a constant in the source."""
+    """Returns what stands behind a constant in the source."""
     for file in Path(package.__file__).parent.rglob("*.py"):
         found = re.search(rf"^{name} = .*?  # (.+)$", file.read_text(), re.MULTILINE)
         if found:

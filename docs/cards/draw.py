@@ -18,7 +18,7 @@ BLUE, ORANGE, GREEN = "#0072B2", "#E69F00", "#009E73"
 
 
 def program(index: int) -> dict:
-    """What a program of the page leaves behind."""
+    """Runs a program of the page; returns the names that it defines."""
     page = (ROOT / "docs" / "start" / "three_ways.md").read_text()
     names: dict = {}
     exec(re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)[index], names)

@@ -60,7 +60,7 @@ train, unseen = record(300, 60), record(50, 100)
 
 
 class BobPosition(torch.nn.Module):
-    """What the camera reads of a state: [..., 2] to [..., 1]."""
+    """Predicts what the camera reads of a state: [..., 2] to [..., 1]."""
 
     def forward(self, state: torch.Tensor) -> torch.Tensor:
         """The sine of the angle."""

@@ -78,7 +78,7 @@ class Wheels(Transition):
         super().__init__(torch.nn.Identity(), [("belief", "ensemble"), "wheels"], [("forecast", "ensemble")])
 
     def noise_sizes(self, ensemble, *_):
-        """How many members there are."""
+        """Tells how many members there are."""
         return {"members": ensemble.shape[-2]}
 
     def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):

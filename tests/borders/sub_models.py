@@ -45,7 +45,7 @@ GIVEN: dict[str, Any] = {
 
 
 def row(states: int = 2) -> TensorDict:
-    """What a step of two readings may find."""
+    """Returns what a step of two readings may find."""
     made = TensorDict({"observation": torch.zeros(2), "action": torch.zeros(1), "state": torch.zeros(2)})
     for place in ("belief", "forecast", "sensor", "analysis"):
         made[place, "ensemble"] = torch.randn(8, 2 if place == "sensor" else states)

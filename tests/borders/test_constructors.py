@@ -29,8 +29,8 @@ EYE, ZERO, ONE = torch.eye(2), torch.zeros(2), torch.ones(2)
 PARTS = {"transition": EYE, "process_noise_cov": EYE, "observation": EYE, "noise_cov": EYE, "mean": ZERO, "cov": EYE}
 
 
-def refused(make, *words, error=ValueError):
-    """The message, which holds these words."""
+def message_of(make, *words, error=ValueError):
+    """Returns the message of what is raised; it holds these words."""
     with pytest.raises(error) as caught:
         make()
     message = str(caught.value)
@@ -50,7 +50,7 @@ def test_noises_of_a_kalman_filter(noises, words):
 
 
 KALMAN = partial(KalmanFilter, **PARTS)
-REFUSED = {
+WRONG = {
     "circular": (lambda: Flat(2, circular=[-1]), "circular", "got -1"),
     "a space of fewer": (lambda: KALMAN(reading_space=Circle()), "reading_space", "2 rows of matrix"),
     "no double": (lambda: DiagonalNoise(2, r=0.1, floor=0.02), "r^2 - floor of DiagonalNoise", "-0.0"),
@@ -66,11 +66,11 @@ REFUSED = {
 WRONG_TYPES = ("dt", "error of a sensor", "a class", "visibility")
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_refused(name):
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_argument_is_named(name):
     """The message begins with the argument's name, and has its value."""
-    make, *words = REFUSED[name]
-    assert refused(make, *words, error=TypeError if name in WRONG_TYPES else ValueError).startswith(words[0])
+    make, *words = WRONG[name]
+    assert message_of(make, *words, error=TypeError if name in WRONG_TYPES else ValueError).startswith(words[0])
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.applications.car.kitti.test_drive import make
-from tests.borders.test_constructors import refused
+from tests.borders.test_constructors import message_of
 from torch_denkf.applications.car import KITTIReplayEnv, read_kitti_drive, with_motion
 from torch_denkf.applications.car.kitti.frames import frames_at
 from torch_denkf.applications.car.kitti.gaps import bridge_gaps
@@ -45,7 +45,7 @@ CLOCKS = {
 def test_clocks_that_are_wrong_throughout(root, case):
     times, *words = case
     set_times(root, times)
-    refused(lambda: read(root), *words)
+    message_of(lambda: read(root), *words)
 
 
 def test_a_gap_of_a_hundred_seconds(root):

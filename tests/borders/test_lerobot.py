@@ -9,7 +9,7 @@ import pyarrow.parquet as parquet
 import pytest
 import torch
 
-from tests.borders.test_constructors import refused
+from tests.borders.test_constructors import message_of
 from tests.data.lerobot.lerobot_folder import FPS, SIZE, joints, write_version_2, write_version_3
 from tests.data.lerobot.test_errors import edit_table
 from torch_denkf.data import LeRobotReplay
@@ -31,17 +31,17 @@ def root(tmp_path):
 def test_nothing_a_second_or_a_chunk(root, key):
     info = json.loads((root / INFO).read_text())
     (root / INFO).write_text(json.dumps({**info, key: 0}))
-    refused(lambda: open_all(root), f"{key} in", INFO, "got 0")
+    message_of(lambda: open_all(root), f"{key} in", INFO, "got 0")
 
 
 def test_an_episode_that_is_listed_twice(tmp_path, root):
     (root / EPISODES).write_text((root / EPISODES).read_text() + '{"episode_index": 0, "length": 12}\n')
-    refused(lambda: open_all(root), EPISODES, "lists episode 0 twice")
+    message_of(lambda: open_all(root), EPISODES, "lists episode 0 twice")
     write_version_3(tmp_path / "newer", [[6, 5]])
     file = tmp_path / "newer/meta/episodes/chunk-000/file-000.parquet"
     table = parquet.read_table(file)
     parquet.write_table(pa.concat_tables([table, table.slice(1)]), file)
-    refused(lambda: open_all(tmp_path / "newer"), "file-000.parquet", "lists episode 1 twice")
+    message_of(lambda: open_all(tmp_path / "newer"), "file-000.parquet", "lists episode 1 twice")
 
 
 def set_stamps(root, stamps):

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 
 from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
-from tests.borders.test_constructors import refused
+from tests.borders.test_constructors import message_of
 from torch_denkf.applications.ur5 import UR5ExperienceReplay
 from torch_denkf.applications.ur5.data.files import COMMAND, MANIFEST, read_manifest, write_demo, write_manifest
 
@@ -22,7 +22,7 @@ def test_a_damaged_line(root):
     """It dropped its demo; collecting goes on without it and makes it again."""
     lines = (root / MANIFEST).read_text().splitlines()
     (root / MANIFEST).write_text("\n".join([lines[0], '{"demo": 1, "fi', *lines[2:], ""]))
-    refused(lambda: open_all(root), f"{MANIFEST}:2", '{"demo": 1, "fi', COMMAND)
+    message_of(lambda: open_all(root), f"{MANIFEST}:2", '{"demo": 1, "fi', COMMAND)
     with pytest.warns(UserWarning, match=rf"{MANIFEST}:2 is damaged .*; its demo is made again"):
         assert list(read_manifest(root, skip_damaged=True)) == [0, 2, 3]
 

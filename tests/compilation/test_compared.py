@@ -105,7 +105,7 @@ def test_two_of_four_numbers_are_read(options):
         ),
     ],
 )
-def test_a_compiler_that_is_wrong_is_refused(sequence, readings):
+def test_a_compiler_that_is_wrong_raises(sequence, readings):
     filter, size = kalman(), [2, 3] if sequence else [2]
     frames = TensorDict({"observation": torch.randn(*size, 3)}, size)
     if readings != "numbers":
@@ -135,7 +135,7 @@ def test_the_error_names_the_entry_and_the_number():
         filter.compile(backend=compiler(one_more)).step(row)
 
 
-def test_a_wrong_gradient_is_refused_where_a_sequence_is_trained():
+def test_a_wrong_gradient_raises_where_a_sequence_is_trained():
     """The backward pass alone is wrong. That of a step is not compiled before someone wants it."""
 
     def doubled(graph, example):

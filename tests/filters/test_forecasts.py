@@ -33,7 +33,7 @@ def test_forecasts_are_told_by_their_names(float64):
     assert (out["forecast", "speed"][:, 1:] > 0).all()
 
 
-def test_two_forecasts_of_one_name_are_refused_until_one_is_named():
+def test_two_forecasts_of_one_name_raise_until_one_is_named():
     F, *_ = linear_system()
 
     class Two(NoisyLinear):
@@ -52,7 +52,7 @@ def test_two_forecasts_of_one_name_are_refused_until_one_is_named():
         linear_with({"transition": Two()}, forecast_keys={ENSEMBLE: ("nowhere", "ensemble")})
 
 
-def test_a_module_that_undoes_another_is_refused():
+def test_a_module_that_undoes_another_raises():
     again = EnsembleAnalysis("etkf", observation_key="observation")
     with pytest.raises(ValueError, match=r"over what 'analysis' .* before any module has read it"):
         linear_with({**dict(linear_denkf().module.named_children()), "again": again})

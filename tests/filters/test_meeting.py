@@ -112,7 +112,7 @@ class Groups(EnvBase):
 
 
 @pytest.mark.parametrize("each", [True, False])
-def test_a_belief_that_torchrl_would_not_reset_is_refused(each):
+def test_a_belief_that_torchrl_would_not_reset_raises(each):
     filter = random_walk()
     for transform in (
         DEnKFTransform(filter),

@@ -35,8 +35,8 @@ FEATURES = (
     "stored belief",
 )
 #: Inflation would spread the past anew with each reading.
-REFUSED = {("late reading", "inflation"), ("joint past", "inflation")}
-PAIRS = [pair for pair in combinations(FEATURES, 2) if pair not in REFUSED]
+APART = {("late reading", "inflation"), ("joint past", "inflation")}
+PAIRS = [pair for pair in combinations(FEATURES, 2) if pair not in APART]
 EAGER = ("loop", "sequence", "transform", "policy")
 ALL = tuple(feature for feature in FEATURES if feature != "inflation")
 ROWS, T, BEGIN = 2, 9, 4
@@ -265,8 +265,8 @@ def test_pairs_are_the_filter_in_numpy(float64, pair, way):
     check(pair, way)
 
 
-@pytest.mark.parametrize("pair", sorted(REFUSED), ids=" + ".join)
-def test_pairs_that_are_refused(float64, pair):
+@pytest.mark.parametrize("pair", sorted(APART), ids=" + ".join)
+def test_pairs_that_raise(float64, pair):
     with pytest.raises(ValueError, match="inflation"):
         build(pair)
 

@@ -48,7 +48,7 @@ class Count(SubModel):
         return count + 1
 
 
-def test_a_module_of_a_users_own_that_reads_what_it_writes_is_refused():
+def test_a_module_of_a_users_own_that_reads_what_it_writes_raises():
     with pytest.raises(ValueError, match=r"'count' \(Count\) writes 'count', which the filter also reads from outside"):
         camera(("count", Count()))
     tally = TensorDictModule(lambda count: count + 1, ["count"], ["count"])

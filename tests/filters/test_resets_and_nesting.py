@@ -58,7 +58,7 @@ def blocks(**info):
     return Filter({**noises, "transition": plain["transition"], **blocks}, initial=plain.initial)
 
 
-def test_analyses_inside_sequences_count_all_or_are_refused(float64):
+def test_analyses_inside_sequences_count_all_or_raise(float64):
     with pytest.raises(ValueError, match="each its own info_prefix"):
         blocks()
     filter, both = blocks(named=True), linear_denkf()
@@ -70,7 +70,7 @@ def test_analyses_inside_sequences_count_all_or_are_refused(float64):
     torch.testing.assert_close(likelihood[:, 1:], exact["info", "log_likelihood"][:, 1:])
 
 
-def test_a_belief_that_no_module_passes_on_is_refused():
+def test_a_belief_that_no_module_passes_on_raises():
 
     class WithBias(FixedEnsemble):
         def __init__(self, members):
@@ -92,7 +92,7 @@ def test_a_belief_that_no_module_passes_on_is_refused():
         linear_with({"transition": Biased()}, initial=WithBias(linear_denkf().initial.members))
 
 
-def test_a_buffer_that_filters_before_its_slices_are_marked_is_refused():
+def test_a_buffer_that_filters_before_its_slices_are_marked_raises():
     frames = TensorDict({"observation": torch.randn(80, 2), "episode": torch.arange(80) // 20}, [80])
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(80),

@@ -252,7 +252,7 @@ def test_gradients_are_finite_also_behind_masks_and_half_a_turn_away(kind):
 # -------------------------------------------------------------------------------------------------------- what is told
 
 
-def test_what_does_not_fit_is_refused():
+def test_what_does_not_fit_raises():
     with pytest.raises(TypeError, match=r"space is a Space, such as SO3\(\)"):
         AroundState([0.1] * 3, space="SO3")
     with pytest.raises(ValueError, match=r"tangent has shape \[4\]; a tangent of SO3\(\) is \[\*, 3\]"):

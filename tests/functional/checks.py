@@ -4,7 +4,7 @@ import pytest
 import torch
 
 
-def assert_refused(error, words, call, /, *args, **kwargs):
+def assert_raises(error, words, call, /, *args, **kwargs):
     """``call(*args, **kwargs)`` raises ``error``, and its message holds ``words``, a regular expression."""
     with pytest.raises(error, match=words):
         call(*args, **kwargs)

@@ -6,7 +6,7 @@ import shutil
 import pytest
 import torch
 
-from tests.functional.checks import assert_compiled_is_eager, assert_refused
+from tests.functional.checks import assert_compiled_is_eager, assert_raises
 from torch_denkf.functional import analyse, crps_ensemble, energy_score, ensemble_mean, kalman_predict, kalman_update
 from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
@@ -243,7 +243,7 @@ def test_errors_name_the_argument(change, message):
         "observation": torch.zeros(5, 3),
         "noise": torch.ones(3),
     }
-    assert_refused(ValueError, message, analyse, **arguments | change)
+    assert_raises(ValueError, message, analyse, **arguments | change)
 
 
 @pytest.mark.parametrize("scheme", ["sensor", "perturbed", "sakov"])

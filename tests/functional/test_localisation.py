@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from tests.functional.checks import assert_refused
+from tests.functional.checks import assert_raises
 from torch_denkf.functional import analyse, kalman_update, letkf, neighbours
 from torch_denkf.functional.localisation import Neighbours, gaspari_cohn, neighbours_of_taper
 from torch_denkf.functional.moments import ensemble_cov
@@ -90,7 +90,7 @@ def test_neighbours_of_a_taper_are_its_positive_entries():
     found = neighbours_of_taper(taper, tile=2)
     torch.testing.assert_close(torch.zeros(3, 4).scatter_add_(1, found.index, found.taper), taper)
     assert found.index.shape == (3, 3)
-    assert_refused(ValueError, r"\[S, O\]", neighbours_of_taper, taper[0])
+    assert_raises(ValueError, r"\[S, O\]", neighbours_of_taper, taper[0])
 
 
 @pytest.mark.parametrize("period", [None, (10.0, math.inf), (10.0, 7.0)])

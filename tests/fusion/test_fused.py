@@ -303,7 +303,7 @@ def test_an_ensemble_with_a_lag_inflates_its_present_alone(float64):
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_inflation_that_would_spread_the_past_is_refused(joint):
+def test_inflation_that_would_spread_the_past_raises(joint):
     members = torch.randn(7, 2)
     for kind, analysis in SPREAD.items():
         with pytest.raises(ValueError, match=r"inflation or relaxation of .* let Refiltering make them again"):
@@ -502,7 +502,7 @@ def test_each_component_of_a_reading_has_its_own_error(float64):
         assert_close(out[key], expected[key], rtol=0, atol=1e-10)
 
 
-def test_what_is_refused():
+def test_what_raises():
     F, Q, H, R = linear_system(torch.float32)
     moments = {"initial": MomentPrior(torch.zeros(2), torch.eye(2))}
     members = {"initial": GaussianPrior([0.0] * 2, [1.0] * 2, ensemble_size=4)}
@@ -540,7 +540,7 @@ def test_what_is_refused():
 @pytest.mark.parametrize(
     ("marker", "observed"), [(BlackIsMissing(), "seen"), (BlackIsMissing(observed_key="other"), "mine")]
 )
-def test_a_mask_that_the_sensor_would_not_read_is_refused(marker, observed):
+def test_a_mask_that_the_sensor_would_not_read_raises(marker, observed):
     """The mask of the data goes through the one that the sensor makes, and neither is dropped."""
     camera = TensorDictSequential(marker, VectorSensor(3, 1, ensemble_size=4, in_key="pixels"))
     with pytest.raises(ValueError, match=f"observed_key= names '{observed}', which it would not read"):

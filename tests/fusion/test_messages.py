@@ -191,7 +191,7 @@ GPS = [(float(k), "gps", [0.1 * (k % 7)]) for k in range(20)]
         ([(0.0, "gps", [1.0], ["wide"])], {}, "Message 0, of 'gps', has a noise that is no number"),
     ],
 )
-def test_a_log_that_makes_no_sense_is_refused(log, options, message):
+def test_a_log_that_makes_no_sense_raises(log, options, message):
     with pytest.raises((ValueError, KeyError), match=message):
         message_rows(log, **options)
 

@@ -137,7 +137,7 @@ def test_noise_that_is_not_given_is_drawn_once_and_actions_drive_the_next_step(f
     assert_close(window.belief["belief", "ensemble"], again["belief", "ensemble"], rtol=0, atol=1e-12)
 
 
-def test_what_is_refused(float64):
+def test_what_raises(float64):
     filter, frames = fused("Kalman"), arriving(readings(), PATTERNS["out of order"])
     late = {"delay": DELAY}, {"delay": DELAY, "late_key": "late"}
     twice = [fused("Kalman", joint=joint, **options) for options in late for joint in (False, True)]

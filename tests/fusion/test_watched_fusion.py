@@ -95,7 +95,7 @@ def test_monitors_read_the_diagnostics_of_each_sensor(float64):
     assert two.monitor.monitor_prefix == "other"
 
 
-def test_two_monitors_of_one_name_are_refused():
+def test_two_monitors_of_one_name_raise():
     with pytest.raises(ValueError, match="monitor_prefix='monitor2'"):
         Monitored(Monitored(fused(), watch("first")), watch("second"))
 
@@ -111,7 +111,7 @@ def test_single_readings_of_a_joint_update_are_left_out_of_no_wrapped_filter(wra
 
 
 @pytest.mark.parametrize("told", [1, 3])
-def test_another_number_of_components_than_the_reading_has_is_refused(told):
+def test_another_number_of_components_than_the_reading_has_raises(told):
     monitor = InnovationMonitor({"both": MonitoredSensor("info", told)})
     for filter in (Gated(fused(joint=True), told), Monitored(fused(joint=True), monitor)):
         with pytest.raises(ValueError, match="pass observation_dim=2"):

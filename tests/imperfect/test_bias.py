@@ -134,7 +134,7 @@ def test_each_component_gets_its_biases():
     torch.testing.assert_close(read["forecast", "observation"], torch.tensor([[1.02, 2.31]]))
 
 
-def test_what_cannot_be_is_refused():
+def test_what_cannot_be_raises():
     with pytest.raises(ValueError, match="time, in steps"):
         FadingBias([1.0], time=0.0)
     with pytest.raises(ValueError, match="2 components of the reading, and there are 1"):
@@ -291,7 +291,7 @@ def test_errors_of_a_whole_run_beside_those_that_fade():
     assert (one.log_time.exp() > 20).all()  # one time for both kinds fits neither
 
 
-def test_white_residuals_and_few_are_refused():
+def test_white_residuals_and_few_raise():
     with pytest.raises(ValueError, match="do not last"):
         FadingBias.from_residuals(torch.randn(50, 100, 1, generator=torch.Generator().manual_seed(1)))
     with pytest.raises(ValueError, match="it takes 100"):

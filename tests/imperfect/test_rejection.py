@@ -127,7 +127,7 @@ def test_a_quaternion_of_zeros_is_no_rotation():
 
 
 @pytest.mark.parametrize("shape", [(3, 1), (3, 4), (3,), (3, 2, 2)])
-def test_a_reading_of_another_size_than_its_space_is_refused(shape):
+def test_a_reading_of_another_size_than_its_space_raises(shape):
     td = TensorDict({"pose": torch.ones(shape)}, [3])
     with pytest.raises(ValueError, match=r"'pose' has shape .*; a point of SE2\(\) is \[\*, 3\]"):
         RejectReadings({"pose": "seen"}, spaces={"pose": SE2()})(td)

@@ -252,7 +252,7 @@ def test_a_head_says_what_it_was_told_to_start_from():
             Visibility(4, **wrong)
 
 
-def test_what_cannot_be_is_refused():
+def test_what_cannot_be_raises():
     inner = EnsembleAnalysis("etkf")
     with pytest.raises(ValueError, match="broad"):
         Visible(inner, broad=1.0)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.functional.checks import assert_refused
+from tests.functional.checks import assert_raises
 from torch_denkf.metrics import ensemble_interval_coverage, interval_coverage
 
 
@@ -47,6 +47,6 @@ def test_errors_say_what_to_do():
         ensemble_interval_coverage(torch.zeros(4, 18, 2), mean)
     with pytest.raises(ValueError, match=r"ensemble must be \[\*B, E, S\]"):
         ensemble_interval_coverage(torch.zeros(4, 19, 3), mean)
-    assert_refused(ValueError, "cannot be negative", interval_coverage, mean, mean - 1, mean)
-    assert_refused(ValueError, r"shape of the mean, \[4, 2\]; got \[2\]", interval_coverage, mean, torch.ones(2), mean)
-    assert_refused(ValueError, r"in \(0, 1\); got 90", interval_coverage, mean, torch.ones(4, 2), mean, level=90)
+    assert_raises(ValueError, "cannot be negative", interval_coverage, mean, mean - 1, mean)
+    assert_raises(ValueError, r"shape of the mean, \[4, 2\]; got \[2\]", interval_coverage, mean, torch.ones(2), mean)
+    assert_raises(ValueError, r"in \(0, 1\); got 90", interval_coverage, mean, torch.ones(4, 2), mean, level=90)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy import stats
 
-from tests.functional.checks import assert_refused
+from tests.functional.checks import assert_raises
 from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.manifolds import Circle, Euclidean
 from torch_denkf.metrics import pit, spread_skill_ratio
@@ -73,7 +73,7 @@ def test_a_truth_between_two_ranks_counts_in_both():
     weight = torch.tensor([[0.5, 0.3, 0.2]]).log()
     counts = rank_histogram(members, torch.tensor([[0.5]]), log_weight=weight)  # 1.5 of three members lie below
     torch.testing.assert_close(counts, torch.tensor([[0.0, 0.5, 0.5, 0.0]], dtype=torch.float64))
-    assert_refused(
+    assert_raises(
         ValueError,
         r"log_weight must be \[\*B, E\], \[1, 3\]",
         rank_histogram,
@@ -124,8 +124,8 @@ def test_interval_is_numpys_quantile(level):
 
 def test_errors_say_what_to_do():
     ones = torch.ones(4, 2)
-    assert_refused(ValueError, "cannot be negative", pit, ones, -ones, ones)
-    assert_refused(ValueError, "must be finite", rank_histogram, torch.full((4, 3, 2), torch.nan), ones)
-    assert_refused(ValueError, r"ensemble must be \[\*B, E, S\]", rank_histogram, ones, ones)
-    assert_refused(ValueError, "needs samples and bins", histogram_band, 0, 10)
-    assert_refused(ValueError, "5 bins need at least one state each; got 4", spread_error, ones, ones, ones, bins=5)
+    assert_raises(ValueError, "cannot be negative", pit, ones, -ones, ones)
+    assert_raises(ValueError, "must be finite", rank_histogram, torch.full((4, 3, 2), torch.nan), ones)
+    assert_raises(ValueError, r"ensemble must be \[\*B, E, S\]", rank_histogram, ones, ones)
+    assert_raises(ValueError, "needs samples and bins", histogram_band, 0, 10)
+    assert_raises(ValueError, "5 bins need at least one state each; got 4", spread_error, ones, ones, ones, bins=5)

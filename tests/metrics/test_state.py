@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.functional.checks import assert_refused
+from tests.functional.checks import assert_raises
 from torch_denkf.functional.manifolds import Circle, Flat
 from torch_denkf.metrics import state_errors
 from torch_denkf.metrics.state import state_difference
@@ -48,7 +48,7 @@ def test_gradients_go_through_wrapped_angles():
 
 
 def test_errors_say_what_to_do():
-    assert_refused(ValueError, "for ensembles pass the mean", state_errors, torch.zeros(4, 8, 3), torch.zeros(4, 3))
+    assert_raises(ValueError, "for ensembles pass the mean", state_errors, torch.zeros(4, 8, 3), torch.zeros(4, 3))
     with pytest.raises(ValueError, match="point has shape"):
         state_errors(torch.zeros(4, 3), torch.zeros(4, 3), space=Circle())
-    assert_refused(ValueError, "no states", state_errors, torch.zeros(0, 3), torch.zeros(0, 3))
+    assert_raises(ValueError, "no states", state_errors, torch.zeros(0, 3), torch.zeros(0, 3))

@@ -115,14 +115,14 @@ def test_the_jacobian_has_a_gradient_unless_it_is_stopped(float64):
 
 @pytest.mark.parametrize("Transition", TRANSITIONS)
 @pytest.mark.parametrize("layer", [nn.Dropout(), FlipoutLinear(3, 3)])
-def test_random_layers_are_refused(Transition, layer):
+def test_random_layers_raise(Transition, layer):
     random = LearnedTransition(nn.Sequential(nn.Linear(3, 3), layer))
     with pytest.raises(ValueError, match=r"deterministic model; LearnedTransition holds random parts \(\['module.1'\]"):
         Transition(random, constant_noise(3))
 
 
 @pytest.mark.parametrize("Analysis", ANALYSES)
-def test_random_observation_models_are_refused_or_made_deterministic(Analysis):
+def test_random_observation_models_raise_or_made_deterministic(Analysis):
     with pytest.raises(ValueError, match="needs a deterministic model; LearnedObservation"):
         Analysis(LearnedObservation(nn.Sequential(nn.Linear(3, 3), nn.Dropout())))
     module = Analysis(LearnedObservation(StochasticMLP(3, 2, (64,), rate=0.5)))
@@ -131,7 +131,7 @@ def test_random_observation_models_are_refused_or_made_deterministic(Analysis):
 
 
 @pytest.mark.parametrize("Transition", TRANSITIONS)
-def test_sub_models_that_draw_their_own_noise_are_refused(Transition):
+def test_sub_models_that_draw_their_own_noise_raise(Transition):
     matrix, state = torch.eye(3), torch.get_rng_state()
     noisy = NoisyLinear(matrix, matrix)
     with pytest.raises(ValueError, match=r"NoisyLinear holds random parts \(\['NoisyLinear'\]"):

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from tests.filters.gaussian_for_tests import directional_check
-from tests.functional.checks import assert_refused
+from tests.functional.checks import assert_raises
 from torch_denkf.applications.car import UnicycleMotion, UnicycleNoise, UnicycleTransition
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.modules import ConstantNoise, LearnedTransition, StochasticMLP
@@ -171,4 +171,4 @@ def test_dt_may_be_an_entry_that_varies_over_rows(float64, name, key):
     for entry in module.out_keys:
         torch.testing.assert_close(out[entry], torch.stack(rows)[entry], rtol=0, atol=1e-13)
     words = f"{type(module).__name__} reads {key!r}, which is missing"
-    assert_refused(KeyError, re.escape(words), module, td)
+    assert_raises(KeyError, re.escape(words), module, td)

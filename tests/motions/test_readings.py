@@ -113,7 +113,7 @@ def test_the_jacobian_is_that_of_differences(float64, make):
         (lambda: PositionInBody(SE2(), [1.0, float("nan")]), "landmark must be finite"),
     ],
 )
-def test_what_makes_no_sense_is_refused(make, words):
+def test_what_makes_no_sense_raises(make, words):
     with pytest.raises((TypeError, ValueError), match=words):
         make()
 

@@ -71,7 +71,7 @@ def test_slices_of_different_lengths(float64, init):
 @pytest.mark.parametrize("key", ["traj_key", "end_key"])
 @pytest.mark.parametrize("init", [False, True])
 @pytest.mark.parametrize("kept", ["next", "episode", "flags"])
-def test_without_marks_slices_are_refused(key, init, kept):
+def test_without_marks_slices_raise(key, init, kept):
     data = buffer(ReplayBuffer, episodes(init=init, following=kept != "flags"), key)
     batch = data.sample()
     while not batch["episode"].diff().any():  # slices of one episode: its number says nothing
@@ -90,7 +90,7 @@ def test_without_marks_slices_are_refused(key, init, kept):
         assert loss(batch.reshape(4, 5))["loss_transition"].isfinite()
 
 
-def test_two_slices_of_one_episode_are_refused_where_a_clock_tells():
+def test_two_slices_of_one_episode_raise_where_a_clock_tells():
     rows = rows_of()
     objective()(rows)  # nothing says that these are several
     for key, clock, several in (
@@ -105,7 +105,7 @@ def test_two_slices_of_one_episode_are_refused_where_a_clock_tells():
     ):
         batch = rows.copy().set(key, clock)
         if several:
-            refused(batch, r"seems to hold several sequences.* at 6, and")
+            assert_raises(batch, r"seems to hold several sequences.* at 6, and")
             accepted(batch.set("is_init", torch.arange(12) % 6 == 0), rows.reshape(2, 6))
         else:
             accepted(batch, rows)
@@ -137,7 +137,7 @@ def test_a_rollout_is_one_sequence(ended):
 def test_an_episode_that_is_done_needs_a_mark_after_it():
     rows = rows_of().set("is_init", torch.arange(12).unsqueeze(-1) == 0)
     rows["next", "done"] = (torch.arange(12) % 6 == 5).unsqueeze(-1)
-    refused(rows, r"is done, and the next begins, at 6")
+    assert_raises(rows, r"is done, and the next begins, at 6")
 
 
 # ------------------------------------------------------------------------------------- what breaks, and what goes on
@@ -160,7 +160,7 @@ def accepted(batch, as_rows):
     torch.testing.assert_close(objective()(batch)["loss_state"], objective()(as_rows)["loss_state"])
 
 
-def refused(batch, match):
+def assert_raises(batch, match):
     with pytest.raises(ValueError, match=match):
         objective()(batch)
 
@@ -169,10 +169,10 @@ def test_a_clock_may_leap_within_slices_that_are_marked():
     """A camera that lost a frame; without marks it looks like the next slice."""
     rows = rows_of()
     batch = rows.copy().set("step", torch.tensor([0, 1, 2, 3, 4, 5, 0, 1, 2, 5, 6, 7]))
-    refused(batch.select("observation", "state", "step")[5:], "'step' does not go on")
+    assert_raises(batch.select("observation", "state", "step")[5:], "'step' does not go on")
     accepted(batch.set("is_init", torch.arange(12) % 6 == 0), rows.reshape(2, 6))
     batch["step"][10] = 0  # back, that is another one all the same
-    refused(batch, r"'step' does not go on.* at 10")
+    assert_raises(batch, r"'step' does not go on.* at 10")
 
 
 def test_the_numbers_of_the_next_step_are_one_ahead():
@@ -187,5 +187,5 @@ def test_the_numbers_of_the_next_step_are_one_ahead():
 def test_a_marked_beginning_is_enough_where_nothing_else_tells():
     rows = rows_of()
     batch = rows.copy().set(("next", "done"), torch.zeros(12, 1, dtype=torch.bool))
-    refused(batch, "may hold several sequences")
+    assert_raises(batch, "may hold several sequences")
     accepted(batch.set("is_init", (torch.arange(12) % 6 == 0).unsqueeze(-1)), rows.reshape(2, 6))

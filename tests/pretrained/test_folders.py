@@ -125,7 +125,7 @@ CHANGED = {"members": 32, "scheme": "etkf", "std": 0.25, "gain": 2.0, "key": "li
 
 
 @pytest.mark.parametrize("name", CHANGED)
-def test_settings_that_build_another_filter_are_refused(tmp_path, name):
+def test_settings_that_build_another_filter_raise(tmp_path, name):
     torch.manual_seed(0)
     model, settings = ball(), {name: CHANGED[name]}
     stored = name == "std"  # a number in a buffer comes back with the weights

@@ -18,7 +18,7 @@ from torch_denkf.modules import Select
 ROOT = Path(__file__).parents[2]
 
 
-def test_a_sample_is_refused_clearly_or_right(tmp_path):
+def test_a_sample_raises_clearly_or_right(tmp_path):
     """In a process of its own: cases are forked, and this one may have threads.
 
     The sample is the same each time. It has cases with names, and others.
@@ -47,7 +47,7 @@ def _numbers(act=lambda value, folder: check_number("lags", value, least=5)):
     return Target("test", "number", ("lags",), act, d.Wrong({"four": 4}, d.drawn(st.integers(max_value=4))))
 
 
-def test_what_is_drawn_is_refused_and_the_same_each_time():
+def test_what_is_drawn_raises_and_the_same_each_time():
     drawn = [search(_numbers().others(), 6, seed, "") for seed in (0, 0, 1)]
     assert {one["kind"] for rows in drawn for one in rows} == {"clear"}
     assert drawn[0] == drawn[1] != drawn[2]

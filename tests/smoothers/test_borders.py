@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf, toy_frames
 from tests.filters.gaussian_for_tests import directional_check
 from tests.filters.particle_for_tests import bootstrap
-from tests.functional.checks import assert_refused
+from tests.functional.checks import assert_raises
 from tests.smoothers.joint import drive, joint_beliefs
 from torch_denkf.baselines import LSTMFilter
 from torch_denkf.functional.smoothing.ensemble import enrts_step
@@ -106,7 +106,7 @@ def test_gradients_with_gaps_and_new_episodes(float64, kind):
 
 
 LSTM = partial(LSTMFilter, None, state_dim=2, observation_dim=2)
-REFUSED = [
+WRONG = [
     *((TypeError, "lag must be a whole number", partial(EnRTS, lag=lag), linear_denkf) for lag in (1.5, True, "2")),
     *((TypeError, "lag must be a whole number", partial(FixedLag, lag=lag), linear_denkf) for lag in (1.5, True, "2")),
     (ValueError, "at least 1", partial(FixedLag, lag=0), linear_denkf),
@@ -126,11 +126,11 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("error", "words", "smoother", "make"), REFUSED)
+@pytest.mark.parametrize(("error", "words", "smoother", "make"), WRONG)
 def test_what_cannot_be_smoothed_says_so(error, words, smoother, make):
-    assert_refused(error, words, smoother, make())
+    assert_raises(error, words, smoother, make())
 
 
 def test_a_belief_that_was_stored_without_a_lag_says_so():
     stored = linear_denkf().sequence(TensorDict({"observation": torch.zeros(4, 2)}, [4]))
-    assert_refused(KeyError, "stored without a lag", FixedLag(linear_denkf(), 2).sequence, stored)
+    assert_raises(KeyError, "stored without a lag", FixedLag(linear_denkf(), 2).sequence, stored)

@@ -13,7 +13,7 @@ from tests.filters.factories import (
     toy_denkf,
     toy_frames,
 )
-from tests.functional.checks import assert_refused
+from tests.functional.checks import assert_raises
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional.moments import ensemble_cov
@@ -102,7 +102,7 @@ def test_rotations_turn_the_past_as_well(float64):
     assert_close(turned["smoothed", "mean"], plain["smoothed", "mean"], rtol=0, atol=1e-9)
     assert_close(turned["smoothed", "var"], plain["smoothed", "var"], rtol=0, atol=1e-9)
     assert not torch.allclose(turned["smoothed", "ensemble"], plain["smoothed", "ensemble"])
-    assert_refused(ValueError, "rotate=True", EnRTS, rotated)
+    assert_raises(ValueError, "rotate=True", EnRTS, rotated)
 
 
 def test_several_analyses_each_correct_the_past(float64):
@@ -139,7 +139,7 @@ def test_damping_holds_the_inflation_that_goes_back(float64):
     torch.testing.assert_close(first[0], 1.5**4 * members, rtol=1e-9, atol=0)
     shift = sum(0.5**k * 1.5 ** (k - 1) * 0.5 for k in range(1, 5))  # of each step k, through k damped gains
     torch.testing.assert_close(first[1], (1 + shift) * members, rtol=1e-9, atol=0)
-    assert_refused(ValueError, "above 0 and at most 1", enrts_step, members, members, members, damping=0.0)
+    assert_raises(ValueError, "above 0 and at most 1", enrts_step, members, members, members, damping=0.0)
 
 
 @pytest.mark.parametrize("lag", [None, 1])
@@ -160,7 +160,7 @@ def test_inflation_needs_a_damping(float64, lag):
     assert_close(unread(first, "smoothed"), unread(first, "belief"), rtol=1e-9, atol=0)
     filter["analysis"].inflation = 1.2
     for make in (lambda: EnRTS(filter, lag), lambda: still(frames.copy())):  # now, and set since it was made
-        assert_refused(ValueError, r"EnsembleAnalysis has inflation=1.2.*damping=.*EnKS or FixedLag", make)
+        assert_raises(ValueError, r"EnsembleAnalysis has inflation=1.2.*damping=.*EnKS or FixedLag", make)
     carried = EnRTS(filter, lag, damping=1.0)(frames.copy())
     assert (unread(carried, "smoothed")[:, 1:-1] > 1.19 * unread(carried, "belief")[:, 1:-1]).all()
     EnRTS(filter, lag, damping=0.8)(frames.copy())

@@ -141,7 +141,7 @@ def test_a_gate_opens_to_readings_of_an_ensemble_as_to_those_of_a_kalman_filter(
 
 
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
-def test_adapted_spread_is_refused_where_the_past_is_observed(float64, kind):
+def test_adapted_spread_raises_where_the_past_is_observed(float64, kind):
     """It is inflation; around a filter without a past it is that of readings in their order."""
     with pytest.raises(ValueError, match="Refiltering"):
         Gated(fused(kind, delay=3, members=torch.randn(7, 2)), adapt_inflation=0.1)

@@ -74,7 +74,7 @@ def test_a_failed_write_leaves_the_old_file(file, monkeypatch):
     assert read_checkpoint(file)["update"] == 7
 
 
-def test_compressed_parts_are_refused_before_they_are_unpacked(tmp_path):
+def test_compressed_parts_raise_before_they_are_unpacked(tmp_path):
     """torch stores its parts as they are; compressed ones could become a thousand times as large."""
     file = tmp_path / "bomb.pt"
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -1,4 +1,4 @@
-"""The example of many machines: what it refuses, what SAC gets, and workers under ray, where that is installed."""
+"""The example of many machines: what raises, what SAC gets, and workers under ray, where that is installed."""
 
 import importlib.util
 from pathlib import Path

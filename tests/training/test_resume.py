@@ -113,7 +113,7 @@ def test_settings_must_be_the_same_and_stages_may_be_added(tmp_path, caplog):
     assert again["scalars/filter/loss.csv"].count(b"\n") == 1
 
 
-def test_another_model_is_refused(tmp_path):
+def test_another_model_raises(tmp_path):
     def trainer(width):
         net = torch.nn.Linear(width, 1)
         return FilterTrainer(net, [Stage("fit", None, None, 1)], out=tmp_path, device="cpu")

@@ -1,11 +1,11 @@
-"""The transform on frames that are missing, broken or not there at all, and what it refuses."""
+"""The transform on frames that are missing, broken or not there at all, and what raises."""
 
 import pytest
 import torch
 from torchrl.envs import Compose, DoubleToFloat, TransformedEnv
 
 from tests.filters.factories import assert_equal, linear_denkf
-from tests.functional.checks import assert_refused
+from tests.functional.checks import assert_raises
 from tests.transforms.envs_for_tests import BELIEF, Changed, base_env, random_filter, toy_base_env, toy_filter
 from torch_denkf.imperfect import RejectReadings
 from torch_denkf.transforms import DEnKFTransform
@@ -50,7 +50,7 @@ def test_observed_nan_raises_and_names_the_key(make_base, make_filter):
         )
 
     assert make().rollout(2).shape == (3, 2)
-    assert_refused(ValueError, r"NaN or infinity in \['observation'\].*RejectReadings", make().rollout, 8)
+    assert_raises(ValueError, r"NaN or infinity in \['observation'\].*RejectReadings", make().rollout, 8)
     # Where such a reading is rejected the beliefs are those under a mask that tells the truth.
     reject = RejectReadings({"observation": "observed"})
     assert_equal(make(reject).rollout(8)["next"], make(honest=True).rollout(8)["next"], BELIEF)
@@ -60,7 +60,7 @@ def test_divergence_is_told_apart():
     filter = linear_denkf()
     filter["transition"].matrix.mul_(1e30)
     env = TransformedEnv(base_env(), DEnKFTransform(filter))
-    assert_refused(ValueError, "all inputs are finite, and the filter diverged", env.rollout, 5)
+    assert_raises(ValueError, "all inputs are finite, and the filter diverged", env.rollout, 5)
 
 
 # ------------------------------------------------------------------------------------------------------ errors

@@ -160,7 +160,7 @@ def test_a_transform_that_writes_over_the_carry_is_named(float64, make, key):
 
 
 @pytest.mark.parametrize("given", ["mean", "cov"])
-def test_a_part_of_a_belief_given_to_reset_is_refused(float64, given):
+def test_a_part_of_a_belief_given_to_reset_raises(float64, given):
     env = env_with(linear_kalman())
     start = env.reset()
     lacking = ({"mean", "cov"} - {given}).pop()

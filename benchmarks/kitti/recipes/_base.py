@@ -1,4 +1,4 @@
-"""How to compose, train and tune a filter; the registry."""
+"""Composes, trains and tunes filters; the registry."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class KITTIRecipe(Recipe):
         return DiagonalNoise(2, r=self.unit, in_features=self.encoding, in_key=("sensor", "encoding"))
 
     def observation(self, **kwargs) -> PairObservation:
-        """What is read of pairs of frames: metres by the flow sensor; one that was trained on grey values hedges."""
+        """Reads pairs of frames: metres by the flow sensor; one that was trained on grey values hedges."""
         if self.flow:
             return PairObservation([REACH / self.facts.dt, torch.inf], curve=SpeedGain(), **kwargs)
         return PairObservation(curve=SensorCurve(self.facts.loc, self.facts.scale), **kwargs)

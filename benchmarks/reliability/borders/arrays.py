@@ -504,7 +504,7 @@ READ = {**dict.fromkeys(("imu", "joints", "joint_rates"), _LOG), "contact": _FLA
 
 
 def _of_robots() -> Iterator[Target]:
-    """What filters of legged robots read, what their networks learn from, and what their environment takes."""
+    """Returns readings of filters of legged robots, rows that networks learn from, and arguments of environments."""
     for kind in ("EKF", "UKF", "DEnKF"):
         source = Source("legged robots", legged.log, partial(legged.run, kind), f"{kind} reads ")
         right = source.like(near=1e-4)

@@ -50,7 +50,7 @@ class Work:
         result: all that it leaves.
         words: one of them is in the message where it cannot write; none where disks are not tried.
         killed: whether it is killed, too.
-        alone: whether a second process may be refused; ``None`` where that is not tried.
+        alone: whether a second process may raise; ``None`` where that is not tried.
     """
 
     do: Callable[[Path], Any]
@@ -273,13 +273,13 @@ def two(name: str) -> dict[str, Any]:
         statuses = [os.waitpid(child, 0)[1] for child in children]
         said = [one.read_text().strip().splitlines()[-1] for one, status in zip(logs, statuses, strict=True) if status]
         result, left = ends_equal(work, broken, sound, sound), left_behind(broken)
-    refused = not said or (work.alone and len(said) == 1 and str(broken) in said[0])
+    sound = not said or (work.alone and len(said) == 1 and str(broken) in said[0])
     return {
-        "refused": len(said),
+        "raised": len(said),
         "message": " ".join(said).replace(str(broken), "FOLDER"),
         "result": result,
         "left behind": left,
-        "right": bool(refused) and result == "right" and not left,
+        "right": bool(sound) and result == "right" and not left,
     }
 
 

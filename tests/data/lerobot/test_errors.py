@@ -187,7 +187,7 @@ def test_tables_that_are_damaged_or_contradict_the_metadata(tmp_path):
 
 @pytest.mark.parametrize("key", ["data_path", "video_path"])
 @pytest.mark.parametrize("version", [2, 3])
-def test_paths_that_lead_out_of_the_data_set_are_refused(tmp_path, version, key):
+def test_paths_that_lead_out_of_the_data_set_raise(tmp_path, version, key):
     root, elsewhere = tmp_path / "robot", tmp_path / "elsewhere"
     write_version_2(root, [4, 4]) if version == 2 else write_version_3(root, [[4, 4]])
     open_all(root)
@@ -208,7 +208,7 @@ def test_paths_that_lead_out_of_the_data_set_are_refused(tmp_path, version, key)
     assert len(open_all(root)) == 8
 
 
-def test_bombs_are_refused_before_they_are_unpacked(tmp_path):
+def test_bombs_raise_before_they_are_unpacked(tmp_path):
     write_version_2(tmp_path, [4, 4], images="bytes")
     episodes = tmp_path / "meta/episodes.jsonl"
     text = episodes.read_text()

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.borders.test_constructors import refused as refuses
+from tests.borders.test_constructors import message_of
 from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf
 from tests.filters.gaussian_for_tests import learned_filter
 from tests.filters.particle_for_tests import bootstrap, toy_filter
@@ -58,7 +58,7 @@ def test_labels_of_another_shape(make, case):
     if make is LOSSES["TransitionLoss"] and options:  # a step starts from all of the state, whatever is scored
         words = ["'state' is [4, 5, 3]"] if options["dims"] == [2] else ["whole true state of 2", "'state' has 1"]
     data = TensorDict({"observation": torch.zeros(4, 5, 2), **entries}, [4, 5])
-    refuses(lambda: make(**options)(data), *words)
+    message_of(lambda: make(**options)(data), *words)
 
 
 # ------------------------------------------------------------------------------------------- settings, missing entries
@@ -84,7 +84,7 @@ SETTINGS = [
 
 @pytest.mark.parametrize(("loss", "options", "words"), SETTINGS)
 def test_settings(loss, options, words):
-    refuses(lambda: LOSSES[loss](**options), words)
+    message_of(lambda: LOSSES[loss](**options), words)
 
 
 OBSERVATION, SENSOR = only(TERMS, "observation"), only(TERMS, "sensor")
@@ -105,19 +105,19 @@ MISSING = [
 def test_missing_entries(left_out, loss, make, options, words):
     frames, _ = problem(toy_denkf())
     frames = frames.set("observation", torch.zeros(2, 7, 2)).exclude(left_out, "noise")
-    refuses(lambda: loss(make(), **options)(frames), *words, error=KeyError)
+    message_of(lambda: loss(make(), **options)(frames), *words, error=KeyError)
 
 
 # --------------------------------------------------------------------------------------------- another kind of belief
 
 
-def test_another_belief_is_refused_and_the_right_loss_named():
+def test_another_belief_raises_and_the_right_loss_named():
     data = TensorDict({"observation": torch.zeros(4, 5, 2), "state": torch.zeros(4, 5, 2)}, [4, 5])
     for score in ("crps", "energy", "mse"):
         loss = DEnKFLoss(bootstrap(8), score=score)
-        refuses(lambda loss=loss: loss(data), "log_weight", "MixtureLoss", 'score="crps"', error=TypeError)
+        message_of(lambda loss=loss: loss(data), "log_weight", "MixtureLoss", 'score="crps"', error=TypeError)
     smoothed = DEnKFLoss(bootstrap(8), state=0.0, transition=0.0, smoothed=1.0, smoother=particle_smoother)
-    refuses(lambda: smoothed(data), "log_weight", "MixtureLoss", error=TypeError)
+    message_of(lambda: smoothed(data), "log_weight", "MixtureLoss", error=TypeError)
     wrong = [DEnKFLoss(linear_kalman()), MixtureLoss(linear_kalman())]
     wrong += [GaussianLoss(linear_denkf("etkf")), GaussianLoss(bootstrap(8))]
     for loss in wrong:
