@@ -1,4 +1,4 @@
-"""The suite on ``device="meta"``, a stand-in for a GPU: it raises where devices are mixed, and at every look at a number."""
+"""The suite on ``device="meta"``, a stand-in for a GPU: it raises at mixed devices and at each look at a number."""
 
 import pytest
 import torch
