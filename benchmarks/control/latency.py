@@ -1,8 +1,9 @@
-"""Robots whose actions run late: a policy on the belief ahead, on the belief of now, on readings; and an LSTM.
+"""Compares policy inputs under action latency: predicted belief, current belief, raw readings; and an LSTM policy.
 
-``python -m benchmarks.control.latency``. A pendulum and an arm of two links. The policy is one of the true state
-without delay, by value iteration for the pendulum, a regulator for the arm: nothing is learned, what it sees alone
-differs. The filter knows the robot. The LSTM is trained by PPO for each delay, and sees the actions under way.
+``python -m benchmarks.control.latency``. The robots are a pendulum and an arm of two links. One fixed policy per robot
+is optimal for the true state without delay: value iteration for the pendulum, a linear regulator for the arm. Only its
+input changes. The filter has the true motion model. The LSTM is trained by PPO for each delay; its input has the
+actions that were sent and have not run yet.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Latency:
     episodes: int = 100  # a seed
     grid: int = 61  # angles, and speeds
     env_steps: int = 100_000  # of an LSTM's training, with the first noise; 0 for none
-    page: Path | None = None  # where to leave the table
+    page: Path | None = None  # file for the table
 
 
 def moved(angle: Tensor, speed: Tensor, torque: Tensor) -> tuple[Tensor, Tensor]:
@@ -250,10 +251,11 @@ def main() -> None:
     """Writes the table."""
     study = parse(Latency)
     lines = [
-        f"{study.seeds * study.episodes} episodes. In brackets: the share of what the belief gains over no motor "
-        f"without delay. An LSTM has {study.env_steps:,} steps of PPO for each delay, one seed.",
+        f"Mean return over {study.seeds * study.episodes} episodes, by the policy's input. The percentages put no "
+        "motor at 0 and the policy on the belief without delay at 100. An LSTM is trained by PPO for each delay, on "
+        f"{study.env_steps:,} steps and one seed.",
         "",
-        *head("robot", "noise", "delay, ms", *SHOWN, "LSTM"),
+        *head("robot", "sensor noise", "delay (ms)", *SHOWN, "LSTM"),
     ]
     for name in study.robots:
         of = robot(name, study.grid)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import SubModel
 
-#: What a sensor does for a while, without a word.
+#: Faults of a sensor, which no mask announces.
 FAULTS = ("frozen", "offset", "noise")
 STARTUP = 0.5  # seconds, in which the first readings come
 FEATURE_STEPS = 5  # readings of which the spread is a feature
@@ -27,7 +27,8 @@ class Task:
         rate: of the filter's steps, in Hz.
         offsets: by sensor, what a fault adds, in the reading's units.
         noises: by sensor, standard deviations of the readings.
-        failing: the sensors of which one fails in a training window; those that matter most stand there twice.
+        failing: sensors from which the faulty one of a training window is drawn; a name that is there twice is drawn
+            twice as often.
         slope: of the weights before training, see :class:`~torch_denkf.fusion.SensorAttention`.
         updates: of the noise and of the weights.
         late: by sensor, by how many more steps its readings come late where it is delayed.

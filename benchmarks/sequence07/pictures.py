@@ -13,13 +13,13 @@ from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
 
 __all__ = ["draw"]
 
-CONDITION = "as it is"
+CONDITION = "recorded"
 LENGTHS = (100, 200, 300, 400, 500, 600)  # m; the drive has 695
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 
 
 def draw(paths: Mapping, claims: Mapping, poses: Tensor, steps: Sequence[int], file: Path) -> None:
-    """Draws the drive as it is.
+    """Draws the drive as recorded.
 
     Args:
         paths: by condition and filter, ``[T, 7]``.

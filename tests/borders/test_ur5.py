@@ -1,4 +1,4 @@
-"""Damaged collections of UR5 demos: refused by file and line."""
+"""Damaged collections of UR5 demos: the error names file and line."""
 
 from functools import partial
 
@@ -18,8 +18,8 @@ def root(tmp_path):
     return tmp_path
 
 
-def test_a_damaged_line(root):
-    """It dropped its demo; collecting goes on without it and makes it again."""
+def test_damaged_line_of_the_manifest(root):
+    """A damaged line of the manifest raises; a collection skips it with a warning, and records that demo again."""
     lines = (root / MANIFEST).read_text().splitlines()
     (root / MANIFEST).write_text("\n".join([lines[0], '{"demo": 1, "fi', *lines[2:], ""]))
     message_of(lambda: open_all(root), f"{MANIFEST}:2", '{"demo": 1, "fi', COMMAND)
@@ -27,13 +27,13 @@ def test_a_damaged_line(root):
         assert list(read_manifest(root, skip_damaged=True)) == [0, 2, 3]
 
 
-def test_a_last_line_that_is_being_written(root):
+def test_incomplete_last_line_is_skipped(root):
     text = (root / MANIFEST).read_text()
     (root / MANIFEST).write_text(text[:-20])
     assert [episode.demo for episode in open_all(root).episodes] == [0, 1, 2]
 
 
-def test_the_same_line_twice_is_one_demo(root):
+def test_duplicate_line_is_one_demo(root):
     entry = write_demo(root, make_demo(2, 8))
     write_manifest(root, [*read_manifest(root).values(), entry])
     assert len(open_all(root).episodes) == 4
