@@ -264,7 +264,7 @@ def page(rows: list[dict], study: Study) -> str:
         f"filter's covariance, over its expectation: above 1 a filter is too sure. The {LEVEL:.0%} intervals are those "
         "of the tilt about x and about y.",
     ]
-    titles = ("filter", "setting", "tilt, deg", "largest, deg", "orientation, deg", "NEES", "held", "ms a step")
+    titles = ("filter", "setting", "tilt, deg", "largest, deg", "orientation, deg", "NEES", "coverage", "ms a step")
     for data, reads in dict.fromkeys((row["data"], row["reads"]) for row in rows):
         lines += ["", f"## {data}: {reads}", "", *head(*titles)]
         for row in rows:

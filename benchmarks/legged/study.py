@@ -42,7 +42,7 @@ SCORES = {
     "tilt": ("tilt, deg", 2),
     "drift": ("drift, %", 1),
     "nees": ("NEES", 2),
-    "held": ("held", 2),
+    "held": ("coverage", 2),
     "ms": ("ms a step", 0),
 }
 HEADS = ("joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)")
@@ -186,7 +186,7 @@ def page(frame: pd.DataFrame, study: Study) -> str:
         "Velocity is the root mean square error of the base's velocity, all three axes together, in the base's axes; "
         "tilt that of where up is. Drift is how far the end of the path is off, over the path's length. NEES is the "
         "squared error of the velocity in units of the variance, over its expectation: above 1 a filter is too sure. "
-        f"Held is the share of true velocities within the {LEVEL:.0%} intervals.",
+        f"Coverage is the share of true velocities within the {LEVEL:.0%} intervals.",
     ]
     frame = frame.reindex(columns=["data", "filter", "draws", *SCORES, *NOISES])
     shown = frame[["filter", "draws"]].assign(

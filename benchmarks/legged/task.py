@@ -179,7 +179,7 @@ def scores(robot: Robot, velocity: Tensor, var: Tensor, mean: Tensor | None = No
 
     Returns:
         ``velocity``, the root mean square error of the velocity in m/s, and ``certain``, the same without rows whose
-        truth is in doubt; ``held``, the share of the true velocities in the intervals; ``nees``, the mean of square
+        truth is in doubt; ``held``, the coverage of the intervals; ``nees``, the mean of square
         error by variance; ``nll``, the mean negative log-likelihood. With ``mean`` also ``tilt`` in degrees, and
         ``drift``, how far the end of the path is off, in % of its length.
     """

@@ -79,7 +79,7 @@ def page(rows: list[dict], study: Study) -> str:
         'Error, and share of the truth within the 90 % intervals, without and with `localisation="significance"`.',
         "Validation data of the same kind choose the threshold, and of Lorenz-96 the inflation.",
         "",
-        *head("task", "error", "members", "without", "held", "with", "held", "threshold"),
+        *head("task", "error", "members", "without", "coverage", "with", "coverage", "threshold"),
     ]
     for name in tasks.ERRORS:
         own = pick(rows, task=name)

@@ -30,10 +30,10 @@ NEAREST = 0.05  # of the true speed: a reading that is smaller, or negative, cou
 
 @dataclass(frozen=True)
 class Calibration:
-    """The doubt about a factor on the speed, of each drive by the others, and of all."""
+    """Options of the calibration of the speed's scale error: for each drive on the others, and on all."""
 
     root: Path  # folder with sequences and poses
-    out: Path = Path("runs/calibrated")  # gets the filter, with the doubt that all drives say
+    out: Path = Path("runs/calibrated")  # folder for the filter, calibrated on all drives
     checkpoint: str = "car-odometry"  # that of the library, or a folder that denkf train left
     draws: int = 8  # of the filter's noise
 
@@ -49,32 +49,35 @@ def lasting_square(car: CarFilter, root: Path, name: str) -> float:
     return error[: count * SECOND].view(count, SECOND).mean(1).square().mean().item()
 
 
-def doubted(checkpoint: str, std: float) -> CarFilter:
-    """The filter, with a doubt about its factor on the speed."""
+def with_scale_std(checkpoint: str, std: float) -> CarFilter:
+    """Returns the filter with a standard deviation of its speed's scale error."""
     car = from_pretrained(checkpoint)
     car["gain"].log_std.data[0] = torch.tensor(std).log()
     return car
 
 
 def root_mean(squares: Mapping[str, float]) -> float:
-    """Of some drives, each counted alike."""
+    """Returns the root of the mean over drives, with equal weights."""
     return fmean(squares.values()) ** 0.5
 
 
 def main() -> None:
-    """Calibrates, scores, and leaves the filter."""
+    """Calibrates, scores, and saves the filter."""
     study = parse(Calibration)
     torch.set_num_threads(1)
     car, names = from_pretrained(study.checkpoint), list_kitti_drives(study.root)
     squares = {name: lasting_square(car, study.root, name) for name in names}
     made_by = command("odometry.calibration")
-    print(f"`{made_by}`. Each drive is scored with the doubt that the others say; empty: shorter than 100 m.\n")
-    columns = "drive", "doubt by the others", "m/m", "devkit, %", "v held, %", "turn rate held, %"
-    print("\n".join(head(*columns, "sensor: m/m", "devkit, %")))
+    print(
+        f"`{made_by}`. Each drive is scored with the standard deviation of the other drives. Drives shorter than 100 m have no devkit error.\n"
+    )
+    columns = "drive", "scale std by the other drives", "m/m", "devkit, %"
+    coverage = "coverage of v (%)", "coverage of the turn rate (%)"
+    print("\n".join(head(*columns, *coverage, "sensor: m/m", "devkit, %")))
     for name in names:
         std = root_mean({other: square for other, square in squares.items() if other != name})
         options = {"draws": study.draws, "progress": False}
-        rows, _ = evaluate_car_filter(doubted(study.checkpoint, std), study.root, [name], **options)
+        rows, _ = evaluate_car_filter(with_scale_std(study.checkpoint, std), study.root, [name], **options)
         found = {row["method"]: row for row in rows}
         errors = [
             text
@@ -88,7 +91,7 @@ def main() -> None:
         print(line(name, f"{std:.3f}", *errors[:2], *held, *errors[2:]), flush=True)
     std = root_mean(squares)
     record = {"command": made_by, "drives": names, "doubt": std}
-    save_pretrained(doubted(study.checkpoint, std), study.out, training={"calibration": record})
+    save_pretrained(with_scale_std(study.checkpoint, std), study.out, training={"calibration": record})
     print(f"by all drives: {std:.3f}; {study.out}")
 
 

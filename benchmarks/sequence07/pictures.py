@@ -47,7 +47,7 @@ def draw(paths: Mapping, claims: Mapping, poses: Tensor, steps: Sequence[int], f
             for at, step in enumerate(steps):
                 claimed.plot(LEVELS, held[:, at], f"C{at}{marker}-", lw=1, ms=4, label=f"{name}, {step} rows")
     claimed.plot([0, 1], [0, 1], "k--", lw=1)
-    claimed.set(xlabel="claimed", ylabel="held", title="relative motion: intervals")
+    claimed.set(xlabel="nominal", ylabel="coverage", title="relative motion: intervals")
     for axis in (above, along, claimed):
         axis.grid(alpha=0.3)
         axis.legend(fontsize=7)

@@ -156,7 +156,7 @@ def drift(path: Tensor, poses: Tensor) -> dict[str, float]:
 
 
 def alone(study: Study, data: TensorDict, poses: Tensor, count: int) -> Iterator[tuple[dict, Tensor]]:
-    """Rows and paths without a filter: motions one after the other, the last one held where none is seen."""
+    """Yields rows and paths of chained motions without a filter, with zero-order hold for missing motions."""
     for number, condition in enumerate(CONDITIONS):
         seen = data[number]["motion_observed"].squeeze(-1)
         motions, found = naive(study.data, "0027", condition, count, study.seed)
@@ -174,11 +174,11 @@ def page(rows: Sequence[dict], count: int) -> str:
         "# Sequence 07 of KITTI",
         "",
         f"Odometry sequence 07, {count} rows: stereo corners and turn rates. Errors are KITTI's own, in six "
-        f"dimensions, over 100 to 800 m. *Held*: the share of errors within the {LEVEL:.0%} intervals, of the six "
-        f"numbers of the motion over 1, 10 and 100 rows; a start every {EVERY} rows. Rows of ensembles are means over "
-        f"{DRAWS} draws, with their standard deviation.",
+        f"dimensions, over 100 to 800 m. *Coverage*: the share of errors within the {LEVEL:.0%} intervals, for "
+        f"the six components of the motion over 1, 10 and 100 rows; a reset every {EVERY} rows. Rows of ensembles are means "
+        f"over {DRAWS} seeds, with their standard deviation.",
     ]
-    titles = ("filter", "translation, %", "rotation, deg/100 m", *(f"held, {step}" for step in STEPS), "ms a row")
+    titles = ("filter", "translation, %", "rotation, deg/100 m", *(f"coverage, {step}" for step in STEPS), "ms a row")
     for condition in CONDITIONS:
         lines += ["", f"## {condition.capitalize()}", "", *head(*titles)]
         for row in rows:
@@ -190,11 +190,11 @@ def page(rows: Sequence[dict], count: int) -> str:
                 lines.append(line(row["filter"], *numbers))
     lines += [
         "",
-        "*Corners lost*: none for 10 rows in each 100. *Wrong corners*: 20 % of the corners are up to 30 pixels off in "
-        "the later row, in both images by different amounts.",
+        "*Dropout*: no corners for 10 rows in each 100. *Outliers*: 20 % of the corners of the later row have an error "
+        "of up to 30 pixels, different in both images.",
         "",
-        "Milliseconds are those of the processor for one row of one drive, not compiled, one thread; without those of "
-        "the corners' motion.",
+        "Milliseconds are processor time for one row of one drive, not compiled, one thread. The estimation of the "
+        "corners' motion is not included.",
         "",
         *made_by("sequence07"),
     ]

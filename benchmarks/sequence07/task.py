@@ -121,7 +121,7 @@ def naive(folder: Path, name: str, condition: Condition, count: int | None = Non
 
 
 def chained(motions: Tensor, seen: Tensor, dt: Tensor) -> Tensor:
-    """A path ``[T, 7]`` of motions ``[T, 7]``; where one is not seen, the last velocity is held."""
+    """Returns a path ``[T, 7]`` of chained motions ``[T, 7]``, with zero-order hold for missing motions."""
     path, twist = [SE3().neutral(motions)], motions.new_zeros(6)
     twists = SE3().log(motions) / dt
     for row in range(1, len(motions)):

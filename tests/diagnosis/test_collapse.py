@@ -54,7 +54,7 @@ def test_names_the_reading_and_the_component_that_is_held_too_firmly(component):
     noise[component] = 1e-3
     (text,) = said(random_draws(walk_filter(noise)), walks())
     assert "'reading' at place 'analysis'" in text
-    assert f"Number {component} tells most of component {component} of the state" in text
+    assert f"Component {component} correlates most with state component {component}" in text
     assert 'localisation="significance"' in text
 
 
@@ -64,7 +64,7 @@ def test_outliers_are_named_as_a_cause_and_few_members_where_they_are_few(member
     data = TensorDict({"reading": torch.zeros(1, STEPS, 2)}, [1, STEPS])
     data["reading"][:, 5:] = 1e3
     (text,) = said(walk_filter([1e-3, 1e-3], members), data)
-    assert "An outlier, or a jump, may have taken the belief away: put a gate around the filter, Gated(filter)" in text
+    assert "Outliers, or a jump, may have displaced the belief: put a gate around the filter, Gated(filter)" in text
     assert ("few members" in text) == (members == 32)
     gated = Gated(walk_filter([1e-3, 1e-3], members), 2, patience=10)
     assert (gated.sequence(data)["belief", "mean"][0, -1] - 1e3).abs().max() < 1.0
