@@ -50,7 +50,7 @@ def record(carts: int, steps: int, *, failing: bool = False) -> TensorDict:
 
 
 def make(*, delay: int = LATE, joint: bool = False, weights: nn.Module | None = None) -> FusedFilter:
-    """The filter: a Kalman filter, because motion and readings are linear."""
+    """Returns the filter: a Kalman filter, because motion and readings are linear."""
     delays = {"wheel": 0, "laser": 0, "gps": delay}
     return FusedFilter(
         LinearTransition(MOVE, DT * WANDER),
@@ -62,7 +62,7 @@ def make(*, delay: int = LATE, joint: bool = False, weights: nn.Module | None = 
 
 
 def error(out: TensorDict, rows=...) -> float:
-    """Root mean square error of the position in m."""
+    """Returns the root mean square error of the position in m."""
     return (out["belief", "mean"] - out["state"])[..., 0][rows].square().mean().sqrt().item()
 
 

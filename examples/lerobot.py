@@ -94,7 +94,7 @@ def write_folder(root: Path, episodes: int, rows: int) -> None:
 
 
 def places_of(asked: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Places in the state of ``7:14``, ``3``, ``gripper`` or ``right_*``."""
+    """Returns places in the state of ``7:14``, ``3``, ``gripper`` or ``right_*``."""
     places: list[int] = []
     for each in asked:
         first, colon, last = each.partition(":")
@@ -112,12 +112,12 @@ def dead(rows: TensorDict) -> torch.Tensor:
 
 
 def fail(rows: TensorDict) -> TensorDict:
-    """Rows whose pictures do not arrive while the camera is dead."""
+    """Returns rows whose pictures do not arrive while the camera is dead."""
     return rows.set("observed", rows["observed"] & ~dead(rows))
 
 
 def go_black(rows: TensorDict) -> TensorDict:
-    """Rows whose pictures are black while the camera is dead. Nobody says so: it is seen in the pictures."""
+    """Returns rows whose pictures are black while the camera is dead. Nobody says so: it is seen in the pictures."""
     rows = BlackIsMissing()(rows.set("pixels", rows["pixels"] * ~dead(rows)[..., None, None]))
     return rows.set("observed", rows["seen"])
 
@@ -268,12 +268,12 @@ def main() -> None:
 
 
 def no_picture(rows: TensorDict) -> TensorDict:
-    """Rows of a robot without a camera."""
+    """Returns rows of a robot without a camera."""
     return rows.set("observed", torch.zeros_like(rows["observed"]))
 
 
 def believe(denkf: DEnKF, data: LeRobotReplay, episode: Episode) -> TensorDict:
-    """An episode as the robot would have seen it, with the belief in each row."""
+    """Returns an episode as the robot would have seen it, with the belief in each row."""
     env = TransformedEnv(ReplayEnv(data, episodes=episode.name))
     env.append_transform(DEnKFTransform(denkf, diagnostics=[("sensor", "ensemble")]))
     torch.manual_seed(0)

@@ -27,7 +27,7 @@ OFF, BACK, BIAS = 120, 160, 4.0  # steps at which the GPS goes off and comes bac
 
 
 def make_cart() -> DEnKF:
-    """An ensemble filter of [position m, speed m/s]."""
+    """Returns an ensemble filter of [position m, speed m/s]."""
     walk = torch.nn.Linear(2, 2, bias=False)
     walk.weight.data = torch.tensor([[1.0, DT], [0.0, 0.99]])
     return DEnKF(

@@ -35,7 +35,7 @@ class Coasting(Transition):
 
 
 def make_filter(members: int = 200) -> Filter:
-    """Two sensors, each with its own noise and analysis: a position in m and a speed in m/s."""
+    """Returns two sensors, each with its own noise and analysis: a position in m and a speed in m/s."""
     return Filter(
         {
             "transition": Coasting(),

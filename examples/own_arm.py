@@ -136,7 +136,7 @@ class Reach(control.Task):
 
 
 def make_env(count: int, seed: int, *transforms) -> TransformedEnv:
-    """Arms side by side, of which 30 % of the readings get lost."""
+    """Returns arms side by side, of which 30 % of the readings get lost."""
 
     def one() -> EnvBase:
         arm = control.Environment(mujoco.Physics.from_xml_string(XML), Reach(), STEPS * DT, control_timestep=DT)
@@ -162,7 +162,7 @@ def demonstrate(episodes: int, seed: int) -> TensorDict:
 
 
 def make_filter(facts: dict[str, list[float]], error: dict[str, list[float]], members: int = 32) -> FusedFilter:
-    """State [angles rad, speeds rad/s]; a learned motion, the camera, the encoders.
+    """Returns the state [angles rad, speeds rad/s]; a learned motion, the camera, the encoders.
 
     Args:
         facts: means and standard deviations of the demonstrations; plain numbers, for the filter's ``config.json``.
@@ -244,7 +244,7 @@ def learn(
 
 
 def errors(model: FusedFilter, rollouts: TensorDict, *without: str) -> tuple[TensorDict, str]:
-    """Root mean squared errors of the belief on rollouts, maybe without a sensor."""
+    """Returns the root mean squared errors of the belief on rollouts, maybe without a sensor."""
     data = rollouts.exclude("next").clone()
     for key in without:
         data[key] = torch.zeros_like(data[key])
@@ -265,7 +265,7 @@ def make_actor() -> ProbabilisticActor:
 
 
 def late_env(model: FusedFilter, count: int, seed: int, key=("ahead", "belief", "mean")) -> TransformedEnv:
-    """Arms whose actions run late; the filter, and what the policy sees: a belief and the goal."""
+    """Returns arms whose actions run late; the filter, and what the policy sees: a belief and the goal."""
     keep = [("belief", "mean"), ("belief", "var")]
     belief = DEnKFTransform(model, ahead=BeliefAhead(model, LATE, keep=keep))
     return make_env(
@@ -299,7 +299,7 @@ def ppo(model: FusedFilter, actor: ProbabilisticActor, batches: int, arms: int =
 
 @torch.no_grad()
 def test(model: FusedFilter, actor: ProbabilisticActor, key, arms: int) -> float:
-    """The mean return where the policy sees another entry."""
+    """Returns the mean return where the policy sees another entry."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return late_env(model, arms, 1000, key).rollout(STEPS, actor)["next", "reward"].sum((1, 2)).mean().item()
 

@@ -99,7 +99,7 @@ def read(root: Path, **options) -> RecordingReplay:
 
 
 def make_filter(data: RecordingReplay) -> Filter:
-    """Learned motion; the camera's sensor and its analysis; then the encoder's, on what the camera left."""
+    """Returns learned motion; the camera's sensor and its analysis; then the encoder's, on what the camera left."""
     facts = data.statistics
     loc, scale = facts["state", "mean"], facts["state", "std"]
     transition = LearnedTransition(StochasticMLP(2, 2, output_gain=0.1), loc=loc, scale=scale)

@@ -77,7 +77,7 @@ def with_noise(drive: TensorDict, std: float) -> TensorDict:
 
 
 def make_filter(frames: TensorDict, dt: float) -> DEnKF:
-    """The paper's filter for visual odometry: known motion of the pose, learned change of the velocities."""
+    """Returns the paper's filter for visual odometry: known motion of the pose, learned change of the velocities."""
     velocity = frames["state"][:, VELOCITIES]
     loc, scale = velocity.mean(0), velocity.std(0)
     image_shape = tuple(frames["pixels"].shape[1:])
@@ -188,7 +188,7 @@ def track(denkf: DEnKF, drive: TensorDict, missing: float) -> TensorDict:
 
 
 def estimate(rollout: TensorDict, mean_velocity: torch.Tensor, dt: float) -> dict[str, torch.Tensor]:
-    """The states [T, 5] that the filter, the sensor alone and dead reckoning make of one drive."""
+    """Returns the states [T, 5] that the filter, the sensor alone and dead reckoning make of one drive."""
     start, readings, observed = rollout["state"][0, :3], rollout["sensor", "ensemble"].mean(1), rollout["observed"]
     held = hold_last(readings, observed, rollout["state"][0, VELOCITIES])
 

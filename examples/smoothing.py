@@ -50,7 +50,7 @@ class Swing(nn.Module):
 
 
 def record(runs: int, steps: int) -> TensorDict:
-    """True states, and the encoder's readings of the angle."""
+    """Returns true states, and the encoder's readings of the angle."""
     swing, state, states = Swing(), START[0] + START[1] * torch.randn(runs, 2), []
     for _ in range(steps):
         states.append(state)
@@ -62,7 +62,7 @@ def record(runs: int, steps: int) -> TensorDict:
 
 
 def make_denkf(swing: Swing | None = None, members: int = 100) -> DEnKF:
-    """An ensemble filter of the pendulum."""
+    """Returns an ensemble filter of the pendulum."""
     return DEnKF(
         transition=LearnedTransition(swing or Swing(), residual=False),
         sensor=None,
@@ -75,7 +75,7 @@ def make_denkf(swing: Swing | None = None, members: int = 100) -> DEnKF:
 
 
 def make_ukf() -> UKF:
-    """An unscented Kalman filter of the pendulum."""
+    """Returns an unscented Kalman filter of the pendulum."""
     return UKF(
         LearnedTransition(Swing(), residual=False),
         None,

@@ -53,7 +53,7 @@ class Arm:
         return torch.cat([angles.cos(), angles.sin(), velocity], -1)
 
     def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Angles in (-pi, pi] and velocities; a sensor's errors may follow in the state."""
+        """Returns angles in (-pi, pi] and velocities; a sensor's errors may follow in the state."""
         cos, sin, velocity = state[..., : 3 * self.joints].split(self.joints, -1)
         return torch.atan2(sin, cos), velocity
 
@@ -63,7 +63,7 @@ class Arm:
         return torch.stack([links * turned.cos(), links * turned.sin()], -1).cumsum(-2)
 
     def angles(self, places: Tensor) -> Tensor:
-        """The angles, in [-pi, pi), of links that end at ``places``, whatever their lengths."""
+        """Returns the angles, in [-pi, pi), of links that end at ``places``, whatever their lengths."""
         x, y = torch.cat([places[..., :1, :], places.diff(dim=-2)], -2).unbind(-1)
         turned = torch.atan2(y, x) - self.ahead
         return wrap(torch.cat([turned[..., :1], turned.diff(dim=-1)], -1))
@@ -90,7 +90,7 @@ class Arm:
         return -flat.flip(-1).cumsum(-1).flip(-1) / torch.tensor(self.torques)  # a joint carries all that follows
 
     def control(self, state: Tensor, goal: Tensor, explore: float = 0.0) -> Tensor:
-        """The policy, whatever its estimate of the state comes from.
+        """Returns the policy, whatever its estimate of the state comes from.
 
         Proportional to the angles' errors, damped, and what holds the arm at its goal.
 

@@ -51,7 +51,7 @@ class Study:
 
 
 def run(env: TransformedEnv, policy: TensorDictModule, steps: int, seed: int) -> TensorDict:
-    """Episodes ``[N, T]`` that begin alike for all policies."""
+    """Returns episodes ``[N, T]`` that begin alike for all policies."""
     torch.manual_seed(seed)
     env.set_seed(seed)
     with torch.no_grad():
@@ -59,7 +59,7 @@ def run(env: TransformedEnv, policy: TensorDictModule, steps: int, seed: int) ->
 
 
 def collect(arm: Arm, pixels: bool, episodes: int, steps: int, seed: int) -> TensorDict:
-    """Episodes of the controller on the truth with noise on its actions."""
+    """Returns episodes of the controller on the truth with noise on its actions."""
     env = make_env(arm, pixels, min(AT_ONCE, episodes))
     policy = TensorDictModule(partial(arm.control, explore=0.5), in_keys=["state", "goal"], out_keys=["action"])
     rounds = range(-(-episodes // AT_ONCE))
@@ -79,7 +79,7 @@ def poses(arm: Arm, count: int, seed: int) -> TensorDict:
 
 
 def trained(arm: Arm, pixels: bool, study: Study, out: Path) -> DEnKF:
-    """The filter of an arm; the seeds of all that it learns from differ."""
+    """Returns the filter of an arm; the seeds of all that it learns from differ."""
     seed = 10_000 * (study.seed + 1)
     torch.manual_seed(study.seed)
     sensor = error = None

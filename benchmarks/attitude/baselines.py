@@ -100,7 +100,7 @@ def error_state_filter(
 
 
 def _up(q: ndarray) -> ndarray:
-    """The world's z in the body's axes."""
+    """Returns the world's z in the body's axes."""
     return matrix(q)[..., 2, :]
 
 

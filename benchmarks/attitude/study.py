@@ -64,7 +64,7 @@ class Study:
 
 
 def scores(orientation: Tensor, data: TensorDict, rows: slice, cov: Tensor | None = None) -> dict[str, float]:
-    """Errors in degrees, and how they compare with what a filter claims.
+    """Returns errors in degrees, and how they compare with what a filter claims.
 
     Args:
         orientation: ``[R, T, 4]``.
@@ -198,7 +198,7 @@ def library_rows(
 
 
 def chosen(make: Callable, noises: Sequence[float], data: TensorDict, rows: slice) -> float:
-    """The standard deviation with the least root mean square tilt; all are tried at once."""
+    """Returns the standard deviation with the least root mean square tilt; all are tried at once."""
     several = torch.cat([data] * len(noises))
     several["std"] = torch.tensor(noises).repeat_interleave(len(data)).reshape(-1, 1, 1).expand(*several.shape, 1)
     orientation, _, _ = run(make("EKF", GYRO_NOISES["simulated"], GivenNoise()), several)
@@ -254,7 +254,7 @@ def picture(data: TensorDict, pull: float, path: Path) -> None:
 
 
 def page(rows: list[dict], study: Study) -> str:
-    """The table."""
+    """Returns the table."""
     lines = [
         "# Which way is up",
         "",

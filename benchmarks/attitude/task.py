@@ -68,7 +68,7 @@ _BODY = f"""
 
 
 def simulated(runs: int, seconds: float, seed: int, sensors: Sensors | None = None) -> TensorDict:
-    """A free body in MuJoCo, pushed and turned at random about a place, and what cheap sensors read of it.
+    """Returns a free body in MuJoCo, pushed and turned at random about a place, and what cheap sensors read of it.
 
     Gyro and accelerometer read the mean over the time since the last row, the magnetometer the moment.
 
@@ -170,7 +170,7 @@ def _run(model: mujoco.MjModel, rows: int, random: np.random.Generator) -> tuple
 
 
 def _leg_velocity(urdf: Path, log: dict[str, np.ndarray], gyro: np.ndarray) -> np.ndarray:
-    """The velocity ``[T, 3]`` of the inertial sensor, in the axes of the root, as the standing leg tells it."""
+    """Returns the velocity ``[T, 3]`` of the inertial sensor, in the axes of the root, as the standing leg tells it."""
     tree = ElementTree.parse(urdf)
     for part in list(tree.iter()):
         for child in list(part):

@@ -69,7 +69,7 @@ def _alone(file: Path, rows: Callable[[], list[dict]]) -> None:
 
 
 def read_rows(files: Iterable[Path], shared: Callable[[dict], Hashable] = lambda row: None) -> list[dict]:
-    """All rows of some JSON files.
+    """Returns all rows of some JSON files.
 
     Args:
         files: in the order of their rows.
@@ -92,5 +92,5 @@ def read_rows(files: Iterable[Path], shared: Callable[[dict], Hashable] = lambda
 
 
 def rows_in(out: Path) -> list[dict]:
-    """All rows that a study's folder holds, in ``out/rows``."""
+    """Returns all rows that a study's folder holds, in ``out/rows``."""
     return read_rows(sorted((out / "rows").glob("*.json")))

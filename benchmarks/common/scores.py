@@ -14,7 +14,7 @@ from torch_denkf.functional import crps_ensemble, crps_gaussian
 
 
 def counted(out: TensorDict, dims: Sequence[int], floor: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Means and variances of a belief ``[*K, T]`` and the truth, ``[*K, T - 1, D]``: the first row is given.
+    """Returns means and variances of a belief ``[*K, T]`` and the truth, ``[*K, T - 1, D]``: the first row is given.
 
     Args:
         out: with ``("belief", "mean")``, ``("belief", "var")`` and ``"state"``.

@@ -11,17 +11,17 @@ from torch_denkf.deployment.files import replacing, write_text
 
 
 def pick(rows: Iterable[dict], **wanted) -> list[dict]:
-    """Rows with these entries."""
+    """Returns rows with these entries."""
     return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
 
 
 def line(*cells: object) -> str:
-    """A line of a Markdown table."""
+    """Returns a line of a Markdown table."""
     return f"| {' | '.join(map(str, cells))} |"
 
 
 def head(*titles: object) -> list[str]:
-    """The two lines that a Markdown table begins with."""
+    """Returns the two lines that a Markdown table begins with."""
     return [line(*titles), "|" + "---|" * len(titles)]
 
 
@@ -44,7 +44,7 @@ def write_table(
 
 
 def records(file: Path) -> list[dict]:
-    """Rows of a CSV, without what is empty; none where there is no file."""
+    """Returns rows of a CSV, without what is empty; none where there is no file."""
     rows = pd.read_csv(file).to_dict("records") if file.exists() else []
     return [{key: value for key, value in row.items() if pd.notna(value)} for row in rows]
 

@@ -57,7 +57,7 @@ class MountainHike(LinearGaussianEnv):
 
 
 def exact_filter(noise: float) -> KalmanFilter:
-    """The Kalman filter that knows the hike."""
+    """Returns the Kalman filter that knows the hike."""
     one = torch.eye(2)
     return KalmanFilter(
         one,

@@ -53,13 +53,13 @@ class Latency:
 
 
 def moved(angle: Tensor, speed: Tensor, torque: Tensor) -> tuple[Tensor, Tensor]:
-    """One step of the pendulum, 0 rad upright."""
+    """Returns one step of the pendulum, 0 rad upright."""
     speed = (speed + DT * (15 * angle.sin() + 3 * torque)).clamp(-SPEED, SPEED)
     return angle + DT * speed, speed
 
 
 def read_grid(table: Tensor, angle: Tensor, speed: Tensor) -> Tensor:
-    """Values between the points of a table ``[N, N]`` of angles, all around, and speeds."""
+    """Returns values between the points of a table ``[N, N]`` of angles, all around, and speeds."""
     count = len(table)
     x = (angle / (2 * torch.pi)).remainder(1.0) * count
     y = (speed.clamp(-SPEED, SPEED) / SPEED + 1) / 2 * (count - 1)
@@ -109,7 +109,7 @@ class TwoLinks(LinearGaussianEnv):
 
     @classmethod
     def moved(cls, state: Tensor, action: Tensor) -> Tensor:
-        """States ``[*B, 4]`` a step on, without a push."""
+        """Returns states ``[*B, 4]`` a step on, without a push."""
         one, two, first, second = state.unbind(-1)
         torque = action.clamp(-1, 1) * torch.tensor(cls.GEAR)
         heavy = cls.M * cls.L**2 / 12 + cls.M * cls.C**2  # of a link around its joint
@@ -152,14 +152,14 @@ class Robot(NamedTuple):
 
 
 def swing(x: Tensor) -> Tensor:
-    """The pendulum's own motion, on cosine, sine, speed and torque."""
+    """Returns the pendulum's own motion, on cosine, sine, speed and torque."""
     angle, speed = moved(torch.atan2(x[..., 1:2], x[..., :1]), x[..., 2:3], x[..., 3:])
     return torch.cat([angle.cos(), angle.sin(), speed], -1)
 
 
 @cache
 def robot(name: str, grid: int) -> Robot:
-    """The pendulum or the arm."""
+    """Returns the pendulum or the arm."""
     if name == "arm":
         motion = lambda x: TwoLinks.moved(x[..., :4], x[..., 4:])  # noqa: E731
         start = [0.0] * 4, [1.0, 1.0, 0.01, 0.01]
@@ -177,7 +177,7 @@ def robot(name: str, grid: int) -> Robot:
 
 
 def known_filter(of: Robot, noise: float, members: int) -> DEnKF:
-    """The robot's own motion."""
+    """Returns the robot's own motion."""
     return DEnKF(
         LearnedTransition(of.motion, residual=False, action_key="action"),
         None,
@@ -197,7 +197,7 @@ def late_env(of: Robot, noise: float, delay: int, count: int, seed: int) -> Tran
 
 
 def returned(study: Latency, of: Robot, noise: float, shown: str, delay: int, seed: int) -> float:
-    """The mean return of the policy that sees something; ``"nothing"`` is the robot without a motor."""
+    """Returns the mean return of the policy that sees something; ``"nothing"`` is the robot without a motor."""
     torch.manual_seed(seed)
     env = late_env(of, noise, delay, study.episodes, seed)
     if shown in ("belief", "belief ahead"):
@@ -224,7 +224,7 @@ def returned(study: Latency, of: Robot, noise: float, shown: str, delay: int, se
 
 
 def trained(study: Latency, of: Robot, noise: float, delay: int, seed: int) -> float:
-    """The mean return of an LSTM that learned with this delay."""
+    """Returns the mean return of an LSTM that learned with this delay."""
     torch.manual_seed(seed)
     task, arm = TASKS["pendulum"], ARMS["LSTM"]
 

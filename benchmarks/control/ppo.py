@@ -62,7 +62,7 @@ class ActorHead(Head):
             self.layers[-1].bias.zero_()
 
     def forward(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Two times ``[*B, A]``."""
+        """Returns two times ``[*B, A]``."""
         mean = super().forward(value)
         return mean, self.log_std.exp().expand_as(mean)
 

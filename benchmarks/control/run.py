@@ -87,7 +87,7 @@ def rollout(env: EnvBase, policy: TensorDictModuleBase | None, steps: int, kind:
 
 
 def make_env(task: Task, arm: Arm, count: int, cell: tuple[float, float], seed: int, filter: Filter | None) -> EnvBase:
-    """The world with what the arm reads.
+    """Returns the world with what the arm reads.
 
     Args:
         task: the world's.
@@ -108,7 +108,7 @@ def make_env(task: Task, arm: Arm, count: int, cell: tuple[float, float], seed: 
 
 
 def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, budget: Budget) -> list[dict]:
-    """Rows: the return after some numbers of environment steps, and the processor's seconds until then."""
+    """Returns rows: the return after some numbers of environment steps, and the processor's seconds until then."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     task, arm, spent = TASKS[task_name], ARMS[arm_name], 0.0

@@ -129,5 +129,5 @@ class SAC:
 
 
 def _both(*keys: NestedKey) -> list[NestedKey]:
-    """Keys before and after a step."""
+    """Returns keys before and after a step."""
     return [*keys, *(unravel_key(("next", key)) for key in keys)]

@@ -50,7 +50,7 @@ class Study:
 
 
 def arms_of(task: str, cell: tuple[float, float]) -> tuple[str, ...]:
-    """The arms that run in a cell."""
+    """Returns the arms that run in a cell."""
     number = CELLS[task].index(cell)
     arms = (*READERS[task], "truth") if cell == min(CELLS[task]) else READERS[task]
     if number >= MORE_CELLS:
@@ -87,7 +87,7 @@ def keep(study: Study, table: Path) -> None:
 
 
 def complete(study: Study) -> list[dict]:
-    """The rows of seeds with which all arms of a cell have run; says of others what they lack."""
+    """Returns the rows of seeds with which all arms of a cell have run; says of others what they lack."""
     files: list[Path] = []
     for task in study.tasks:
         for cell in CELLS[task]:

@@ -84,7 +84,7 @@ def recorded(root: Path, frames: int) -> tuple[Tensor, Tensor]:
 
 
 def driven(root: Path, names: Sequence[str], frames: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Windows of true paths, and what a camera might read there."""
+    """Returns windows of true paths, and what a camera might read there."""
     parts = []
     for name in names:
         poses = read_poses(root / "poses" / f"{name}.txt")
@@ -108,7 +108,7 @@ def simulated(frames: int, seed: int, count: int = 2) -> tuple[Tensor, Tensor]:
 
 
 def car_task(root: Path | None, *, frames: int = 60, validate: bool = False) -> Task:
-    """The task, on real frames, or on a made-up drive where there are no data.
+    """Returns the task, on real frames, or on a made-up drive where there are no data.
 
     Args:
         root: folder with ``sequences`` and ``poses``.

@@ -61,12 +61,12 @@ class Task:
 
     @property
     def sensors(self) -> list[str]:
-        """Names of all sensors."""
+        """Returns names of all sensors."""
         return list(self.offsets)
 
     @property
     def settled(self) -> slice:
-        """The steps that are scored: all but those of the start-up."""
+        """Returns the steps that are scored: all but those of the start-up."""
         return slice(round(min(STARTUP * self.rate, self.test.shape[1] // 4)), None)
 
 
@@ -87,7 +87,7 @@ def fused_sensors(
 
 
 def without(data: TensorDict, *sensors: str) -> TensorDict:
-    """The recordings without some sensors' readings."""
+    """Returns the recordings without some sensors' readings."""
     out = data.copy()
     for name in sensors:
         out[f"{name}_observed"] = torch.zeros_like(data[f"{name}_observed"])
@@ -114,7 +114,7 @@ def faulty(
 
 
 def delayed(data: TensorDict, sensor: str, steps: int) -> TensorDict:
-    """The recordings with one sensor's readings so many steps late."""
+    """Returns the recordings with one sensor's readings so many steps late."""
     out = data.copy()
     for key in (sensor, f"{sensor}_observed", f"{sensor}_features"):
         out[key] = data[key].roll(steps, 1)
@@ -154,7 +154,7 @@ def add_features(data: TensorDict, noises: Mapping[str, Tensor]) -> TensorDict:
 
 
 def last_seen(data: TensorDict, sensor: str) -> Tensor:
-    """The step of a sensor's last reading at each time, ``[N, T, 1]``; 0 before the first."""
+    """Returns the step of a sensor's last reading at each time, ``[N, T, 1]``; 0 before the first."""
     seen = data[f"{sensor}_observed"]
     time = torch.arange(data.shape[1]).reshape(1, -1, 1).expand_as(seen)
     return torch.where(seen, time, 0).cummax(1).values

@@ -44,7 +44,7 @@ class Later:
 
 
 def episodes(root: Path) -> dict[str, TensorDict]:
-    """Joints and commands by role, ``[B, T]``, in rad; ``valid`` says where an episode is."""
+    """Returns joints and commands by role, ``[B, T]``, in rad; ``valid`` says where an episode is."""
     found: dict[str, list[Tensor]] = {"train": [], "validation": [], "test": []}
     for file in sorted((root / "data").glob("*/*.parquet")):
         number, table = int(file.stem.rpartition("_")[-1]), read_parquet(file, ["observation.state", "action"])
@@ -90,7 +90,7 @@ class Motion:
         return cls(weight.mT, left.mT @ left / len(left), center)
 
     def filter(self, kind: str, factor: float) -> Filter:
-        """A filter of joints and those of the row before; ``kind`` is ``"EKF"`` or ``"DEnKF"``."""
+        """Returns a filter of joints and those of the row before; ``kind`` is ``"EKF"`` or ``"DEnKF"``."""
         passed = torch.eye(JOINTS, 2 * JOINTS)
         matrix = torch.cat([self.weight[:, : 2 * JOINTS], passed])
         control = torch.cat([self.weight[:, 2 * JOINTS :], torch.zeros(JOINTS, JOINTS)])
@@ -121,7 +121,7 @@ class Motion:
 
 
 def looked(motion: Motion, data: TensorDict, kind: str, factor: float, steps: int) -> TensorDict:
-    """The belief now, and those of the next rows ``[B, T, steps, 14]``."""
+    """Returns the belief now, and those of the next rows ``[B, T, steps, 14]``."""
     filter = motion.filter(kind, factor)
     ahead = BeliefAhead(filter, steps, each=True, keep=[("belief", "mean"), ("belief", "var")])
     with torch.no_grad():

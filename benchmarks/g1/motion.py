@@ -41,7 +41,7 @@ class Motion(ArmMotion):
         self.pull = nn.Parameter(torch.zeros(len(DELAYS), JOINTS)) if actions else None
 
     def forward(self, features: Tensor) -> Tensor:
-        """States ``[*, 2D]`` of states ``[*, 2D]``, or of states and commands ``[*, 4D]``."""
+        """Returns states ``[*, 2D]`` of states ``[*, 2D]``, or of states and commands ``[*, 4D]``."""
         place, rates = features[..., :JOINTS], features[..., JOINTS : self.size]
         parts = [(place - self.loc) / self.scale, (rates / (3 * self.rate)).tanh()]
         wanted = self.damping.sigmoid() * rates

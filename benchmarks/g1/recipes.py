@@ -47,7 +47,7 @@ class RatesAndBias(SubModel):
         super().__init__(parts, [*rates.in_keys, *bias.in_keys], rates.out_keys)
 
     def compute(self, mean, encoding, *, batch_size):
-        """Variances ``[*B, 2D]``."""
+        """Returns variances ``[*B, 2D]``."""
         rates = self.module["rates"].compute(mean, batch_size=batch_size)
         return torch.cat([rates, self.module["bias"].compute(encoding, batch_size=batch_size)], -1)
 

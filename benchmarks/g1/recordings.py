@@ -36,7 +36,7 @@ class Recordings:
 
     @cached_property
     def data(self) -> LeRobotReplay:
-        """All episodes, with repeats masked."""
+        """Returns all episodes, with repeats masked."""
         source = drawn_recording(self.size) if self.drawn else self.root
         return LeRobotReplay(source, size=self.size, split="all", repeats="mask", cache=self.out / "cache")
 

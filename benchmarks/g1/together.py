@@ -81,7 +81,7 @@ class Arm:
 
     @cached_property
     def motion(self) -> Motion:
-        """The motion, learned from true states."""
+        """Returns the motion, learned from true states."""
         torch.manual_seed(self.study.seed)
         motion, paths = Motion(self.sensor.trained[1]), [with_rates(state, 1) for state, _ in self.known]
         settings = {"seed": self.study.seed, "updates": self.study.motion_updates}
@@ -106,7 +106,7 @@ class Arm:
 
     @cached_property
     def unseen(self) -> list[TensorDict]:
-        """Readings of the episodes that are not tested on, and that the camera's sensor has not seen."""
+        """Returns readings of the episodes that are not tested on, and that the camera's sensor has not seen."""
         return [self.readings(role) for role in ("tune", "validation")]
 
     def errors(self, name: str, kind: str) -> tuple[FadingBias | None, Tensor]:
@@ -130,7 +130,7 @@ class Arm:
         return belief["mean"][..., :JOINTS], belief["var"][..., :JOINTS].sqrt()
 
     def held(self, data: TensorDict, name: str) -> Tensor:
-        """A sensor's last reading."""
+        """Returns a sensor's last reading."""
         return hold_last(data[name], data[f"{name}_observed"], self.begin.mean(0).expand_as(data[name][:, 0]))
 
     def combined(self, data: TensorDict) -> Tensor:
@@ -155,7 +155,7 @@ def lagged(commands: Tensor) -> Tensor:
 
 
 def score(estimate: Estimate, data: TensorDict, at: Tensor) -> list[str]:
-    """Mean absolute error in degrees, and what the 90 % intervals hold, at rows ``[N, T]``."""
+    """Returns the mean absolute error in degrees, and what the 90 % intervals hold, at rows ``[N, T]``."""
     mean, std = estimate
     error = (mean - data["state"])[at].abs()
     held = "" if std is None else f"{100 * (error < LEVEL * std[at]).float().mean():.0f} %"
@@ -163,7 +163,7 @@ def score(estimate: Estimate, data: TensorDict, at: Tensor) -> list[str]:
 
 
 def read_together(arm: Arm) -> list[str]:
-    """The table of what is read, and how well the arm is known from it."""
+    """Returns the table of what is read, and how well the arm is known from it."""
     data = arm.readings("test")
     at, dark = data["valid"].squeeze(-1).clone(), data.copy()
     at[:, 0] = False
@@ -192,7 +192,7 @@ def read_together(arm: Arm) -> list[str]:
 
 
 def camera_off(arm: Arm) -> list[str]:
-    """The table of a camera that is off."""
+    """Returns the table of a camera that is off."""
     data, rows = arm.readings("test"), SEEN + max(AFTER) + 1
     generator, parts = torch.Generator().manual_seed(5), []
     lengths = data["valid"].sum((1, 2)).tolist()

@@ -100,7 +100,7 @@ class Gpu:
 
 
 def about(device: str) -> dict[str, str]:
-    """The card, versions and the date."""
+    """Returns the card, versions and the date."""
     import tensordict
     import torchrl
 
@@ -110,7 +110,7 @@ def about(device: str) -> dict[str, str]:
 
 
 def page_of(rows: list[dict[str, Any]], about: dict[str, str], smoke: bool) -> str:
-    """The Markdown page."""
+    """Returns the Markdown page."""
     versions = ", ".join(f"{name} {value}" for name, value in about.items() if name not in ("device", "date"))
     text = ["# On a GPU", "", f"{about['device']}; {versions}; {about['date']}. Medians, in ms a call."]
     for part in dict.fromkeys(row["part"] for row in rows):

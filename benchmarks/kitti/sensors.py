@@ -29,7 +29,7 @@ def flow_sensor(statistics: Statistics) -> SubModel:
 
 
 def image_sensor(statistics: Statistics) -> SubModel:
-    """The paper's: Table I on a grey frame and its difference to the one before."""
+    """Returns the paper's: Table I on a grey frame and its difference to the one before."""
     return ImageSensor(
         2,
         image_shape=(2, 50, 150),
@@ -136,7 +136,7 @@ class SensorOfFold:
 
     @property
     def validation(self) -> list[TensorDict]:
-        """Readings to choose by; not the mirrored ones: they say the same."""
+        """Returns readings to choose by; not the mirrored ones: they say the same."""
         return [reading for _, reading, _ in self.readings[::2]]
 
 

@@ -69,7 +69,7 @@ class Camera:
             self.renderer.scene.flags[flag] = 0
 
     def frame(self, arrows: Mapping[str, Tensor], std: Tensor) -> np.ndarray:
-        """A picture ``[H, W, 3]``.
+        """Returns a picture ``[H, W, 3]``.
 
         Args:
             arrows: velocities ``[3]`` in the base's axes, by their colour.

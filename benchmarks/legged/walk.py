@@ -130,7 +130,7 @@ def play(
     keep: list,
     watch: Callable[[TensorDict], None] = lambda row: None,
 ) -> TensorDict:
-    """Some entries of an episode ``[B, T]``, in which a policy acts every fifth row.
+    """Returns some entries of an episode ``[B, T]``, in which a policy acts every fifth row.
 
     Args:
         env: a :class:`Walk`, maybe with transforms.

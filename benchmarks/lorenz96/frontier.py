@@ -59,7 +59,7 @@ def _models() -> dict:
 
 
 def ensemble(scheme: str, size: int, radius: float | None, inflation: float) -> Filter:
-    """The DEnKF with one of the schemes; a localised ``"etkf"`` is the LETKF."""
+    """Returns the DEnKF with one of the schemes; a localised ``"etkf"`` is the LETKF."""
     keys = {"inflation": inflation, "rotate": scheme == "etkf", "observation_key": "observation"}
     if scheme == "etkf" and radius is not None:
         places = torch.arange(float(VARIABLES)).unsqueeze(-1)
@@ -71,20 +71,20 @@ def ensemble(scheme: str, size: int, radius: float | None, inflation: float) -> 
 
 
 def gaussian(kind: type[EKF | UKF], inflation: float) -> Filter:
-    """An extended or unscented Kalman filter."""
+    """Returns an extended or unscented Kalman filter."""
     keys = {"observation_key": "observation", "inflation": inflation, "process_noise": 0.0}
     return kind(**_models(), initial=GaussianAround([1.0] * VARIABLES), **keys)
 
 
 def particles(size: int, kernel: float) -> Filter:
-    """A bootstrap filter, regularised."""
+    """Returns a bootstrap filter, regularised."""
     initial = AroundState([1.0] * VARIABLES, ensemble_size=size)
     likelihood = GaussianLikelihood(observation_key="observation")
     return ParticleFilter(**_models(), likelihood=likelihood, jitter=kernel, initial=initial)
 
 
 def candidates(sizes: Iterable[int]) -> dict[tuple[str, int], dict[str, Make]]:
-    """Filters by name and size, and their settings."""
+    """Returns filters by name and size, and their settings."""
     found: dict[tuple[str, int], dict[str, Make]] = {}
     for (name, scheme), size in product(SCHEMES.items(), sizes):
         if scheme == "etkf" and size > ROTATED:

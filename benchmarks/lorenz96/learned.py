@@ -50,13 +50,13 @@ def tapers(dims: Sequence[int], variables: int, radius: float) -> tuple[torch.Te
 
 
 def on_circle(first: torch.Tensor, second: torch.Tensor, variables: int) -> torch.Tensor:
-    """Distances ``[len(first), len(second)]`` between places on a circle."""
+    """Returns distances ``[len(first), len(second)]`` between places on a circle."""
     distance = (first.unsqueeze(-1) - second).abs()
     return torch.minimum(distance, variables - distance)
 
 
 def simulate(variables: int, steps: int, records: int, rng: torch.Generator) -> torch.Tensor:
-    """True states ``[records, steps, variables]`` on the attractor."""
+    """Returns true states ``[records, steps, variables]`` on the attractor."""
     state = FORCING + torch.randn(records, variables, generator=rng)
     states = []
     for _ in range(SPIN_UP + steps):
@@ -80,7 +80,7 @@ def make_filter(
     radius: float | None,
     learn_noise: bool = False,
 ) -> DEnKF:
-    """An ensemble Kalman filter of the system with a wrong forcing.
+    """Returns an ensemble Kalman filter of the system with a wrong forcing.
 
     Args:
         variables: N.
@@ -119,12 +119,12 @@ def climate_of(record: TensorDict) -> tuple[float, float]:
 
 
 def forcing_of(denkf: DEnKF) -> torch.Tensor:
-    """The parameter F."""
+    """Returns the parameter F."""
     return denkf["transition"].module["transition"].module.forcing
 
 
 def noise_of(denkf: DEnKF) -> torch.Tensor:
-    """Standard deviation of the model noise of each variable."""
+    """Returns the standard deviation of the model noise of each variable."""
     return (0.5 * denkf["transition"].module["noise"].log_variance).exp().detach()
 
 

@@ -59,7 +59,7 @@ class Bearing(SubModel):
         super().__init__(nn.Identity(), [("forecast", "ensemble"), "observer"], [("forecast", "observation")])
 
     def compute(self, ensemble, observer):
-        """The bearings ``[*B, E, 1]``."""
+        """Returns the bearings ``[*B, E, 1]``."""
         away = ensemble[..., :2] - observer.unsqueeze(-2)
         return torch.atan2(away[..., :1], away[..., 1:])
 
@@ -109,7 +109,7 @@ def bearings(runs: int) -> tuple[Score, Callable[[int, float | None], Score]]:
 
 
 def linear(size: int, read: int, runs: int) -> tuple[Score, Callable[[int, float | None], Score]]:
-    """The Kalman filter's score on a random stable system, and an ensemble's."""
+    """Returns the Kalman filter's score on a random stable system, and an ensemble's."""
     generator = torch.Generator().manual_seed(size)
     draw = partial(torch.randn, generator=generator)
     f, h = 0.98 * torch.linalg.qr(draw(size, size))[0], draw(read, size) / size**0.5

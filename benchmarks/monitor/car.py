@@ -65,7 +65,7 @@ class CarGates(NamedTuple):
         return self.pictures(signs)["seen"]
 
     def answered(self, reading: TensorDict) -> TensorDict:
-        """The reading without what its pictures speak against.
+        """Returns the reading without what its pictures speak against.
 
         Where the flow contradicts the road, the speed is that of the flow.
         """

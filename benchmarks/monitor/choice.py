@@ -40,7 +40,7 @@ def choose_car(
     known = filtered(model, calibration)
 
     def guarded(readings: Sequence[TensorDict], guard: CarGuard, left_out: bool = False) -> list[dict[str, float]]:
-        """Path scores; where the drives are those of the calibration, each with a gate from the others."""
+        """Returns the path scores; where the drives are those of the calibration, each with a gate from the others."""
         answered = []
         for place, reading in enumerate(readings):
             others = [each for k, each in enumerate(calibration) if not (left_out and k == place)]

@@ -88,7 +88,7 @@ def failing(root: Path, name: str, fault: str, cache: Path, steps: int = 1, *, r
 
 
 def _with_signs(reading: TensorDict, shown: Tensor, seen: Tensor) -> TensorDict:
-    """The reading with all signs, with what the flow says ``[N, 2]``."""
+    """Returns the reading with all signs, with what the flow says ``[N, 2]``."""
     distance = reading["sensor", "ensemble"][..., 0].mean(-1) * KITTI_DT
     of_flow = flow_signs(seen[:, 0], seen[:, 1].reshape(-1, 1, 1), distance)
     return reading.update({"signs": torch.cat([shown, of_flow], -1), "by_flow": seen, "plane": seen[:, :1]})
@@ -169,7 +169,7 @@ def believed_spans(spans: Sequence[TensorDict], seen: Callable[[TensorDict], Ten
 
 
 def from_truth(reading: TensorDict) -> TensorDict:
-    """Readings ``[N]`` that begin at the true pose."""
+    """Returns readings ``[N]`` that begin at the true pose."""
     row = reading.copy()
     row["start"] = row["state"].clone()
     row["start"][0] = first_state(row)
@@ -194,7 +194,7 @@ def filtered(model: Filter, readings: Sequence[TensorDict], draws: int = 1, seed
 
 
 def side_by_side(beliefs: Sequence[TensorDict]) -> list[TensorDict]:
-    """Beliefs ``[K, N]`` of one length each, joined into ``[K', N]``: a monitor runs over all at once."""
+    """Returns beliefs ``[K, N]`` of one length each, joined into ``[K', N]``: a monitor runs over all at once."""
     groups: dict[int, list[TensorDict]] = defaultdict(list)
     for each in beliefs:
         groups[each.shape[1]].append(each)
@@ -205,7 +205,7 @@ def side_by_side(beliefs: Sequence[TensorDict]) -> list[TensorDict]:
 
 
 def car_filter() -> tuple[CarFilter, Filter]:
-    """The trained filter, and the same behind its sensor."""
+    """Returns the trained filter, and the same behind its sensor."""
     car = from_pretrained("car-odometry")
     assert isinstance(car, CarFilter)
     return car, car.without_sensor()

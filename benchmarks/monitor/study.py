@@ -51,7 +51,7 @@ def invented(study: Study, kind: str) -> tuple[Path, list[str]]:
 
 
 def rows_of(study: Study, task: str) -> list[dict]:
-    """The rows of one task."""
+    """Returns the rows of one task."""
     cache = study.out / "readings"
     if task == "ur5":
         from benchmarks.monitor.arm import arm_rows, own_demos  # needs mujoco
@@ -113,7 +113,7 @@ def choice_page(rows: Sequence[dict], study: Study) -> str:
 
 
 def page(rows: Sequence[dict], study: Study) -> str:
-    """Two tables: alarms, and errors."""
+    """Returns two tables: alarms, and errors."""
     lines = ["# Faults that nobody announces", ""]
     lines += head("task", "fault", "AUROC", "delay, steps", "found", "alarms in 1,000 sound steps", "error afterwards")
     for row in rows:

@@ -69,7 +69,8 @@ def main() -> None:
     squares = {name: lasting_square(car, study.root, name) for name in names}
     made_by = command("odometry.calibration")
     print(
-        f"`{made_by}`. Each drive is scored with the standard deviation of the other drives. Drives shorter than 100 m have no devkit error.\n"
+        f"`{made_by}`. Each drive is scored with the standard deviation of the other drives. "
+        "Drives shorter than 100 m have no devkit error.\n"
     )
     columns = "drive", "scale std by the other drives", "m/m", "devkit, %"
     coverage = "coverage of v (%)", "coverage of the turn rate (%)"

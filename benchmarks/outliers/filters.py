@@ -68,7 +68,7 @@ UPDATES: dict[str, Callable[[Filter], Filter]] = {
 
 
 def learned(members: int = 32) -> Filter:
-    """An ensemble whose motion, noises, share and width of outliers are learned."""
+    """Returns an ensemble whose motion, noises, share and width of outliers are learned."""
     network = nn.Sequential(nn.Linear(3, 32), nn.Tanh(), nn.Linear(32, 32), nn.Tanh(), nn.Linear(32, 2))
     for parameter in network[-1].parameters():
         nn.init.zeros_(parameter)

@@ -102,7 +102,7 @@ def apart(work: Callable[[], Any]) -> None:
 
 @cache
 def workshop() -> Path:
-    """A folder for what cases start from; it goes with the process that made it."""
+    """Returns a folder for what cases start from; it goes with the process that made it."""
     folder = Path(tempfile.mkdtemp(prefix="fuzz-sound-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)  # not in forked children, which leave by os._exit
     return folder

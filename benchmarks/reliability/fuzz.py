@@ -83,7 +83,7 @@ def search(cases: st.SearchStrategy[Case], count: int, seed: int, words: str) ->
 
 
 def attacked(target: Target, drawn: int, seed: int) -> list[Row]:
-    """All named cases of a target, and some that are drawn."""
+    """Returns all named cases of a target, and some that are drawn."""
     words = f"--match {f'{target.border} {target.name}:'!r} --drawn {drawn} --seed {seed}"
     rows = [row(case, judge(case), f"--match {f'{case.border} {case.name}'!r} --drawn 0") for case in target.named()]
     if drawn and not target.wrong.others.is_empty:
@@ -133,7 +133,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def table(found: dict[str, Any]) -> str:
-    """A summary as Markdown."""
+    """Returns a summary as Markdown."""
     rows = [*found["borders"].items(), ("all", found)]
     lines = [line(name, one["records"], *(one[kind] for kind in KINDS)) for name, one in rows]
     return "\n".join([*head("border", "inputs", *KINDS), *lines, ""])

@@ -57,17 +57,17 @@ class Claim(NamedTuple):
     truth: Tensor
 
     def away(self) -> Tensor:
-        """The tangent's errors, in standard deviations, ``[*B, K, 6]``."""
+        """Returns the tangent's errors, in standard deviations, ``[*B, K, 6]``."""
         return SE3().minus(self.truth, self.mean) / self.var.sqrt()
 
     def held(self, level: float = LEVEL) -> Tensor:
-        """Share of the tangent's components within the intervals of that level, ``[K]``."""
+        """Returns the share of the tangent's components within the intervals of that level, ``[K]``."""
         inside = self.away().abs() <= NormalDist().inv_cdf((1 + level) / 2)
         return inside.double().mean(-1).flatten(0, -2).mean(0)
 
 
 def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict, Tensor]:
-    """Sequences that start from a pose that is known.
+    """Returns sequences that start from a pose that is known.
 
     Args:
         data: what a filter reads, ``[C, T]``.
@@ -107,7 +107,7 @@ def run(model: Filter, data: TensorDict) -> TensorDict:
 
 
 def and_one_more(data: TensorDict) -> TensorDict:
-    """Rows ``[C, T + 1]``: one more, in which nothing is read."""
+    """Returns rows ``[C, T + 1]``: one more, in which nothing is read."""
     last = data[:, -1:].clone()
     for key in ("motion_observed", "gyro_observed"):
         last[key] = torch.zeros_like(last[key])
@@ -150,7 +150,7 @@ def filter_rows(
 
 
 def drift(path: Tensor, poses: Tensor) -> dict[str, float]:
-    """The official errors: % and degrees in 100 m."""
+    """Returns the official errors: % and degrees in 100 m."""
     error = kitti_devkit_error(path, poses)
     return {"translation": error.translation.item(), "rotation": 100 * error.rotation.item()}
 
@@ -169,14 +169,14 @@ def alone(study: Study, data: TensorDict, poses: Tensor, count: int) -> Iterator
 
 
 def page(rows: Sequence[dict], count: int) -> str:
-    """The table."""
+    """Returns the table."""
     lines = [
         "# Sequence 07 of KITTI",
         "",
         f"Odometry sequence 07, {count} rows: stereo corners and turn rates. Errors are KITTI's own, in six "
         f"dimensions, over 100 to 800 m. *Coverage*: the share of errors within the {LEVEL:.0%} intervals, for "
-        f"the six components of the motion over 1, 10 and 100 rows; a reset every {EVERY} rows. Rows of ensembles are means "
-        f"over {DRAWS} seeds, with their standard deviation.",
+        f"the six components of the motion over 1, 10 and 100 rows; a reset every {EVERY} rows. Rows of ensembles are "
+        f"means over {DRAWS} seeds, with their standard deviation.",
     ]
     titles = ("filter", "translation, %", "rotation, deg/100 m", *(f"coverage, {step}" for step in STEPS), "ms a row")
     for condition in CONDITIONS:

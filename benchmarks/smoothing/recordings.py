@@ -51,7 +51,7 @@ class Task:
     read: Callable[[Filter], dict[str, Group]]
 
     def groups(self, members: int, folder: Path) -> dict[str, Group]:
-        """The recordings by group; read the first time, then kept in a folder."""
+        """Returns the recordings by group; read the first time, then kept in a folder."""
         file = folder / f"{self.name}-{members}.pt"
         if not file.exists():
             folder.mkdir(parents=True, exist_ok=True)
@@ -134,7 +134,7 @@ def ur5(out: Path, *, smoke: bool = False) -> Task:
 
 
 def side_by_side(recordings: Iterable[tuple[str, TensorDict]]) -> Group:
-    """Recordings of one length in one batch each."""
+    """Returns recordings of one length in one batch each."""
     lengths: dict[int, list[tuple[str, TensorDict]]] = {}
     for name, recording in recordings:
         lengths.setdefault(len(recording), []).append((name, recording))

@@ -37,7 +37,7 @@ class Study:
 
 
 def page(rows: Sequence[dict], study: Study) -> str:
-    """Means over the seeds."""
+    """Returns means over the seeds."""
     lines = [
         "# Smoothers on chaotic systems",
         "",

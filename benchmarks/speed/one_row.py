@@ -76,7 +76,7 @@ FILTERS: dict[str, Callable[[], tuple[Filter, TensorDict]]] = {
 
 
 def numpy_attitude() -> Callable[[], np.ndarray]:
-    """A row of the attitude filter a call, in double precision: numpy is no faster in single."""
+    """Returns a row of the attitude filter a call, in double precision: numpy is no faster in single."""
     row = {key: value.numpy().astype(float) for key, value in attitude()[1].items()}
     constants = [(row["force"], np.array([0.0, 0.0, 9.81]), FORCE_STD), (row["field"], np.array(FIELD), FIELD_STD)]
     q = np.diag([GYRO_NOISE**2 * DT] * 3 + [GYRO_WALK**2 * DT] * 3)
@@ -107,7 +107,7 @@ def numpy_attitude() -> Callable[[], np.ndarray]:
 
 
 def eager(name: str) -> Callable[[], TensorDict]:
-    """A row a call."""
+    """Returns a row a call."""
     filter, row = FILTERS[name]()
     filter.initialise(row)
 
@@ -135,7 +135,7 @@ def first_call(name: str, chunk: int = 1) -> dict[str, float]:
 
 
 def rows(seconds: float) -> list[Row]:
-    """Rows of the table."""
+    """Returns rows of the table."""
     calls: dict[str, Callable[[], object]] = {name: eager(name) for name in FILTERS}
     timings = interleave({**calls, "numpy": numpy_attitude()}, seconds=seconds)
     found = []

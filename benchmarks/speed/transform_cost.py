@@ -61,7 +61,7 @@ class Reading(Transform):
 
 
 def kitti_filter() -> DEnKF:
-    """The README's, with Table I's stochastic head on a reading in the place of the image sensor."""
+    """Returns the README's, with Table I's stochastic head on a reading in the place of the image sensor."""
     return car_filter(lambda: VectorSensor(2, 2, in_key="reading"))
 
 
@@ -72,7 +72,7 @@ def kitti_env(folder: str) -> EnvBase:
 
 
 def reacher_env() -> EnvBase:
-    """The arm with noisy encoders of examples/append_to_env.py."""
+    """Returns the arm with noisy encoders of examples/append_to_env.py."""
     return TransformedEnv(
         DMControlEnv("reacher", "easy"),
         Compose(
@@ -111,7 +111,7 @@ def example_step(env: EnvBase, filter: DEnKF) -> TensorDict:
 
 
 def steppers(make_env, make_filter, folder: str) -> dict[str, Stepper]:
-    """The environment in its three ways."""
+    """Returns the environment in its three ways."""
     filter = make_filter()
     example = example_step(make_env(), filter)
     path = export_step(filter, example, Path(folder) / f"{id(filter)}.pt2")
@@ -130,7 +130,7 @@ def measure(rounds: int = 41, steps: int = 50) -> dict[str, Timings]:
 
 
 def cost_ms(timings: Timings, kind: str) -> float:
-    """Median over the rounds of what the transform adds to a step."""
+    """Returns the median over the rounds of what the transform adds to a step."""
     return 1e3 * median(b - a for a, b in zip(timings.rounds["without"], timings.rounds[kind], strict=True))
 
 
@@ -156,7 +156,7 @@ def rows(seconds: float) -> list[Row]:
 
 
 def table(found: dict[str, Timings], command: str, elapsed: float) -> str:
-    """The Markdown page."""
+    """Returns the Markdown page."""
     lines = [
         "# What DEnKFTransform costs",
         "",

@@ -47,18 +47,18 @@ class Shrink(nn.Module):
     """Averages pixels until a picture is at most :data:`COARSE` wide."""
 
     def forward(self, images: Tensor) -> Tensor:
-        """Pictures ``[N, 3, H / n, W / n]``."""
+        """Returns pictures ``[N, 3, H / n, W / n]``."""
         times = images.shape[-1] // COARSE
         return nn.functional.avg_pool2d(images, times) if times > 1 else images
 
 
 def keypoint_trunk() -> nn.Module:
-    """The coarse trunk of both presets."""
+    """Returns the coarse trunk of both presets."""
     return nn.Sequential(Shrink(), KeypointTrunk(3, channels=(32, 48, 96, 128), keypoints=64, features=256))
 
 
 def glimpse_trunk(side: int) -> GlimpseTrunk:
-    """The trunk that looks at the gripper in pictures of a side of so many pixels."""
+    """Returns the trunk that looks at the gripper in pictures of a side of so many pixels."""
     return GlimpseTrunk(keypoint_trunk(), CloseLook(side, REACH), 256, raised=RAISE)
 
 
@@ -134,7 +134,7 @@ def unit_of(dim: int) -> Tensor:
 
 
 def _moments(facts: Statistics) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of what :class:`TurnedWrist` reads."""
+    """Returns the mean and standard deviation of what :class:`TurnedWrist` reads."""
     loc, scale = facts.loc, facts.scale
     middle = torch.zeros(4), torch.tensor([0.35, 0.35, 0.7, 0.7])
     return tuple(
@@ -146,7 +146,7 @@ CELLS = (128, 64)
 
 
 def keypoint_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
-    """A better one: places of features beside a coarse view, coordinate channels, J6 by twice its angle."""
+    """Returns a better one: places of features beside a coarse view, coordinate channels, J6 by twice its angle."""
     head = {"num_cells": CELLS, "layer": "dropout", "rate": 0.05}
     return camera_sensor(facts, keypoint_trunk(), samples, *_moments(facts), **head)
 
@@ -158,7 +158,7 @@ def glimpse_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
 
 
 def paper_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
-    """The paper's: Table I on the frame, which reads all ten numbers of the state."""
+    """Returns the paper's: Table I on the frame, which reads all ten numbers of the state."""
     return camera_sensor(facts, convolutional_trunk(3), samples, facts.loc, facts.scale)
 
 
@@ -205,7 +205,7 @@ class NearForecast(SubModel):
         self.preset, self.factor = preset, 1.0  # on the samples' distances from their mean
 
     def compute(self, samples, forecast, *, batch_size):
-        """The states ``[*B, E, 10]``."""
+        """Returns the states ``[*B, E, 10]``."""
         angle = forecast[..., WRIST]
         if angle.ndim > len(batch_size):
             angle = angle.mean(-1)

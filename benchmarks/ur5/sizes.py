@@ -88,7 +88,7 @@ def members(study: Study) -> list[Path]:
 
 
 def members_page(frame: pd.DataFrame) -> str:
-    """A table of the rows, with a column for each localisation."""
+    """Returns a table of the rows, with a column for each localisation."""
     frame = frame.assign(cell=[_cell(row) for row in frame.to_dict("records")])
     table = frame.set_index(["sensor", "trained", "members", "localisation"])["cell"].unstack("localisation")
     text = "Clean test demos. Cells: joints, deg / end effector, cm / coverage of 90 %, and the threshold, if any."

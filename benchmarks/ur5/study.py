@@ -84,7 +84,7 @@ class Base:
 
     @cached_property
     def states(self) -> Tensor:
-        """States of the simulator's demos that the sensor may see, ``[N, T, 10]``."""
+        """Returns states of the simulator's demos that the sensor may see, ``[N, T, 10]``."""
         return sequences_of(self.study.replay("sim-frames", "train"), self.study.sequences)
 
     def _sensor(self) -> tuple[ImageSensor, Statistics]:
@@ -142,7 +142,7 @@ class Base:
 
     @cached_property
     def motion(self) -> Motion:
-        """The motion, trained on true states."""
+        """Returns the motion, trained on true states."""
         if self.parent is not None:
             return self.parent.motion
         torch.manual_seed(self.seed)
@@ -170,14 +170,14 @@ class Base:
 
     @cached_property
     def error(self) -> Tensor:
-        """Root mean square error of the sensor on the validation demos, ``[10]``."""
+        """Returns the root mean square error of the sensor on the validation demos, ``[10]``."""
         reading = read_all([self.sensor], self.codes("validation"), MEMBERS)
         truth = reading["state"]
         read = self.preset.state_of(reading["sensor", "ensemble"].mean(-2), truth[..., WRIST])
         return (read - truth).square().mean((0, 1)).sqrt()
 
     def recipe(self, name: str, size: int = MEMBERS) -> UR5Recipe:
-        """A filter's recipe, with a sensor of its own."""
+        """Returns a filter's recipe, with a sensor of its own."""
         return FILTERS[name](deepcopy(self.sensor), self.preset, self.facts, self.motion, self.error, size)
 
     def train(self, name: str, recipe: UR5Recipe | None = None) -> tuple[UR5Recipe, Filter, Path]:
@@ -227,7 +227,7 @@ def members_of(name: str) -> int:
 
 
 def sensor_rows(preset: Preset, readings: dict[str, TensorDict], names: dict) -> list[dict]:
-    """The sensor alone; where it sees nothing, its last reading stays."""
+    """Returns the sensor alone; where it sees nothing, its last reading stays."""
     rows = []
     for condition, reading in readings.items():
         truth, samples, seen = reading["state"], reading["sensor", "ensemble"], reading["observed"]
@@ -241,7 +241,7 @@ def sensor_rows(preset: Preset, readings: dict[str, TensorDict], names: dict) ->
 
 
 def size_row(base: Base, recipe: UR5Recipe, saved: dict, names: dict, chunk: int | None = None) -> dict:
-    """A row of a trained filter with other members on clean demos, and its CRPS on the validation demos.
+    """Returns a row of a trained filter with other members on clean demos, and its CRPS on the validation demos.
 
     With ``chunk``, ``ms_per_step`` is processor time of compiled chunks of so many steps, and ``eager_ms_per_step`` of
     eager steps; 0 compiles nothing.

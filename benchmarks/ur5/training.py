@@ -37,7 +37,7 @@ class Budget:
 
 
 def with_missing(recipe: UR5Recipe, codes: TensorDict) -> TensorDict:
-    """Readings of clean demos, and the same with missing frames: what filters are validated on."""
+    """Returns readings of clean demos, and the same with missing frames: what filters are validated on."""
     readings = read_all([recipe.sensor], codes, recipe.members)
     return torch.cat([readings, fail(readings, "missing", seed=1)])
 
@@ -52,7 +52,7 @@ class WithHead(nn.Module):
         self.register_buffer("unit", unit_of(self.preset.dim))
 
     def forward(self, codes: TensorDict) -> dict[str, Tensor]:
-        """All terms, of windows ``[B, T]`` of features."""
+        """Returns all terms, of windows ``[B, T]`` of features."""
         windows = with_head([self.sensor], codes, self.size)
         own = crps_ensemble(windows["sensor", "ensemble"], self.preset.observe(codes["state"])) / self.unit
         return {**self.objective(windows), "loss_sensor": 0.5 * own[codes["observed"].squeeze(-1)].mean()}

@@ -83,7 +83,7 @@ def ensemble_filter(members: int, **options) -> FusedFilter:
 
 
 def gaussian_filter() -> FusedFilter:
-    """The extended Kalman filter."""
+    """Returns the extended Kalman filter."""
     return FusedFilter(
         LearnedTransition(moved, residual=False),
         _sensors(),

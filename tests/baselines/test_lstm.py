@@ -27,7 +27,7 @@ def readings(batch, width=1, resets=True):
 
 
 def torch_lstm(filter, frames):
-    """Means, hidden and cell states of the last layer by ``torch.nn.LSTM`` with the same weights."""
+    """Returns means, hidden and cell states of the last layer by ``torch.nn.LSTM`` with the same weights."""
     update = filter["lstm"]
     lstm = nn.LSTM(update.in_size, update.hidden_size, update.num_layers, batch_first=True)
     weights = update.module["cells"].state_dict()

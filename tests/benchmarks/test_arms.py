@@ -12,7 +12,7 @@ from benchmarks.arms.sensor import FromPlaces, JointPlaces
 
 
 def physics_at(name, seed):
-    """An arm after a reset, what it emits as float32, and its simulator."""
+    """Returns an arm after a reset, what it emits as float32, and its simulator."""
     env = make_one(ARMS[name], pixels=False)
     env.set_seed(seed)
     emitted = env.reset().float()

@@ -45,7 +45,7 @@ def test_the_filter_that_knows_the_world_errs_as_it_believes():
 
 
 def still_filter(members=8):
-    """One without process noise, that starts at given members: all its steps are determined."""
+    """Returns one without process noise, that starts at given members: all its steps are determined."""
     filter = cartpole.unlearned_filter(members)
     torch.manual_seed(0)
     start = torch.tensor(cartpole.START) + 0.1 * torch.randn(members, 5)

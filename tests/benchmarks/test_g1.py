@@ -15,7 +15,7 @@ from torch_denkf.data import LeRobotReplay
 
 
 def readings(count=4, steps=60):
-    """A sensor that is right, of episodes of which the others are shorter than the first."""
+    """Returns a sensor that is right, of episodes of which the others are shorter than the first."""
     valid = torch.ones(count, steps, 1, dtype=torch.bool)
     valid[1:, 30:] = False
     truth = torch.randn(count, steps, JOINTS, generator=torch.Generator().manual_seed(0))

@@ -108,7 +108,7 @@ def facts():
 
 
 def smooth_drive(count, encoding):
-    """Readings of a flow sensor over gaps, with errors of 0.02, from a drive of ``count`` steps."""
+    """Returns readings of a flow sensor over gaps, with errors of 0.02, from a drive of ``count`` steps."""
     velocity = torch.stack([8 + 2 * torch.linspace(0, 6, count).sin(), 0.1 * torch.linspace(0, 4, count).cos()], -1)
     path = dead_reckoning(velocity.double(), torch.zeros(3, dtype=torch.float64), 0.1).float()
     sums = torch.stack([sum(torch.roll(velocity, lag, 0) for lag in range(n)) for n in range(1, LONGEST + 1)], 1)

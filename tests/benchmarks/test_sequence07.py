@@ -18,7 +18,7 @@ def _double(float64):
 
 
 def driven(count=240, runs=4, seed=0, slips=True):
-    """Drives as the filters take them to be: readings and poses ``[C, T]``; each ninth row is not seen."""
+    """Returns drives as the filters take them to be: readings and poses ``[C, T]``; each ninth row is not seen."""
     torch.manual_seed(seed)
     data = TensorDict({"motion": SE3().neutral(torch.zeros(7)).expand(runs, count, 7).clone()}, [runs, count])
     data["motion_cov"] = torch.diag_embed(torch.tensor([1e-4] * 3 + [2e-3] * 3).square()).expand(runs, count, 6, 6)

@@ -154,7 +154,7 @@ def _car() -> Iterator[Subject]:
 
 
 def _trajectory(**given: Any) -> Any:
-    """A path that is written for other programs."""
+    """Returns a path that is written for other programs."""
     layout = {"layout": "tum"} if "times" in given else {}
     return write_trajectory("path.txt", **{"trajectory": torch.zeros(5, 3), **layout, **given})
 
@@ -332,7 +332,7 @@ def _packages() -> Iterator[Subject]:
 
 
 def targets() -> Iterator[Target]:
-    """All arguments."""
+    """Yields all arguments."""
     kinds = {
         **{"kitti": _drives, "car": _car, "recordings": _recordings, "lerobot": _lerobot, "corners": _corners},
         **{"ur5": _ur5, "training": _training, "pretrained": _pretrained, "packages": _packages},

@@ -22,7 +22,7 @@ ROWS = 12
 
 @pytest.fixture
 def root(tmp_path):
-    """Two episodes, of 12 rows and of 4."""
+    """Returns two episodes, of 12 rows and of 4."""
     write_version_2(tmp_path, [ROWS, 4], images="bytes")
     return tmp_path
 

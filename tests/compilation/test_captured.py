@@ -50,7 +50,7 @@ def assert_same(ours, theirs, atol=1e-12):
 
 
 def pair(**kwargs):
-    """An eager filter, and the same recorded."""
+    """Returns an eager filter, and the same recorded."""
     eager = toy_denkf("perturbed", **kwargs).double()
     return eager, pickle.loads(pickle.dumps(eager)).compile(mode="graph")
 

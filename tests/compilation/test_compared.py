@@ -22,13 +22,13 @@ needs_compiler = pytest.mark.skipif(not has_compiler(), reason="inductor needs a
 
 
 def kalman(prior=1.0, r=1.0):
-    """Five numbers that walk at random, of which three are read."""
+    """Returns five numbers that walk at random, of which three are read."""
     eye = torch.eye(5)
     return KalmanFilter(eye, eye[:3], process_noise_cov=eye, noise=[r**0.5] * 3, mean=torch.ones(5), cov=prior * eye)
 
 
 def compiler(run):
-    """A backend of torch.compile that runs a graph as ``run(graph, inputs)``, and counts graphs."""
+    """Returns a backend of torch.compile that runs a graph as ``run(graph, inputs)``, and counts graphs."""
 
     def compile_graph(graph, example):
         compile_graph.graphs += 1
@@ -64,7 +64,7 @@ def rounded(graph, inputs):
 
 
 def ekf():
-    """Four numbers that stand still, of which two are read."""
+    """Returns four numbers that stand still, of which two are read."""
     return EKF(
         LearnedTransition(torch.nn.Identity(), residual=False),
         None,
@@ -158,7 +158,7 @@ def test_a_wrong_gradient_raises_where_a_sequence_is_trained():
 
 
 def precise():
-    """A reading 1e4 times as precise as the belief, of sums that the belief knows well."""
+    """Returns a reading 1e4 times as precise as the belief, of sums that the belief knows well."""
     sums = torch.tensor([[1.0, 1.0, 1.0]])
     cov = 1e4 * torch.ones(3, 3) + torch.diag(torch.tensor([1.0, 2.0, 3.0]))
     filter = KalmanFilter(

@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def cache(tmp_path):
-    """A real library, the smallest of torch's, and its beginnings."""
+    """Returns a real library, the smallest of torch's, and its beginnings."""
     source = min(Path(torch.__file__).parent.glob("lib/*.so"), key=os.path.getsize)
     (tmp_path / "ab").mkdir()
     shutil.copy(source, tmp_path / "ab" / "cabwhole.so")

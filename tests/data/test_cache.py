@@ -145,7 +145,7 @@ def replace_by(make):
 
 
 def lists(batch_sizes, tensors):
-    """A manifest with its checksum, of other tensors."""
+    """Returns a manifest with its checksum, of other tensors."""
 
     def write(file):
         text = json.dumps({"format": "torch_denkf.cache/1", "batch_sizes": batch_sizes, "tensors": tensors})

@@ -20,7 +20,7 @@ ROWS = 12
 
 
 def make(count=10, *, for_tests=lambda episode: False, lengths=None, **options):
-    """Episodes whose numbers tell where they are: state (episode, step), action (100 episode + step)."""
+    """Returns episodes whose numbers tell where they are: state (episode, step), action (100 episode + step)."""
     lengths = lengths or [ROWS] * count
     step = torch.cat([torch.arange(length) for length in lengths]).unsqueeze(-1)
     number = torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths)).unsqueeze(-1)

@@ -26,7 +26,7 @@ STATES = 3
 
 
 def bend(states):
-    """A known motion that is not linear."""
+    """Returns a known motion that is not linear."""
     x, y, z = states.unbind(-1)
     return torch.stack([x + 0.3 * y.sin(), 0.9 * y - 0.1 * x**3, z.cos() * x], -1)
 

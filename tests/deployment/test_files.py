@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def start(code, *arguments):
-    """A process that says when it holds what it holds."""
+    """Returns a process that says when it holds what it holds."""
     command = [sys.executable, "-c", code, *map(str, arguments)]
     process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "ready\n"

@@ -20,7 +20,7 @@ pytest.importorskip("onnxruntime")
 
 
 def one_number(**options):
-    """A number that walks at random with variance 1, read with variance 1."""
+    """Returns a number that walks at random with variance 1, read with variance 1."""
     one = torch.eye(1)
     return KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one, **options)
 

@@ -20,7 +20,7 @@ MATRICES = {
 
 
 def filter_and_frames(name, which, source, kind, wrong):
-    """A filter, its frames, and the words by which a message may name what is wrong."""
+    """Returns a filter, its frames, and the words by which a message may name what is wrong."""
     wrong = torch.tensor(wrong)
     fine = torch.tensor([0.5, 0.3]) if kind == "vector" else torch.tensor([[0.5, 0.1], [0.1, 0.3]])
     frames, modules = sound_frames(), {"R": Given("r", R), "Q": Given("q", Q)}

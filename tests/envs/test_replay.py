@@ -21,7 +21,7 @@ LENGTHS = [6, 9, 4, 7]
 
 
 def make(actions=True, transform=None):
-    """State (episode, step), a reading of its own, and an action that tells both."""
+    """Returns the state (episode, step), a reading of its own, and an action that tells both."""
     step = torch.cat([torch.arange(length) for length in LENGTHS]).unsqueeze(-1)
     number = torch.arange(4).repeat_interleave(torch.tensor(LENGTHS)).unsqueeze(-1)
     rows = {"step": step, "time": 0.1 * step.double(), "state": torch.cat([number, step], -1).float()}

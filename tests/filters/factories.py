@@ -18,7 +18,7 @@ S, M, OBS, A, E = 3, 4, 2, 2, 4  # state, measurement, observation, action, memb
 
 
 def toy_denkf(scheme="sensor", layer="dropout", *, sensor_layer="dropout", ensemble_size=E, action=True, **kwargs):
-    """Four learned sub-models on a vector measurement and an action."""
+    """Returns four learned sub-models on a vector measurement and an action."""
     initial, in_key = kwargs.pop("initial", None), kwargs.pop("in_key", "measurement")
     return DEnKF(
         transition=LearnedTransition(
@@ -39,7 +39,7 @@ def toy_denkf(scheme="sensor", layer="dropout", *, sensor_layer="dropout", ensem
 
 
 def random_draws(filter):
-    """The filter, whose noise is used as it was drawn: what an oracle computes from the draws holds for it."""
+    """Returns the filter, whose noise is used as it was drawn: what an oracle computes from the draws holds for it."""
     for module in filter.modules():
         if hasattr(module, "exact"):
             module.exact = False

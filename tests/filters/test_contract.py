@@ -55,7 +55,7 @@ def lstm():
 
 
 def fused(kind, *, late=False, **kwargs):
-    """Two sensors that read the same entry, the second one perhaps two steps late."""
+    """Returns two sensors that read the same entry, the second one perhaps two steps late."""
     F, Q, H, R = linear_system()
     if kind == "Kalman":
         motion, initial = LinearTransition(F, Q), MomentPrior(torch.zeros(2), torch.eye(2))
@@ -117,7 +117,7 @@ def readings(*batch, width=1):
 
 
 def with_noise(name, *batch, width=1):
-    """A filter, and readings with the noise of all its steps."""
+    """Returns a filter, and readings with the noise of all its steps."""
     filter = FILTERS[name]()
     return filter, filter.draw_noise(readings(*batch, width=width))
 

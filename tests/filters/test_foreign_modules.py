@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def forecasts(filter):
-    """The forecast of a step, and that of the second element of a sequence from the same belief."""
+    """Returns the forecast of a step, and that of the second element of a sequence from the same belief."""
     frames = TensorDict({"observation": torch.randn(3, 2, 2)}, [3, 2])
     filter.draw_noise(frames)
     out = filter.sequence(frames.copy())

@@ -70,7 +70,7 @@ class Whole(SubModel):
 
 
 def make(kind, space, model=None, reading_space=None, dim=None, key="pose"):
-    """A filter whose state is read as it is, or by a model of ``dim`` numbers, with an R that is trained."""
+    """Returns a filter whose state is read as it is, or by a model of ``dim`` numbers, with an R that is trained."""
     model, reading_space = (Whole(), space) if model is None else (model, reading_space)
     std, q = ([value] * space.tangent_dim for value in (0.2, 0.05))
     noise = ConstantNoise([0.1] * (dim or space.tangent_dim), in_key=key, trainable=True)

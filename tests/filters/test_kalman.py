@@ -60,7 +60,7 @@ def test_sequence_equals_numpy(float64, update_at_reset, width):
 
 
 def joint_gaussian(kf, T, S=2):
-    """Mean and covariance of y_1 .. y_T, stacked, by the system's impulse responses."""
+    """Returns the mean and covariance of y_1 .. y_T, stacked, by the system's impulse responses."""
     F, Q, H, R = linear_system()
     F_to = [torch.linalg.matrix_power(F, k) for k in range(T)]
     mean = torch.cat([H @ power @ kf.initial.mean for power in F_to])

@@ -47,7 +47,7 @@ class Unsaid(FixedEnsemble):
 
 
 def foreign_noise(filter):
-    """The noise from a module that does not say how many readings it is for."""
+    """Returns the noise from a module that does not say how many readings it is for."""
     _, _, _, R = linear_system()
     filter = filter.with_modules(noise=TensorDictModule(nn.Linear(2, 2), ["observation"], [("sensor", "noise")]))
     with torch.no_grad():

@@ -112,7 +112,7 @@ def frames_for(features):
 
 
 def correct(mean, cov, h, reading, r):
-    """One scalar reading; also its innovation and how much it varies."""
+    """Returns one scalar reading; also its innovation and how much it varies."""
     innovation, s = reading - h @ mean, h @ cov @ h + r
     gain = cov @ h / s
     keep = np.eye(len(mean)) - np.outer(gain, h)
@@ -174,7 +174,7 @@ def read(features, frames, row, t, lag):
 
 
 def weighted(readings, noise, mean, cov):
-    """The noise divided by what :class:`Doubt` says, in the forecast."""
+    """Returns the noise divided by what :class:`Doubt` says, in the forecast."""
     size = {}
     for name, (reading, h, seen) in readings.items():
         size[name] = (reading - h @ mean) ** 2 / (h @ cov @ h + noise[name]) if seen else 0.0

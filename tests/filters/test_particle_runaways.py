@@ -41,7 +41,7 @@ def cubic_filter(size=1000, resampling="systematic", **kwargs):
 
 
 def drive(seed=0):
-    """Readings at each sixth step, and the true states, ``[T]`` each."""
+    """Returns readings at each sixth step, and the true states, ``[T]`` each."""
     random = np.random.default_rng(seed)
     state, states = 0.5 * random.standard_normal(), []
     for _ in range(STEPS):
@@ -52,7 +52,7 @@ def drive(seed=0):
 
 
 def numpy_bootstrap(readings, observed, size=100_000):
-    """Means and variances from the first reading on; particles that are no number any more have no weight."""
+    """Returns means and variances from the first reading on; particles that are no number any more have no weight."""
     random = np.random.default_rng(1)
     particles, weights = PRIOR * random.standard_normal(size), np.full(size, 1 / size)
     moments = []

@@ -17,7 +17,7 @@ MEAN, VAR = ("belief", "mean"), ("belief", "var")
 
 
 def named(name, prefix="imu"):
-    """A filter of the contract's table, twice: without and with a prefix, under one noise."""
+    """Returns a filter of the contract's table, twice: without and with a prefix, under one noise."""
     plain, other = FILTERS[name](), FILTERS[name]()
     other = other.with_options(prefix=prefix)
     frames = plain.draw_noise(readings(3, 6))
@@ -48,7 +48,7 @@ def test_a_prefix_changes_names_and_nothing_else(float64, name):
 
 
 def by_hand(readings, q=0.25, r=1.0):
-    """A scalar Kalman filter ``[T]``; the first element is its prior."""
+    """Returns a scalar Kalman filter ``[T]``; the first element is its prior."""
     means, m, p = [0.0], 0.0, 1.0
     for y in readings[1:]:
         p += q

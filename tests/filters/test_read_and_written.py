@@ -24,7 +24,7 @@ def test_what_is_read_and_written_is_carried(name):
 
 
 def camera(*front, observed_key="observed", initial=None):
-    """A filter whose reading is the mean of a picture, with modules in front."""
+    """Returns a filter whose reading is the mean of a picture, with modules in front."""
     return Filter(
         {
             **dict(front),

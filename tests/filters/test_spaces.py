@@ -61,7 +61,7 @@ class Orientation(SubModel):
 
 
 def make(kind, members=E, **options):
-    """A filter of orientations."""
+    """Returns a filter of orientations."""
     parts = (Turning(), None, Orientation(), ConstantNoise(R, in_key="pose"))
     known = {"process_noise": Q, "observation_key": "pose", "reading_space": SO3(), **options}
     around = AroundState(STD, ensemble_size=200 if kind == "particles" else members, state_key="start", space=SPACE)
@@ -83,7 +83,7 @@ def make(kind, members=E, **options):
 
 
 def log(steps=T, seed=0, hidden=True):
-    """True states, gyro, readings of the orientation, some of which are missing, and where a filter starts."""
+    """Returns true states, gyro, readings of the orientation, some of which are missing, and where a filter starts."""
     torch.manual_seed(seed)
     rates, turns, biases = torch.randn(B, steps, 3), [SO3().exp(2 * torch.randn(B, 3))], [0.1 * torch.randn(B, 3)]
     for t in range(steps - 1):
@@ -302,7 +302,7 @@ class Both(SubModel):
 
 
 def in_one(kind, lag=None, **options):
-    """A joint update of a pose and of numbers; and one update of both, side by side."""
+    """Returns a joint update of a pose and of numbers; and one update of both, side by side."""
     around = AroundState(STD, ensemble_size=E, state_key="start", space=SPACE)
     initial = GaussianAround(STD, state_key="start", space=SPACE) if kind in ("EKF", "UKF") else around
     sensors = {

@@ -52,7 +52,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def tangents(space, *batch, size=None):
-    """Random tangents; of a motion with rotations of one size, in rad."""
+    """Returns random tangents; of a motion with rotations of one size, in rad."""
     value = torch.randn(*batch, space.tangent_dim)
     if size is not None and space in ANGLES:
         turn, rest = value[..., : ANGLES[space]], value[..., ANGLES[space] :]
@@ -61,7 +61,7 @@ def tangents(space, *batch, size=None):
 
 
 def near(space, *batch, most=2.5):
-    """Random tangents whose logarithm is themselves: rotations below half a turn."""
+    """Returns random tangents whose logarithm is themselves: rotations below half a turn."""
     value = tangents(space, *batch)
     return value * (most / value.norm(dim=-1, keepdim=True).clamp_min(most))
 
@@ -71,7 +71,7 @@ def points(space, *batch):
 
 
 def matrix(space, point):
-    """The matrix whose product is that of the space."""
+    """Returns the matrix whose product is that of the space."""
     if isinstance(space, SE2):
         angle, x, y = point.unbind(-1)
         rows = [[angle.cos(), -angle.sin(), x], [angle.sin(), angle.cos(), y], [0 * x, 0 * x, 0 * x + 1]]
@@ -84,7 +84,7 @@ def matrix(space, point):
 
 
 def generator(space, tangent):
-    """The matrix whose exponential is the matrix of the point."""
+    """Returns the matrix whose exponential is the matrix of the point."""
     if isinstance(space, SE2):
         angle, x, y = tangent.unbind(-1)
         zero = 0 * x
@@ -239,7 +239,7 @@ def test_a_quaternion_and_its_negative_are_one_rotation():
 
 
 def of_one(function, *values):
-    """The derivative of ``function`` of vectors, by the first of them, of each row."""
+    """Returns the derivative of ``function`` of vectors, by the first of them, of each row."""
     return torch.func.vmap(torch.func.jacrev(function))(*values)
 
 

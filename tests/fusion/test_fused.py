@@ -56,7 +56,7 @@ def known_noise():
 
 
 def sensors(**second):
-    """The two components of the linear system's reading, as two sensors."""
+    """Returns the two components of the linear system's reading, as two sensors."""
     _, _, H, R = linear_system()
     return {
         "first": FusedSensor(LinearObservation(H[:1]), R[:1].sqrt()),
@@ -78,7 +78,7 @@ def fused(kind, *, joint=False, lag=None, members=None, noisy=True, analysis=Non
 
 
 def readings():
-    """Readings of both sensors in their order, and masks; the first frame, which no update sees, hides all."""
+    """Returns readings of both sensors in their order, and masks; the first frame, which no update sees, hides all."""
     torch.manual_seed(0)
     y = torch.randn(B, T, 2)
     frames = TensorDict({"first": y[..., :1], "second": y[..., 1:]}, [B, T])
@@ -91,7 +91,7 @@ def readings():
 
 
 def as_kalman(frames):
-    """The frames for one Kalman filter of both sensors."""
+    """Returns the frames for one Kalman filter of both sensors."""
     out = frames.select("is_init")
     out["observation"] = torch.cat([frames["first"], frames["second"]], -1)
     out["observed"] = torch.cat([frames["first_observed"], frames["second_observed"]], -1)
@@ -99,7 +99,7 @@ def as_kalman(frames):
 
 
 def arriving(frames, late):
-    """The second sensor's readings when they arrive: at t comes that of t - late[t]."""
+    """Returns the second sensor's readings when they arrive: at t comes that of t - late[t]."""
     index = torch.arange(T) - late
     out = frames.copy()
     for key in ("second", "second_observed"):
@@ -110,7 +110,7 @@ def arriving(frames, late):
 
 
 def arrived(frames, late, now):
-    """The readings in their order, as far as they have arrived at ``now``."""
+    """Returns the readings in their order, as far as they have arrived at ``now``."""
     out = frames[:, : now + 1].copy()
     times = torch.arange(T) - late
     known = torch.isin(torch.arange(now + 1), times[: now + 1])
@@ -396,7 +396,7 @@ def test_covariances_of_readings_side_by_side(float64):
 
 
 def with_lasting_errors(*, joint=False, delay=0, kind=None):
-    """Two sensors of the linear system, each with lasting errors, around one that has none."""
+    """Returns two sensors of the linear system, each with lasting errors, around one that has none."""
     F, Q, H, R = linear_system()
     errors = [FadingBias([std], time, trainable=False) for std, time in ((0.8, 6.0), (1.5, 1e6))]
     sensors = {

@@ -15,7 +15,7 @@ from torch_denkf.smoothers import ParticleSmoother
 
 
 def glider(**options) -> FusedFilter:
-    """Position and speed in continuous time; both read at once, or the speed alone."""
+    """Returns the position and speed in continuous time; both read at once, or the speed alone."""
     motion = ContinuousMotion(torch.tensor([[0.0, 1.0], [0.0, 0.0]]))
     sensors = {
         "both": FusedSensor(Select([0, 1]), "both_noise", **options),
@@ -38,7 +38,7 @@ def irregular_log(seed: int = 0, count: int = 40) -> list[tuple]:
 
 
 def kalman(log: list[tuple], start: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance behind the last message, from one message to the next."""
+    """Returns the mean and covariance behind the last message, from one message to the next."""
     mean, cov, now = np.zeros(2), np.eye(2), start
     for stamp, name, value, noise in sorted(log, key=lambda message: message[0]):
         dt, now = stamp - now, stamp
@@ -217,7 +217,7 @@ def test_a_regular_log_is_a_regular_filter(float64):
 
 
 def pose_log(covariance: bool) -> TensorDict:
-    """Poses at times of their own, each with the noise of its tangent."""
+    """Returns poses at times of their own, each with the noise of its tangent."""
     random, log = np.random.default_rng(0), []
     for row in range(12):
         root = 0.1 * random.normal(size=(6, 6))

@@ -28,7 +28,7 @@ STD, TIME = [0.8, 0.5], [3.0, 20.0]  # of a fast bias and a slow one, of the sam
 
 
 def motion():
-    """A place and its rate."""
+    """Returns a place and its rate."""
     network = torch.nn.Linear(2, 2, bias=False).double()
     network.weight.data = torch.tensor([[1.0, 1.0], [0.0, 1.0]], dtype=torch.double)
     return LearnedTransition(network.requires_grad_(False), residual=False)
@@ -44,7 +44,7 @@ def parts():
 
 
 def simulate(seed=0):
-    """True places ``[T]`` and readings ``[T]`` with coloured errors."""
+    """Returns true places ``[T]`` and readings ``[T]`` with coloured errors."""
     rng = np.random.default_rng(seed)
     decay = np.exp(-1 / np.array(TIME))
     place, rate, bias, places, readings = 0.0, 0.0, np.array(STD) * rng.normal(size=2), [], []
@@ -57,7 +57,7 @@ def simulate(seed=0):
 
 
 def augmented_kalman_filter(readings, start):
-    """Means ``[T, 4]`` and covariances ``[T, 4, 4]``; the first is the start."""
+    """Returns means ``[T, 4]`` and covariances ``[T, 4, 4]``; the first is the start."""
     decay = np.exp(-1 / np.array(TIME))
     f = np.zeros((4, 4))
     f[:2, :2], f[2:, 2:] = [[1, 1], [0, 1]], np.diag(decay)

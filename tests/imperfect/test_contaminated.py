@@ -44,7 +44,7 @@ SCORES = ("innovation", "nis", "log_likelihood")
 
 
 def update_of(inner, *args, **options):
-    """The update, for particles with the likelihood in front, in double precision."""
+    """Returns the update, for particles with the likelihood in front, in double precision."""
     likelihood = GaussianLikelihood(observation_key=KEY)
     if inner == "particles":
         return TensorDictSequential(likelihood, Contaminated(ParticleAnalysis(likelihood), *args, **options)).double()
@@ -177,7 +177,7 @@ SPACE = Product(SO3(), Euclidean(2))
 
 
 def on_space(members=9, batch=(3,), seed=1):
-    """An attitude and two numbers; the reading is another attitude and one of the numbers."""
+    """Returns an attitude and two numbers; the reading is another attitude and one of the numbers."""
     torch.manual_seed(seed)
     center = SPACE.plus(SPACE.neutral(torch.zeros(1).double()).expand(*batch, 6), torch.randn(*batch, 5).double())
     ensemble = SPACE.plus(center.unsqueeze(-2), 0.3 * torch.randn(*batch, members, 5).double())
@@ -198,7 +198,7 @@ KINDS_ON_SPACE = {
 
 
 def tangents(name, td, start, prefix="belief"):
-    """Mean and covariance of a belief as tangents at a point."""
+    """Returns the mean and covariance of a belief as tangents at a point."""
     if name == "etkf":
         away = SPACE.minus(td[prefix, "ensemble"], start.unsqueeze(-2))
         return away.mean(-2), (away - away.mean(-2, keepdim=True)).mT @ (away - away.mean(-2, keepdim=True)) / 8
@@ -330,7 +330,7 @@ def test_gradients_are_those_of_finite_differences(name, reading):
 
 
 def sum_of(keys, out_key):
-    """A module that writes a share from entries: the sigmoid of their sum."""
+    """Returns a module that writes a share from entries: the sigmoid of their sum."""
     return TensorDictModule(lambda *values: torch.cat(values, -1).sum(-1, keepdim=True).sigmoid(), keys, [out_key])
 
 

@@ -15,7 +15,7 @@ def cov(members):
 
 
 def updated(size, dim, *, dtype=torch.float64, seed=0):
-    """Members, and what an update in their own span leaves of them: shrunk, turned a little and moved."""
+    """Returns members, and what an update in their own span leaves of them: shrunk, turned a little and moved."""
     torch.manual_seed(seed)
     before = torch.randn(2, size, dim, dtype=dtype)
     before[..., 1] = 3 * before[..., 0]  # known together

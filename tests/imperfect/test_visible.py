@@ -45,7 +45,7 @@ MEAN, STD, R = 0.3, 1.2, 0.5  # of a forecast in one dimension, standard deviati
 
 
 def forecast(reading, p, members=400, dtype=torch.float64):
-    """One dimension: members at the quantiles of the forecast, with exactly its mean and variance."""
+    """Returns one dimension: members at the quantiles of the forecast, with exactly its mean and variance."""
     levels = (torch.arange(members, dtype=dtype) + 0.5) / members
     standard = torch.special.ndtri(levels)
     ensemble = (MEAN + STD * standard / standard.std()).unsqueeze(-1)
@@ -107,7 +107,7 @@ NEAR = Neighbours(torch.arange(2).expand(3, 2), torch.tensor([[1.0, 0.5], [0.5, 
 
 
 def several(members=12, batch=(3,), dtype=torch.float64, seed=1, samples=False):
-    """A forecast of three components, two of which are read."""
+    """Returns a forecast of three components, two of which are read."""
     torch.manual_seed(seed)
     ensemble = torch.randn(*batch, members, 3, dtype=dtype)
     td = TensorDict({("forecast", "ensemble"): ensemble}, batch)
@@ -135,7 +135,7 @@ SEVERAL = {
 
 
 def around(name, wrap=lambda inner: inner):
-    """The update of that name in a wrapper; that of particles behind its likelihood."""
+    """Returns the update of that name in a wrapper; that of particles behind its likelihood."""
     if name != "particles":
         return TensorDictSequential(wrap(SEVERAL[name]()))
     likelihood = GaussianLikelihood(observation_key=KEY)
@@ -143,7 +143,7 @@ def around(name, wrap=lambda inner: inner):
 
 
 def hidden_in_part(name):
-    """A row that is observed, one that is not, and one of which the first component alone is."""
+    """Returns a row that is observed, one that is not, and one of which the first component alone is."""
     td = several(samples=name == "sensor")
     td["observed"] = torch.tensor([[True, True], [False, False], [True, False]])
     shown = td["observed"].unsqueeze(-2) if name == "sensor" else td["observed"]

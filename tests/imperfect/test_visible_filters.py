@@ -46,12 +46,12 @@ CERTAIN = [name for name in MAKERS if name != "particles"]  # these resample whe
 
 
 def heeds(filter):
-    """The filter, whose update heeds p from the data."""
+    """Returns the filter, whose update heeds p from the data."""
     return filter.with_modules(analysis=Visible(filter["analysis"], visible_key="visible"))
 
 
 def contaminated(filter, share="visible", **options):
-    """The filter, whose readings are wrong in the share that an entry says."""
+    """Returns the filter, whose readings are wrong in the share that an entry says."""
     return filter.with_modules(analysis=Contaminated(filter["analysis"], share, **options))
 
 
@@ -112,7 +112,7 @@ def test_a_packaged_step_is_the_step(name, share, tmp_path):
 
 
 def certain(td, key="observed"):
-    """Readings that are seen for certain, or for certain not; and the same by masks."""
+    """Returns readings that are seen for certain, or for certain not; and the same by masks."""
     sees = torch.rand(*td.batch_size, 1) < 0.6
     return td.copy().set("visible", sees.to(torch.float64)), td.copy().set(key, td[key] & sees)
 
@@ -138,7 +138,7 @@ KINDS = {"ensemble": partial(EnsembleAnalysis, "etkf"), "EKF": EKFAnalysis, "UKF
 
 
 def late(kind, r=1.0, *, analysis=None, delay=2):
-    """A filter of a sensor that is late, and of one that is not."""
+    """Returns a filter of a sensor that is late, and of one that is not."""
     F, Q, H, R = linear_system()
     sensors = {
         "late": FusedSensor(LinearObservation(H), r * R.sqrt(), delay=delay, analysis=analysis),
@@ -201,7 +201,7 @@ def test_a_gate_does_not_go_around_it_for_particles():
 
 
 def learned(kind):
-    """A filter of two components; its sensor's reading tells half of what the head must know."""
+    """Returns a filter of two components; its sensor's reading tells half of what the head must know."""
     F, _, H, _ = linear_system()
     moves = torch.nn.Linear(2, 2, bias=False)
     moves.weight.data = F.clone()

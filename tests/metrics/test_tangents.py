@@ -28,7 +28,7 @@ def _double(float64):
 
 
 def belief(space, center, factor):
-    """Truth, mean, members, weights, variance and covariance around a point, [COUNT, ...]."""
+    """Returns the truth, mean, members, weights, variance and covariance around a point, [COUNT, ...]."""
 
     def around(*extra):
         point = center.expand(COUNT, *extra, space.point_dim)

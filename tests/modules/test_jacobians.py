@@ -143,7 +143,7 @@ def test_a_transition_knows_its_jacobian_and_its_gradient(float64, monkeypatch, 
 
 
 def reading(name, *batch, kind=EKFAnalysis):
-    """An update of an observation, and what it reads."""
+    """Returns an update of an observation, and what it reads."""
     observation = OBSERVATIONS[name]()
     size = {"errors of others": 6}.get(name, 3)
     outputs = {"select": 3, "biased": 1, "biased factor": 2}.get(name, 2)

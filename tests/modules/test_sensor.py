@@ -19,7 +19,7 @@ def image_sensor(**kwargs):
 
 
 def draw(sensor, batch):
-    """Noise that can be indexed by rows, whatever it is made of."""
+    """Returns the noise that can be indexed by rows, whatever it is made of."""
     noise = sensor.draw_noise(batch)
     return noise if isinstance(noise, torch.Tensor) else TensorDict(noise, batch)
 

@@ -28,17 +28,17 @@ def constant_noise(size, r=0.3):
 
 
 def bend(x):
-    """A nonlinear map of three dimensions."""
+    """Returns a nonlinear map of three dimensions."""
     return torch.stack([x[..., 0] + x[..., 1].sin(), x[..., 1] * x[..., 2], x[..., 2].exp()], -1)
 
 
 def range_bearing(x):
-    """Distance and direction of the origin."""
+    """Returns the distance and direction of the origin."""
     return torch.stack([x[..., :2].norm(dim=-1), torch.atan2(x[..., 1], x[..., 0])], -1)
 
 
 def loops(mean, cov, function, alpha, beta, kappa):
-    """Points, their images and both weights, one point at a time."""
+    """Returns points, their images and both weights, one point at a time."""
     dim = len(mean)
     lam = alpha**2 * (dim + kappa) - dim
     root = np.linalg.cholesky((dim + lam) * cov)

@@ -50,7 +50,7 @@ def test_an_inert_gate_is_the_filter_bit_for_bit(name, response):
 
 
 def still(variance=1.0, noise=1.0, **kwargs):
-    """A state that does not move, in one dimension: the update is a weighted mean."""
+    """Returns a state that does not move, in one dimension: the update is a weighted mean."""
     one = torch.eye(1, dtype=torch.float64)
     filter = KalmanFilter(
         one, one, process_noise_cov=0 * one, noise_cov=noise * one, mean=torch.zeros(1).double(), cov=variance * one
@@ -248,7 +248,7 @@ def test_calibration_holds_what_clean_data_show():
 
 
 def gate_of(kind, dim=1, **options):
-    """A gate around the update of a forecast N(0, 1) by readings with noise 1, and that forecast."""
+    """Returns a gate around the update of a forecast N(0, 1) by readings with noise 1, and that forecast."""
     if kind == "ensemble":
         members = torch.randn(5 * dim, dim).double()
         members = members - members.mean(0)

@@ -28,13 +28,13 @@ def frame(motion, *batch, still=False):
 
 
 def step(motion, state, **entries):
-    """The forecast of states [*B, E, P]."""
+    """Returns the forecast of states [*B, E, P]."""
     td = TensorDict({("belief", "ensemble"): state, **entries}, state.shape[:-2])
     return motion(td)["forecast", "ensemble"]
 
 
 def observe(reading, state):
-    """The predicted readings of states [*B, E, P]."""
+    """Returns the predicted readings of states [*B, E, P]."""
     return reading(TensorDict({("forecast", "ensemble"): state}, state.shape[:-2]))["forecast", "observation"]
 
 

@@ -35,7 +35,7 @@ def drives(*batch, count=12):
 
 
 def by_hand(frames):
-    """Mean and covariance with F and Q of each step in their closed form; the first frame is not read."""
+    """Returns the mean and covariance with F and Q of each step in their closed form; the first frame is not read."""
     mean, cov = torch.zeros(len(frames), 2), torch.eye(2).expand(len(frames), 2, 2)
     means, covs = [mean], [cov]
     for row in frames.unbind(1)[1:]:

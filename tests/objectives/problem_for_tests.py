@@ -6,14 +6,14 @@ from tests.filters.factories import OBS, S, toy_frames
 
 
 def problem(filter, batch=(2, 7), **kwargs):
-    """Frames with noise, true states and true observations, and what the filter makes of them."""
+    """Returns frames with noise, true states and true observations, and what the filter makes of them."""
     frames = filter.draw_noise(toy_frames(batch, **kwargs))
     frames["state"], frames["target_observation"] = torch.randn(*batch, S), torch.randn(*batch, OBS)
     return frames, filter.sequence(frames.copy())
 
 
 def only(terms, name, weight=1.0):
-    """Weights that are zero for all other terms."""
+    """Returns weights that are zero for all other terms."""
     return {term: weight * (term == name) for term in terms}
 
 

@@ -45,7 +45,7 @@ def start(gaussian):
 
 
 def fused(kind, *, lidar=False, **options):
-    """A state of two components: a wheel, whose model comes first, reads the second, and a camera the first."""
+    """Returns a state of two components: a wheel, whose model comes first, reads the second, and a camera the first."""
     sensors = {"wheel": FusedSensor(Select([1]), [0.3]), "camera": FusedSensor(Select([0]), [NOISE], sensor=camera())}
     if lidar:
         sensors["lidar"] = FusedSensor(Select([1]), [0.2], sensor=camera(image_key="scan"))
@@ -62,7 +62,7 @@ def data():
 
 
 def off(drive, component=0, key="pixels"):
-    """Errors of a camera's readings, in the pictures that show anything."""
+    """Returns errors of a camera's readings, in the pictures that show anything."""
     error = 2 * drive[key].flatten(-3).mean(-1) + 0.1 - drive["state"][..., component]
     return error[drive[key].flatten(-3).amax(-1) > 0.02]
 

@@ -23,7 +23,7 @@ def code(name):
 
 @cache
 def run(name):
-    """The program's names after it ran, with the small setting of the page."""
+    """Returns the program's names after it ran, with the small setting of the page."""
     names = {}
     exec(compile(code(name), f"{name} of the page", "exec"), names)
     return names

@@ -64,7 +64,7 @@ def value(name, data, **options):
 
 
 def beliefs(space, center, spread=0.3):
-    """Truth, members with weights, mean and covariance around a point, or around points ``[B, T, P]``."""
+    """Returns the truth, members with weights, mean and covariance around a point, or around points ``[B, T, P]``."""
 
     def around(*extra):
         return space.plus(center.expand(*extra, space.point_dim), spread * torch.randn(*extra, space.tangent_dim))
@@ -80,7 +80,7 @@ def beliefs(space, center, spread=0.3):
 
 
 def points_of(data, change):
-    """The batch with all its points changed."""
+    """Returns the batch with all its points changed."""
     out = data.clone()
     for key in ("state", ("belief", "mean"), ("belief", "ensemble")):
         out[key] = change(data[key])
@@ -88,7 +88,7 @@ def points_of(data, change):
 
 
 def for_kind(name, data):
-    """The belief that a loss reads: of members without weights, its key is the ensemble's."""
+    """Returns the belief that a loss reads: of members without weights, its key is the ensemble's."""
     return data.exclude(("belief", "log_weight")) if name.startswith("members") else data
 
 

@@ -57,7 +57,7 @@ def collected(filter, frames):
 
 
 def beliefs_by_hand(filter, data):
-    """The belief's mean at every root and every next observation, one step after the other."""
+    """Returns the belief's mean at every root and every next observation, one step after the other."""
     roots, nexts, carry = [], [], None
     for t in range(data.shape[1]):
         row = data[:, t]
@@ -180,7 +180,7 @@ def q_of(loss, mean, action, number=0):
 
 
 def soft_value(head, mean, q):
-    """The worth of an action that is drawn, by the less of two critics, with the reward of its entropy."""
+    """Returns the worth of an action that is drawn, by the less of two critics, with the reward of its entropy."""
     chosen = TanhNormal(*head(mean))
     action = chosen.rsample()
     worth = torch.stack([q(mean, action, number) for number in (0, 1)]).min(0).values
@@ -188,7 +188,7 @@ def soft_value(head, mean, q):
 
 
 def critics_by_hand(data, roots, nexts, head, q):
-    """The squared error of both critics at the beliefs ``roots``."""
+    """Returns the squared error of both critics at the beliefs ``roots``."""
     target = data["next", "reward"] + 0.9 * ~data["next", "terminated"] * soft_value(head, nexts, q)
     return sum((q(roots, data["action"], number) - target.detach()).square().mean() for number in (0, 1))
 

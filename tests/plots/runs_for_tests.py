@@ -26,7 +26,7 @@ def kalman_runs(batch=60, steps=80, lag=0):
 
 
 def ensemble_run(steps=40, members=19, seed=0):
-    """A belief of random members around a circle, with truth and mask; [steps]."""
+    """Returns a belief of random members around a circle, with truth and mask; [steps]."""
     rng = torch.Generator().manual_seed(seed)
     t = torch.arange(steps) * DT
     truth = torch.stack([t.cos(), t.sin(), t], -1)

@@ -107,7 +107,7 @@ def spans(axes) -> list[tuple[float, float]]:
 
 
 def slow_sensor(lost: int) -> TensorDict:
-    """Five seconds at 100 Hz of a sensor at 1 Hz, of whose readings at 0.5, 1.5, ... s one is lost."""
+    """Returns five seconds at 100 Hz of a sensor at 1 Hz, of whose readings at 0.5, 1.5, ... s one is lost."""
     sequence = TensorDict({"belief": {"mean": torch.zeros(500, 1)}}, [500])
     sequence["observed"] = (torch.arange(500) % 100 == 50).unsqueeze(-1)
     sequence["observed"][50 + 100 * lost] = False

@@ -20,7 +20,7 @@ def _double(float64):
 
 
 def turning_run(spread=0.05):
-    """A body that turns about a tilted axis, more than once around; quaternions of either sign."""
+    """Returns a body that turns about a tilted axis, more than once around; quaternions of either sign."""
     rates = torch.tensor([0.03, -0.02, 0.12, 0.2, 0.1]).expand(STEPS, -1) * torch.arange(STEPS).unsqueeze(-1)
     truth = SPACE.plus(SPACE.exp(torch.tensor([0.3, 0.2, 2.0, 3.0, 1.0])), rates)
     ensemble = SPACE.plus(truth.unsqueeze(1), spread * torch.randn(STEPS, E, 5))

@@ -26,7 +26,7 @@ SMOOTHERS = {"EnKS": EnKS, "EnRTS": EnRTS}
 
 
 def large_filter(scheme, **kwargs):
-    """The linear system with so many members that sampling errors are small."""
+    """Returns the linear system with so many members that sampling errors are small."""
     prior = GaussianPrior(MEAN, torch.tensor(COV).sqrt(), ensemble_size=MEMBERS)
     return linear_denkf(scheme, noisy=True, initial=prior, **kwargs)
 

@@ -17,7 +17,7 @@ from torch_denkf.smoothers.particles import log_density_of_pairs
 
 
 def particles(size, *, control=None, **kwargs):
-    """The linear system; its noise is one that has a density."""
+    """Returns the linear system; its noise is one that has a density."""
     F, _, H, R = linear_system()
     return ParticleFilter(
         NoisyTransition(NoisyLinear(F, control=control), known_process_noise()),

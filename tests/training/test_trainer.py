@@ -38,7 +38,7 @@ def line_stage(net, name="fit", updates=6, spoil=(), **kwargs):
 
 
 def by_hand(stage, net, seed, number=0, spoil=()):
-    """The loop of examples/quickstart.py; returns the terms of every update."""
+    """Returns the loop of examples/quickstart.py; returns the terms of every update."""
     optimiser = torch.optim.AdamW(net.parameters(), lr=stage.lr, weight_decay=stage.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, stage.lr, total_steps=stage.updates)
     seen = []

@@ -23,7 +23,7 @@ def one_step(env, filter, without=()):
 
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory):
-    """Steps of a filter without randomness in a batch and of one with an action alone; not compiled: fast."""
+    """Returns steps of a filter without randomness in a batch and of one with an action alone; not compiled: fast."""
     folder, out = tmp_path_factory.mktemp("packages"), {}
     plain_toy = partial(toy_filter, sensor_layer="none", layer="none")
     cases = {"[3]": (base_env, fixed_filter, [3]), "action": (toy_base_env, plain_toy, [])}

@@ -155,7 +155,7 @@ def _results(
 
 
 def _waves(value: Tensor) -> Tensor:
-    """Numbers between -1 and 1, as many and of the kind of a tensor's."""
+    """Returns numbers between -1 and 1, as many and of the kind of a tensor's."""
     numbers = torch.arange(1, value.numel() + 1, dtype=torch.float64).sin()
     return numbers.reshape(value.shape).to(value.device, value.dtype)
 

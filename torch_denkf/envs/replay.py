@@ -178,7 +178,7 @@ class ReplayEnv(RowsEnv):
 
 
 def _numbers(data: EpisodeReplay, episodes: Sequence[int | str] | int | str | None) -> list[int]:
-    """Numbers of episodes by number or name."""
+    """Returns numbers of episodes by number or name."""
     if episodes is None:
         return list(range(len(data.episodes)))
     numbers = {episode.name: number for number, episode in enumerate(data.episodes)}

@@ -276,7 +276,7 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
 
 
 def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey]], dict]:
-    """Names of their own for the diagnostics of several analyses, and what to sum up."""
+    """Returns names of their own for the diagnostics of several analyses, and what to sum up."""
     writers: dict[str, list[Placed]] = {}
     for place, module in steps:
         for part in in_sequences(module):

@@ -158,7 +158,7 @@ class _Stream:
         return np.stack([self.times, before.astype(float)], 1)
 
     def rows(self, name: str, place: np.ndarray, count: int) -> dict[str, np.ndarray]:
-        """Readings, their mask, and their noise, in the rows in which they stand."""
+        """Returns readings, their mask, and their noise, in the rows in which they stand."""
         value, observed = np.full((count, *self.values.shape[1:]), np.nan), np.zeros((count, 1), bool)
         value[place], observed[place] = self.values, True
         found = {name: value, f"{name}_observed": observed}

@@ -273,7 +273,7 @@ class StochasticMLP(nn.Module):
         return jacobian_of_layers(layers, x, size, (nn.Linear, FlipoutLinear))
 
     def _perturbation_sizes(self) -> list[int]:
-        """Numbers of perturbed weights and biases; those of flipout's layers."""
+        """Returns numbers of perturbed weights and biases; those of flipout's layers."""
         return [layer.perturbation_size for layer in self.layers if isinstance(layer, FlipoutLinear)]
 
     def _flipout(self, noise: Mapping[str, torch.Tensor]) -> list[tuple[Callable[..., torch.Tensor], None]]:

@@ -22,7 +22,7 @@ BLACK, MISSING = 20, 0.3  # consecutive black frames; share of frames that do no
 
 
 def code_of(sensors: Sequence[ImageSensor], pixels: Tensor) -> Tensor:
-    """Features of the sensors' trunks, one behind the other, ``[N, F]``, of pictures ``[N, 3, H, W]``."""
+    """Returns features of the sensors' trunks, one behind the other, ``[N, F]``, of pictures ``[N, 3, H, W]``."""
     return torch.cat([sensor._features(pixels, None) for sensor in sensors], -1)
 
 
@@ -34,7 +34,7 @@ def read_codes(
     see: Callable[[TensorDict], TensorDict],
     file: Path,
 ) -> TensorDict:
-    """Features of all frames of some sequences ``[N, T]``, the shorter ones filled up; kept in a file.
+    """Returns features of all frames of some sequences ``[N, T]``, the shorter ones filled up; kept in a file.
 
     Args:
         sensors: whose trunks look.
@@ -65,7 +65,7 @@ def read_codes(
 def read_heads(
     sensors: Sequence[ImageSensor], code: Tensor, size: int, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Samples ``[*B, size, O]`` and encoding ``[*B, F]`` of the sensors' heads, of features ``[*B, F]``.
+    """Returns samples ``[*B, size, O]`` and encoding ``[*B, F]`` of the sensors' heads, of features ``[*B, F]``.
 
     The samples are split among the sensors, which were trained from different random numbers: their spread is also that
     of what training leaves open.
@@ -115,7 +115,7 @@ def fail(readings: TensorDict, condition: str, seed: int = 0) -> TensorDict:
 
 
 def without(readings: TensorDict, lost: Tensor) -> TensorDict:
-    """Readings ``[N, T]`` without the frames that are ``lost`` ``[N, T, 1]``, of which nothing is left."""
+    """Returns readings ``[N, T]`` without the frames that are ``lost`` ``[N, T, 1]``, of which nothing is left."""
     out = readings.copy()
     for key in ("observed", "arrived"):
         out[key] = out[key] & ~lost

@@ -59,7 +59,7 @@ class KITTIRecipe(Recipe):
                 module.logarithm.fill_(logarithm)
 
     def transition(self, network: nn.Module) -> SubModel:
-        """Known motion of the pose; the velocities walk at random, with a trend."""
+        """Returns known motion of the pose; the velocities walk at random, with a trend."""
         facts = self.facts
         keys = {"history_key": HISTORY, "drift": False}
         return UnicycleTransition(network, dt=facts.dt, loc=facts.loc, scale=facts.scale, **keys)
@@ -70,7 +70,7 @@ class KITTIRecipe(Recipe):
         return torch.cat([torch.full((3,), torch.inf), self.unit])
 
     def build(self) -> Filter:
-        """The whole filter."""
+        """Returns the whole filter."""
         return Filter(OrderedDict(sensor=self.sensor, **self.modules()), initial=self.initial(INITIAL_STD, "state"))
 
     def part(self, model: Filter, *, sensor: bool, start_std: Tensor | None = None) -> Filter:

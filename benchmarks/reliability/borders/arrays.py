@@ -107,7 +107,7 @@ def both(first: Change, then: Change) -> Change:
 
 
 def unobserved(*at: Any, width: int = 0) -> Change:
-    """A mask that is False in a place; of so many components, which then have masks of their own."""
+    """Returns a mask that is False in a place; of so many components, which then have masks of their own."""
 
     def change(frames: TensorDict) -> None:
         mask = frames["observed"]
@@ -189,7 +189,7 @@ WIDE_MASK = d.Wrong({"too wide": lambda mask: mask.expand(*mask.shape[:-1], 5)})
 
 
 def large(source: Source, change: Change, result: TensorDict) -> bool:
-    """Right where a reading is treated as missing, or all is finite and as in double precision."""
+    """Tells whether a reading is treated as missing, or all is finite and as in double precision."""
     if source.like(unobserved(*AT))(result):
         return True
 
@@ -207,7 +207,7 @@ def large(source: Source, change: Change, result: TensorDict) -> bool:
 
 
 def goes_on(source: Source, width: int, change: Change, result: TensorDict) -> bool:
-    """Right where only the row that is damaged is as if it had not been observed, or computed right."""
+    """Tells whether only the row that is damaged is as if it had not been observed, or computed right."""
     rows, near = [row for row in range(B) if row != AT[0]], {"rtol": 1e-5, "atol": 1e-5}
     hides = [unobserved(*AT)] + [unobserved(*AT, 0, width=width)] * (width == 2)  # a sensor's is hidden as a whole
     hidden = any(d.same(result[AT[0]], source.damaged(hide)[AT[0]], **near) for hide in hides)
@@ -234,7 +234,7 @@ def readings(one: Fed) -> Iterator[Target]:
 
 
 def poke(place: int, value: float) -> Change:
-    """A number in a belief's entry, of the first row."""
+    """Returns a number in a belief's entry, of the first row."""
     return lambda entry: torch.cat([spoiled(place / 41, value)(entry[:1]), entry[1:]])
 
 
@@ -525,6 +525,6 @@ def _of_robots() -> Iterator[Target]:
 
 
 def targets() -> Iterator[Target]:
-    """All that is read, entry by entry."""
+    """Yields all that is read, entry by entry."""
     for kind in (_of_filters, _of_spaces, _of_noises, _of_robots):
         yield from kind()

@@ -207,7 +207,7 @@ def _half_of_the_drive(root: Path) -> None:
 
 
 def _as_of_half_the_drive(said: str) -> bool:
-    """Right where images without poses are warned of, and the rest is as of a drive without these images."""
+    """Tells whether images without poses are warned of, and the rest is as of a drive without these images."""
     warning, _, table = said.partition("\n")
     shorter = CALLED["evaluate"].damaged(_half_of_the_drive)
     return "town.txt has 5 poses" in warning and "5 of 10 images" in warning and table == shorter
@@ -242,7 +242,7 @@ POSES: dict[str, d.Change] = {
 
 
 def _rights(source: Source, file: str, options: dict[str, Any]) -> Callable[[str, Any], Any]:
-    """Right where a command says word for word what it says of sound files, and warns of nothing.
+    """Tells whether a command says word for word what it says of sound files, and warns of nothing.
 
     Nothing depends on the last byte of a table or a description, which ends a line; of calib.txt, rows of other cameras
     may be damaged.
@@ -262,7 +262,7 @@ def _rights(source: Source, file: str, options: dict[str, Any]) -> Callable[[str
 
 
 def targets() -> Iterator[Target]:
-    """All words and files."""
+    """Yields all words and files."""
     for name in COMMANDS:
         yield from _options(name)
     act, no_words = (lambda words, folder: run(words)), d.of(["fly"], ["info", "--loud"])

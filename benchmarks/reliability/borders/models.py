@@ -202,7 +202,7 @@ def _called(folder: Path, entries: dict[str, Any] | None = None) -> Any:
 
 
 def _as_by_hand(result: Any) -> bool:
-    """Right where the step returns what the filter's own does."""
+    """Tells whether the step returns what the filter's own does."""
     out = linear_kalman().step(TensorDict({tuple(name.split(".")): value for name, value in ENTRIES.items()}))
     expected = {f"belief.{name}": out["belief", name] for name in ("mean", "cov", "var")}
     return same({name: result[name] for name in expected}, expected, atol=1e-5)
@@ -270,7 +270,7 @@ def _of_packages() -> Iterator[Target]:
 
 
 def targets() -> Iterator[Target]:
-    """All files of models."""
+    """Yields all files of models."""
     npz_of_zeros(1 << 30)  # here, not in each case's process
     yield from _of_checkpoints()
     for name in LOADERS:

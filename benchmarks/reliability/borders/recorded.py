@@ -65,7 +65,7 @@ IMAGES, TIME_FILE, CALIBRATION_FILE = f"{SEQUENCE}/image_2", f"{SEQUENCE}/times.
 
 
 def read_drive(root: Path, drive: Any = DRIVE, **options: Any) -> TensorDict:
-    """A drive, as a user reads it."""
+    """Returns a drive, as a user reads it."""
     return read_kitti_drive(root, drive, **{"size": SIZE, "cache": None, **options})
 
 
@@ -84,7 +84,7 @@ def _that_picture(result: TensorDict) -> bool:
 
 
 def _times_masked(result: TensorDict) -> bool:
-    """Right where poses and pictures are as without damage, and frames of a wrong time are marked as missing.
+    """Tells whether poses and pictures are as without damage, and frames of a wrong time are marked as missing.
 
     A first time that is too early is a gap, after which no motion is known.
     """
@@ -106,7 +106,7 @@ def _picture(size: tuple[int, int], suffix: str) -> d.Change:
 
 
 def bomb(data: bytes) -> bytes:
-    """A picture that says that it is of 60,000 x 60,000 pixels."""
+    """Returns a picture that says that it is of 60,000 x 60,000 pixels."""
     return data[:16] + struct.pack(">II", 60000, 60000) + data[24:]
 
 
@@ -172,7 +172,7 @@ VIDEO = f"videos/{CAMERA}/chunk-000/file-000.mkv"
 
 
 def read_episodes(root: Path, **options: Any) -> TensorDict:
-    """All rows, as a user reads them."""
+    """Returns all rows, as a user reads them."""
     return LeRobotReplay(root, **{"size": SMALL, **ALL_ROWS, **options})[:]
 
 
@@ -182,12 +182,12 @@ V3 = Source("lerobot", made("lerobot3", lambda root: write_version_3(root, [LENG
 
 
 def _rows_kept(result: TensorDict) -> bool:
-    """Right where rows are as without damage, or those of the damaged episode are marked; stamps are rounded."""
+    """Tells whether rows are as without damage, or those of the damaged episode are marked; stamps are rounded."""
     return kept(result, V2.reference(), most=LENGTHS[1], rtol=1e-6)
 
 
 def _video_shown(result: TensorDict) -> bool:
-    """Right where every row that counts as seen shows its own picture, but for a codec's rounding."""
+    """Tells whether every row that counts as seen shows its own picture, but for a codec's rounding."""
     expected = V3.reference()
     seen = result["observed"].squeeze(-1)
     numbers = [key for key in expected.keys(True, True) if key != "pixels" and key != "observed"]
@@ -259,12 +259,12 @@ DEMO, MANIFEST = "demo-000001.npz", "demos.jsonl"
 
 
 def read_demos(root: Path, **options: Any) -> TensorDict:
-    """All rows, as a user reads them."""
+    """Returns all rows, as a user reads them."""
     return UR5ExperienceReplay(root, **{**ALL_ROWS, **options})[:]
 
 
 def _warned(root: Path) -> tuple[TensorDict, list[str]]:
-    """The rows, and what was said."""
+    """Returns the rows, and what was said."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         result = read_demos(root)
@@ -277,7 +277,7 @@ LISTED = Source("ur5", demos, _warned)
 
 
 def _all_or_said(result: tuple[TensorDict, list[str]]) -> bool:
-    """Right where all demos are there, or the first ones, and a warning names the list that lacks the others."""
+    """Tells whether all demos are there, or the first ones, and a warning names the list that lacks the others."""
     rows, said = result
     first = same(rows, DEMOS.reference()[: len(rows)])
     return DEMOS.like()(rows) or (first and any(MANIFEST in message for message in said))
@@ -352,7 +352,7 @@ def _write_own(root: Path) -> None:
 
 
 def read_own(root: Path, *, camera: str = "", table: str = "table.csv", replay: Any = None, **options: Any) -> Any:
-    """All rows, as a user reads them."""
+    """Returns all rows, as a user reads them."""
     streams: dict[str, Any] = {"state": Table(root / table, **options)}
     if camera == "video":
         streams["camera"] = Video(root / "run.mkv", times=root / "stamps.csv")
@@ -366,7 +366,7 @@ OWN = Source("recordings", own, read_own)
 
 
 def _shown(result: TensorDict, camera: str = "images") -> bool:
-    """Right where each row that counts as seen shows its own picture, and all numbers are as without damage."""
+    """Tells whether each row that counts as seen shows its own picture, and all numbers are as without damage."""
     expected, places = OWN.reference(camera=camera), result["time"].squeeze(-1)
     if same(result, expected):
         return True
@@ -407,7 +407,7 @@ def _named(name: bytes, folder: Path) -> Any:
 
 
 def rows_in_memory(change: d.Change = lambda rows: None, fps: Any = 10.0) -> Any:
-    """Rows that are in memory."""
+    """Returns rows that are in memory."""
     state = torch.rand(12, 2, generator=torch.Generator().manual_seed(0))
     rows = TensorDict({"observation": {"image": torch.zeros(12, 3, 8, 8, dtype=torch.uint8), "state": state}}, [12])
     rows["episode"] = torch.arange(3).repeat_interleave(4)
@@ -416,7 +416,7 @@ def rows_in_memory(change: d.Change = lambda rows: None, fps: Any = 10.0) -> Any
 
 
 def _row_masked(result: TensorDict) -> bool:
-    """Right where the damaged row counts neither as seen nor in a loss, and all others are as without damage."""
+    """Tells whether the damaged row counts neither as seen nor in a loss, and all others are as without damage."""
     masks = ("observed", "state_observed", ("collector", "mask"))
     return all(not bool(result[mask][1].any()) for mask in masks) and kept(result, rows_in_memory())
 
@@ -465,7 +465,7 @@ def _of_own() -> Iterator[Target]:
 
 
 def sound_entries() -> dict[str, np.ndarray]:
-    """A drive of eight rows and six corners that all see."""
+    """Returns a drive of eight rows and six corners that all see."""
     random = np.random.default_rng(0)
     left = np.stack([600 + 100 * random.normal(size=(6, 8)), 180 + 20 * random.normal(size=(6, 8))])
     return {
@@ -501,7 +501,7 @@ BAD_ENTRIES: dict[str, tuple[str, Callable[[np.ndarray], Any]]] = {
 
 
 def read_corners(root: Path, **options: Any) -> Any:
-    """All rows, as a user replays them."""
+    """Returns all rows, as a user replays them."""
     rows, camera = read_corner_drive(root / "drive.npz", **options)
     replay = corner_replay({"drive": rows.exclude("came_from")}, split="all", cache=None)[:]
     before, after = (camera.corners(rows["corners"][:, :, row]).float() for row in (0, 1))
@@ -611,6 +611,6 @@ def _of_caches() -> Iterator[Target]:
 
 
 def targets() -> Iterator[Target]:
-    """All files, and what is kept of them."""
+    """Yields all files, and what is kept of them."""
     for kind in (_of_kitti, _of_lerobot, _of_ur5, _of_own, _of_corners, _of_caches):
         yield from kind()

@@ -43,7 +43,7 @@ def model_of(name):
 
 
 def of_mujoco(model, data, feet, imu):
-    """Positions of the feet in the sensor's axes."""
+    """Returns positions of the feet in the sensor's axes."""
 
     def frame(name):
         if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name) >= 0:

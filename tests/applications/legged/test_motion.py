@@ -90,7 +90,7 @@ class Hartley:
         self.bias, self.feet = mean[10:16].numpy().copy(), mean[16:].reshape(-1, 3).numpy().copy()
 
     def world(self):
-        """Velocity, position, feet, and where their errors stand."""
+        """Returns the velocity, position, feet, and where their errors stand."""
         places = [slice(3, 6), slice(6, 9), *(slice(15 + 3 * k, 18 + 3 * k) for k in range(len(self.feet)))]
         return zip([*self.vectors, *self.feet], places, strict=True)
 
@@ -136,7 +136,7 @@ def cross(vector):
 
 
 def series(matrix, later=0):
-    """The exponential of a matrix, or its integrals."""
+    """Returns the exponential of a matrix, or its integrals."""
     return sum(np.linalg.matrix_power(matrix, k) / math.factorial(k + later) for k in range(12))
 
 

@@ -108,7 +108,7 @@ def test_a_state_that_the_log_lacks(tmp_path):
 
 
 def planar(folder, seconds, **more):
-    """A log of fixes and a gyro, and the model that reads them."""
+    """Returns a log of fixes and a gyro, and the model that reads them."""
     write_log(folder / "log.csv", seconds)
     settings = {"two_d_mode": True, "frequency": 2.0, "initial_estimate_covariance": [1.0] * 15}
     settings |= {"pose0": "gps", "pose0_config": flags(0, 1), "imu0": "imu", "imu0_config": flags(11)}

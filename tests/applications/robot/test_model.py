@@ -17,7 +17,7 @@ def flags(*places):
 
 
 def moved(state, dt):
-    """The state after dt, angles not wrapped."""
+    """Returns the state after dt, angles not wrapped."""
     roll, pitch, _ = state[3:6]
     rates = np.array(
         [

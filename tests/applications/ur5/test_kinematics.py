@@ -28,7 +28,7 @@ def scene():
 
 
 def flange(joints):
-    """The flange in the table's frame; the maker's base frame has its x axis away from the table."""
+    """Returns the flange in the table's frame; the maker's base frame has its x axis away from the table."""
     pose = np.diag([-1.0, -1.0, 1.0, 1.0])
     pose[:3, 3] = BASE
     for q, a, d, alpha in zip(joints, A, D, ALPHA, strict=True):

@@ -128,7 +128,7 @@ def test_arrivals_of_repeated_fixes(tmp_path):
 
 
 def queued(rate, count=2000):
-    """Steps by 0.2 ms at 5 % of the stamps, and by 0.16 s at 2 %; the others make up for both."""
+    """Returns steps by 0.2 ms at 5 % of the stamps, and by 0.16 s at 2 %; the others make up for both."""
     steps = np.full(count, 1 / rate)
     order = np.random.default_rng(0).permutation(count)
     steps[order[: count // 20]], steps[order[-count // 50 :]] = 2e-4, 0.16
@@ -136,7 +136,7 @@ def queued(rate, count=2000):
 
 
 def bursts(count=1000):
-    """A sensor of 100 Hz, of whose stamps some are those of a queue that is emptied at once."""
+    """Returns a sensor of 100 Hz, of whose stamps some are those of a queue that is emptied at once."""
     time = np.arange(count) * 0.01
     for first in range(20, count - 20, 50):
         time[first : first + 18] = time[first + 18] - 0.0002 * np.arange(18, 0, -1)

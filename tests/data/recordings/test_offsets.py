@@ -12,7 +12,7 @@ LATE = {"wheels": 0.1, "gps": 0.3}
 
 
 def drive(seed, seconds=120.0, noise=0.05):
-    """A gyro at 100 Hz, wheels at 20 Hz and 0.1 s late, GPS at 5 Hz and 0.3 s late; none in common units."""
+    """Returns a gyro at 100 Hz, wheels at 20 Hz and 0.1 s late, GPS at 5 Hz and 0.3 s late; none in common units."""
     rng, dt, count = np.random.default_rng(seed), 0.01, round(100 * seconds)
     turn, speed = np.zeros(count), np.full(count, 2.0)
     for k in range(1, count):

@@ -232,7 +232,7 @@ class MagnetometerNoise(Sensor):
         self.log_std = nn.Parameter(torch.tensor([settings.magnetometer, settings.magnetometer_rate]).log())
 
     def compute(self, gyro):
-        """The variances."""
+        """Returns the variances."""
         white, rate = (2 * self.log_std).exp().unbind(-1)
         return (white + rate * gyro.square().sum(-1, keepdim=True)).expand_as(gyro)
 
@@ -277,7 +277,7 @@ class ImuFilter(FusedFilter):
 
 
 def imu(**settings) -> ImuFilter:
-    """A filter of an inertial sensor's orientation, with 9 or 6 axes.
+    """Returns a filter of an inertial sensor's orientation, with 9 or 6 axes.
 
     Args:
         **settings: those of :class:`ImuSettings`.

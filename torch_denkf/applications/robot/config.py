@@ -218,7 +218,7 @@ def _matrix(name: str, values: Any) -> np.ndarray:
 
 
 def _numbers_of(yaml: Any) -> Any:
-    """A loader that reads 1e-3, which YAML 1.1 takes for text, as a number, as ROS does."""
+    """Returns a loader that reads 1e-3, which YAML 1.1 takes for text, as a number, as ROS does."""
     loader: Any = type("Loader", (yaml.SafeLoader,), {})
     pattern = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
     loader.add_implicit_resolver("tag:yaml.org,2002:float", pattern, list("-+0123456789."))

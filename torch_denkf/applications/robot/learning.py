@@ -136,7 +136,7 @@ def _alike(gradient: Tensor, at: Sequence[int]) -> Tensor:
 
 
 def scale_of(model: RobotModel, name: str) -> Tensor:
-    """The parameter of a sensor's noise."""
+    """Returns the parameter of a sensor's noise."""
     return model.filter[f"{name}_noise"].module.log_scale
 
 
@@ -197,7 +197,7 @@ def _segments(model: RobotModel, rows: TensorDict, window: float, length: int) -
 
 
 def _positions(model: RobotModel) -> list[str]:
-    """The sensors that read x and y first."""
+    """Returns the sensors that read x and y first."""
     return [name for name, reads in model.reads.items() if tuple(reads[:2]) == (0, 1)]
 
 

@@ -104,7 +104,7 @@ class LearnedScale(SubModel):
         self.log_scale = nn.Parameter(torch.zeros(size - kept, dtype=dtype))
 
     def compute(self, covariance):
-        """The scaled covariances."""
+        """Returns the scaled covariances."""
         scale = nn.functional.pad(self.log_scale, (0, self.kept)).exp().to(covariance.dtype)
         return covariance * scale * scale.unsqueeze(-1)
 

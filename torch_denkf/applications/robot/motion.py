@@ -89,7 +89,7 @@ class RobotMotion(Motion):
         self.drifts, self.held = drifts, held
 
     def move(self, state, *, dt):
-        """The pose moved by velocity and acceleration, the velocity by the acceleration."""
+        """Returns the pose moved by velocity and acceleration, the velocity by the acceleration."""
         return self._moved(state, dt)[0]
 
     def move_and_gradient(self, state, *, dt):
@@ -175,7 +175,7 @@ class RobotNoise(SubModel):
         self.log_scale = nn.Parameter(torch.zeros(len(STATES), dtype=cov.dtype))
 
     def compute(self, mean, *dt):
-        """The covariance of the step."""
+        """Returns the covariance of the step."""
         scale = self.log_scale.exp()
         cov = (self.cov * scale * scale.unsqueeze(-1)).to(mean.dtype)
         if self.dynamic:

@@ -37,7 +37,7 @@ class Seen(NamedTuple):
     stated: bool
 
     def every(self, count: int) -> Seen:
-        """Each of so many readings; all for a count of one or less."""
+        """Returns each of so many readings; all for a count of one or less."""
         kept = slice(None, None, max(count, 1))
         return Seen(self.times[kept], self.values[kept], self.noise[kept], self.stated)
 

@@ -72,7 +72,7 @@ def _drift(model: RobotModel, name: str, at: int) -> tuple[float, float] | None:
 
 
 def _chi_square(dof: int) -> float:
-    """The quantile of a chi-square distribution, by Wilson and Hilferty."""
+    """Returns the quantile of a chi-square distribution, by Wilson and Hilferty."""
     part = 2 / (9 * dof)
     return dof * (1 - part + NormalDist().inv_cdf(_BELIEVED) * math.sqrt(part)) ** 3
 
@@ -96,7 +96,7 @@ def gap_errors(out: TensorDict, full: TensorDict, model: RobotModel) -> tuple[fl
 
 
 def learned_settings(model: RobotModel, log: RobotLog, rows: TensorDict) -> dict[str, Any]:
-    """The settings that were learned: process noise, and delays, variances and drifts of the sensors."""
+    """Returns the settings that were learned: process noise, and delays, variances and drifts of the sensors."""
     process = next(part for part in model.filter.modules() if hasattr(part, "log_scale") and hasattr(part, "dynamic"))
     scale = process.log_scale.detach().exp()
     cov: Tensor = process.cov * scale * scale.unsqueeze(-1)

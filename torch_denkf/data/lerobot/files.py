@@ -77,7 +77,7 @@ class Layout:
     meta: tuple[Path, ...]
 
     def width(self, key: str) -> int:
-        """Numbers in a feature.
+        """Returns numbers in a feature.
 
         Raises:
             ValueError: if there is no such feature, or it is no vector.

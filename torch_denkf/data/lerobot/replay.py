@@ -239,7 +239,7 @@ def _pictures_of_rows(images: JoinedPictures, shown: Tensor, row: Tensor) -> dic
 
 
 def _places(argument: str, dims: Sequence[int | str], names: tuple[str, ...] | None, width: int) -> list[int]:
-    """Places of the numbers that are asked for by place or name."""
+    """Returns places of the numbers that are asked for by place or name."""
     places = {name: place for place, name in enumerate(names or ())}
     chosen = [places.get(dim, -1) if isinstance(dim, str) else int(dim) for dim in dims]
     if not chosen or not all(0 <= place < width for place in chosen):

@@ -175,7 +175,7 @@ def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[De
 
 
 def changes_of(tables: Mapping[str, Readings], offsets: Mapping[str, float]) -> tuple[dict, dict]:
-    """Times of the streams, and the changes of heading and way that several know, all after correction.
+    """Returns times of the streams, and the changes of heading and way that several know, all after correction.
 
     Args:
         tables: readings by stream.

@@ -49,7 +49,7 @@ def time_columns(names: Sequence[str]) -> list[str]:
 
 
 def nanoseconds_beside(time: str, names: Sequence[str]) -> str | None:
-    """The column with the nanoseconds of a column of whole seconds, as ROS writes stamps.
+    """Returns the column with the nanoseconds of a column of whole seconds, as ROS writes stamps.
 
     Examples:
         >>> nanoseconds_beside("header.stamp.secs", ["x", "header.stamp.nsecs"])
@@ -87,7 +87,7 @@ def seconds_of(text: str) -> float | None:
 
 
 def unit_of(name: str, times: np.ndarray) -> Unit:
-    """The unit of times, by the name of their column, or where they are stamps since 1970 by their size.
+    """Returns the unit of times, by the name of their column, or where they are stamps since 1970 by their size.
 
     Examples:
         >>> unit_of("timestamp [ns]", np.zeros(1)), unit_of("time", np.array([1.4e15])), unit_of("t", np.zeros(1))

@@ -217,7 +217,7 @@ def check_times(times: np.ndarray, place: Callable[[int], str], column: str) -> 
 def given_times(
     given: str | Path | Sequence[float], column: str | None, source: str, count: int, what: str
 ) -> tuple[np.ndarray, Callable[[int], str]]:
-    """Times that stand beside what they belong to, in their own unit, and where each is, for messages.
+    """Returns times that stand beside what they belong to, in their own unit, and where each is, for messages.
 
     Args:
         given: a table with a row each, or the times.

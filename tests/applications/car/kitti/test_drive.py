@@ -16,7 +16,7 @@ cv2.setNumThreads(1)
 
 
 def make(root, *, images=range(6), poses=None, camera="image_2", sequence="00", grey=False, size=(10, 30), times=True):
-    """A drive whose frame k is flat in colour (B, G, R) = (k, 50 + k, 100 + k) and which moves 1 m a frame."""
+    """Returns a drive whose frame k is flat in colour (B, G, R) = (k, 50 + k, 100 + k) and which moves 1 m a frame."""
     folder = root / "sequences" / sequence
     (folder / camera).mkdir(parents=True, exist_ok=True)
     (root / "poses").mkdir(exist_ok=True)

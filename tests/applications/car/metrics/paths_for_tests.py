@@ -15,7 +15,7 @@ def straight(rows=201, step=1.0):
 
 
 def winding(seed, rows=400, step=None, batch=()):
-    """A bent path; steps of 0.5 to 1.5 m, or of one length."""
+    """Returns a bent path; steps of 0.5 to 1.5 m, or of one length."""
     rng = torch.Generator().manual_seed(seed)
     speed = 5 + 10 * torch.rand(*batch, rows, generator=rng, dtype=torch.float64)
     speed = speed if step is None else torch.full_like(speed, 10 * step)

@@ -59,7 +59,7 @@ def test_errors_say_what_to_do():
 
 
 def in_space(path):
-    """A planar path (x, y, angle) as points of SE3, whose z is up."""
+    """Returns a planar path (x, y, angle) as points of SE3, whose z is up."""
     turn = SO3().exp(torch.cat([torch.zeros_like(path[..., :2]), path[..., 2:]], -1))
     return torch.cat([turn, path[..., :2], torch.zeros_like(path[..., :1])], -1)
 

@@ -21,7 +21,7 @@ def make(**kwargs):
 
 
 def draw_noise(sensor, batch, **options):
-    """Noise that can be indexed by rows, whatever it is made of."""
+    """Returns the noise that can be indexed by rows, whatever it is made of."""
     noise = sensor.draw_noise(batch, **options)
     return noise if isinstance(noise, torch.Tensor) else TensorDict(noise, batch)
 

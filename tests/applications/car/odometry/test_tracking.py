@@ -25,7 +25,7 @@ def calibration_of(drive):
 
 
 def recorded(car):
-    """The filter, and a list that gets the noise of each of its steps."""
+    """Returns the filter, and a list that gets the noise of each of its steps."""
     noises, plain = [], car.draw_noise
 
     def draw(frame, **kwargs):
@@ -122,7 +122,7 @@ def test_bad_input_says_what_to_do(what, checkpoint, drive):
 
 @pytest.fixture(scope="module")
 def moving(tmp_path_factory):
-    """A drive with traffic, 45 frames of 50 x 150."""
+    """Returns a drive with traffic, 45 frames of 50 x 150."""
     folder = tmp_path_factory.mktemp("moving")
     render_drives(folder, names=["m"], frames=45, camera="image_0")
     return read_kitti_drive(folder, "m", colour=False, cache=None)

@@ -67,7 +67,7 @@ def test_signs_are_shares_and_a_ratio():
 
 
 def plane_flow(distance, turn=(0.0, 0.0, 0.0), focus=(0.0, 0.0)):
-    """The flow of a level road, and of a far wall above it."""
+    """Returns the flow of a level road, and of a far wall above it."""
     x, y = coarse_cells()
     left, up, around = turn
     inverse = (y - focus[1]).clamp_min(0.02) / HEIGHT

@@ -262,7 +262,7 @@ def _covariance(by_disparity: Tensor, flow2: Tensor, stays: Tensor | float, nois
 def started_by_ransac(
     before: Tensor, after: Tensor, seen: Tensor, camera: StereoCamera, *, pixels: float = 1.5
 ) -> tuple[Tensor, Tensor]:
-    """Motions of rows one by one, by OpenCV's random samples of corners.
+    """Returns motions of rows one by one, by OpenCV's random samples of corners.
 
     Args:
         before: corners of the earlier rows ``[T, N, 3]``.

@@ -59,7 +59,7 @@ def after_gap(drive: TensorDictBase) -> Tensor | None:
 
 
 def steps_between(valid: Tensor, longest: int) -> Tensor:
-    """Steps from each frame back to the last one that is there, int64 ``[*B, N]``: see :func:`bridge_gaps`.
+    """Returns steps from each frame back to the last one that is there, int64 ``[*B, N]``: see :func:`bridge_gaps`.
 
     Args:
         valid: whether a frame is there, bool ``[*B, N]``, time last.
