@@ -32,7 +32,7 @@ WANDER = torch.diag(torch.tensor([0.0, PUSH**2]))
 
 
 def record(carts: int, steps: int, *, failing: bool = False) -> TensorDict:
-    """True states, readings when they arrive, and masks; with ``failing`` somebody walks through the laser's beam."""
+    """Returns true states, readings at their arrival, and masks; ``failing`` adds people in the laser's beam."""
     speed = (PUSH * DT**0.5 * torch.randn(carts, steps)).cumsum(1)
     state = torch.stack([DT * speed.cumsum(1), speed], -1)
     data = TensorDict({"state": state}, [carts, steps])

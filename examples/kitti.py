@@ -37,7 +37,7 @@ VELOCITIES = [3, 4]  # v in m/s and theta_dot in rad/s, of the state [x, y, thet
 
 
 def make_filter(data: KITTIOdometryExperienceReplay) -> DEnKF:
-    """Known motion of the pose, learned change of the velocities, and a sensor that reads them from optical flow."""
+    """Returns the filter: known motion of the pose, learned change of the velocities, read from optical flow."""
     dt = float(data[0]["dt"])
     loc, scale = data.statistics["velocity", "mean"], data.statistics["velocity", "std"]
     return DEnKF(

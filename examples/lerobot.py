@@ -123,7 +123,7 @@ def go_black(rows: TensorDict) -> TensorDict:
 
 
 def make_filter(data: LeRobotReplay) -> DEnKF:
-    """Learned motion, under the commands where there are any, and a sensor that reads the state from one picture."""
+    """Returns the filter: learned motion, driven by commands if there are any; a sensor that reads single images."""
     facts, row = data.statistics, data[0]
     loc, scale = facts["state", "mean"], facts["state", "std"].clamp_min(1e-3)  # a joint may never move
     joints, image, driven = len(loc), tuple(row["pixels"].shape), "action" in row

@@ -161,7 +161,7 @@ class Learner:
         self.processes = processes
 
     def __call__(self, batch: TensorDictBase) -> float:
-        """One update of the filter by windows, and many of the policy by their rows; returns the filter's CRPS."""
+        """Updates the filter on windows and the policy on their rows; returns the filter's CRPS."""
         crps = self.descend(self.filter_loss(batch.exclude("belief", "next")), self.filter_optimiser)
         rows = transitions(batch)
         for part in torch.randperm(len(rows)).chunk(8):

@@ -85,7 +85,7 @@ def draw(path: str, plain: TensorDict, gated: TensorDict, limit: float) -> None:
 
 
 def error_of(out: TensorDict) -> Tensor:
-    """Error of the position, ``[runs, steps]`` in m."""
+    """Returns the error of the position, ``[runs, steps]`` in m."""
     return (out["belief", "mean"] - out["state"])[..., 0].abs()
 
 

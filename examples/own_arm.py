@@ -200,7 +200,7 @@ def make_filter(facts: dict[str, list[float]], error: dict[str, list[float]], me
 
 @torch.no_grad()
 def camera_errors(model: FusedFilter, rows: TensorDict, lasting: bool) -> dict[str, list[float]]:
-    """The camera's errors on rows ``[B, T]``, as white noise, or as what lasts from picture to picture beside some."""
+    """Estimates the camera's errors on rows ``[B, T]``: as white noise, or as white and coloured noise."""
     off = model["camera_sensor"](rows.copy())["sensor", "camera", "ensemble"].mean(-2) - rows["state"][..., :2]
     off = torch.where(rows["observed"], off, torch.nan)
     if not lasting:
@@ -212,7 +212,7 @@ def camera_errors(model: FusedFilter, rows: TensorDict, lasting: bool) -> dict[s
 def learn(
     rollouts: TensorDict, unseen: TensorDict, out: Path, updates: tuple[int, int, int]
 ) -> tuple[FusedFilter, dict]:
-    """Motion and camera on three quarters of the demonstrations; the camera's errors, then the whole, on the others.
+    """Trains motion and camera on three quarters of the demonstrations, error model and filter on the others.
 
     On pictures that it learned from the camera's errors are too small.
     """

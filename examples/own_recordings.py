@@ -85,7 +85,7 @@ def make_recordings(root: Path, runs: int, seconds: float) -> None:
 
 
 def read(root: Path, **options) -> RecordingReplay:
-    """The runs of a folder on one clock. A hash of a run's name says for which split it is."""
+    """Returns the runs of a folder on one clock; a hash of a run's name decides its split."""
     runs = [
         Recording(
             name=video.stem,

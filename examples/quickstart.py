@@ -204,7 +204,7 @@ def estimate(rollout: TensorDict, mean_velocity: torch.Tensor, dt: float) -> dic
 
 
 def compare(rollouts: list[TensorDict], estimates: list[dict], window: int) -> str:
-    """A Markdown table of errors, averaged over the drives."""
+    """Returns a Markdown table of errors, averaged over the drives."""
     lines = [
         f"| | translation, m/m over {window} steps | rotation, deg/m | v, RMSE m/s | theta_dot, RMSE deg/s |",
         "|---|---|---|---|---|",

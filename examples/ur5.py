@@ -55,7 +55,7 @@ UNITS = [180 / math.pi] * 7 + [100.0] * 3  # the state is in rad and m
 
 
 def make_filter(data: UR5ExperienceReplay) -> DEnKF:
-    """Learned motion of the ten numbers under commands, and a sensor that reads all of them from one picture."""
+    """Returns the filter: learned motion of ten components under commands; a sensor that reads them from one image."""
     facts = data.statistics
     loc, scale = facts["state", "mean"], facts["state", "std"]
     image = tuple(data[0]["pixels"].shape)

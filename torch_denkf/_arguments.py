@@ -103,7 +103,7 @@ def _of_bases(owner: type) -> dict[str, str]:
 
 
 def _fields(kind: type) -> Iterator[tuple[str, str]]:
-    """Names and annotations of a TypedDict, as text."""
+    """Returns names and annotations of a TypedDict, as text."""
     for name, annotation in kind.__annotations__.items():
         yield name, getattr(annotation, "__forward_arg__", str(annotation))
 

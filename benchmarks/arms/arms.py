@@ -73,7 +73,7 @@ class Arm:
         return self.places(angles)[..., -1, :]
 
     def goal(self, emitted: TensorDictBase) -> Tensor:
-        """The joint angles to go to, at the start of an episode."""
+        """Returns the goal of the joint angles at the start of an episode."""
         angles = self.split(self.state(emitted))[0]
         if self.domain != "reacher":  # upright, away from floor and walls
             return 1.6 * torch.rand_like(angles) - 0.8
@@ -85,7 +85,7 @@ class Arm:
         return torch.stack([shoulder, wrist], -1)
 
     def hold(self, angles: Tensor) -> Tensor:
-        """The action that holds the arm against gravity, of angles ``[*, J]``; angles are 0 where a link stands up."""
+        """Returns the action that holds the arm against gravity at angles ``[*, J]``, which are 0 for links upright."""
         flat = torch.tensor(self.weights) * angles.cumsum(-1).sin()
         return -flat.flip(-1).cumsum(-1).flip(-1) / torch.tensor(self.torques)  # a joint carries all that follows
 

@@ -48,7 +48,7 @@ class ArmTransition(m.Transition):
         self.register_buffer("bias", bias)
 
     def faster(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the change of the velocities in a step, rad/s, of states ``[*, 3 J]``.
+        """Returns mean and standard deviation of the velocity change in a step, rad/s, at states ``[*, 3 J]``.
 
         The network reads velocities no larger than ``fastest``: beyond, the noise that it claims grows with them.
         """
@@ -80,7 +80,7 @@ class ArmTransition(m.Transition):
 
 
 def make_filter(arm: Arm, motion: TensorDict, sensor: JointSensor | None, error: Tensor | None) -> DEnKF:
-    """State [cos, sin, velocity] of each joint; encoders read cosines and sines, a sensor of pictures places.
+    """Returns a filter of the state [cos, sin, velocity] per joint; encoders read cos and sin, images link positions.
 
     Args:
         arm: the arm.

@@ -209,7 +209,7 @@ def chosen(make: Callable, noises: Sequence[float], data: TensorDict, rows: slic
 
 
 def learned_noise(data: TensorDict, up_noise: float, updates: int, window: int = 250) -> DiagonalNoise:
-    """The noise of the accelerometer's direction by features of the reading, trained through the extended filter.
+    """Returns the accelerometer's direction noise as a network of the reading, trained through the EKF.
 
     The score is the CRPS of the tilt about x and about y, which are tangents at the filter's mean.
 
@@ -289,7 +289,7 @@ def page(rows: list[dict], study: Study) -> str:
 
 
 def found_settings(study: Study, settled: slice) -> tuple[float, float, DiagonalNoise]:
-    """Both settings by other runs, and the learned noise."""
+    """Returns both settings, chosen on other runs, and the learned noise."""
     others = study.runs // 3 + 1
     validation = prepared(simulated(others, study.seconds, study.seed + 1))
     up_noise = chosen(attitude_filter, UP_NOISES[-2:] if study.smoke else UP_NOISES, validation, settled)

@@ -58,7 +58,7 @@ def side_by_side(calls: Sequence[Callable[[], object]], processes: int, title: s
 
 
 def compute(jobs: Mapping[Path, Callable[[], list[dict]]], processes: int, title: str) -> list[dict]:
-    """The rows of all jobs, each of which leaves them in a file; those that are there are not computed again."""
+    """Runs all jobs and returns their rows; each job saves its rows in a file, which a resumed run reads."""
     side_by_side([partial(_alone, file, rows) for file, rows in jobs.items()], processes, title)
     return read_rows(jobs)
 

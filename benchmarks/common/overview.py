@@ -36,7 +36,7 @@ def fusion() -> Bars:
 
 
 def monitor() -> Bars:
-    """Error of the path's end, alone and with an answer to the signs."""
+    """Returns the end-point error, with and without a gate on the signs."""
     rows = pd.read_csv(STUDIES / "monitor/results/monitor.csv").dropna(subset="m_per_m")
     faults = rows["fault"].map({"none": "no fault", "black-all": "30 % black", "box-all": "a box"})
     names = rows["task"].str.removeprefix("kitti-") + ": " + faults
@@ -53,7 +53,7 @@ def arms() -> Bars:
 
 
 def odometry() -> Bars:
-    """Length of the path over the true length, mean over the drives."""
+    """Returns the estimated over the true path length, mean over the drives."""
     scales = pd.read_csv(STUDIES / "odometry/results/odometry.csv").groupby("height_m")["scale"].mean()
     return "length of the path / true length", scales.rename(index="height {:g} m".format).to_frame("path")
 

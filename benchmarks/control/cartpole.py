@@ -160,7 +160,7 @@ def exact_filter(noise: float, members: int = 32, read: int = 3) -> DEnKF:
 
 
 def unlearned_filter(members: int, read: int = 3) -> DEnKF:
-    """A filter that knows what is read and where an episode starts; accelerations and both noises are learned."""
+    """Returns a filter with known observation model and reset; learned acceleration and noises."""
     q = m.ConstantNoise([0.2, 0.3], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     r = m.ConstantNoise([0.2] * read, trainable=True, in_key="observation")
     return _filter(m.NoisyTransition(Push(), q, dims=[3, 4], before=True), r, members)

@@ -41,7 +41,7 @@ class Kept:
 
 
 def make_filter(motion: nn.Module, members: int, keep: bool) -> DEnKF:
-    """The page's filter with random draws: it knows the spring, and nothing of the motor."""
+    """Returns the page's filter with random draws; it knows the spring, and not the motor."""
     q = ConstantNoise([0.0, 0.1], in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return DEnKF(
         NoisyTransition(LearnedTransition(motion, residual=False, action_key="action"), q, draws="random"),

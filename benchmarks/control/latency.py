@@ -71,7 +71,7 @@ def read_grid(table: Tensor, angle: Tensor, speed: Tensor) -> Tensor:
 
 
 def best_policy(count: int, sweeps: int = 400, gamma: float = 0.99) -> Callable[[Tensor], Tensor]:
-    """The torque ``[*B, 1]`` that value iteration finds for states ``[*B, 3]``: one step ahead of its values."""
+    """Returns the torque ``[*B, 1]`` of value iteration for states ``[*B, 3]``, by one step of lookahead."""
     angles, speeds = torch.arange(count) / count * 2 * torch.pi, torch.linspace(-SPEED, SPEED, count)
     torques = torch.linspace(-TORQUE, TORQUE, 17)
 

@@ -31,7 +31,7 @@ def interquartile_mean(values, axis: int = -1):
 
 
 def summary(values: pd.Series) -> str:
-    """The interquartile mean over seeds, and the bounds of its 95 % bootstrap interval; empty where none ran."""
+    """Returns the interquartile mean over seeds and its 95 % bootstrap interval; empty for cells that did not run."""
     values = values.dropna()
     if values.empty:
         return ""

@@ -71,7 +71,7 @@ def batches_of(task: Task, budget: Budget) -> tuple[int, list[int]]:
 
 
 def shifted_names(task: Task, cell: tuple[float, float]) -> list[str]:
-    """Names of the tests in which the readings are noisier than in the training: with the filter told, and with not.
+    """Returns the names of the tests with more noise than in training, with and without the filter knowing it.
 
     None of a cell after whose training the readings stay as they are.
     """
@@ -81,7 +81,7 @@ def shifted_names(task: Task, cell: tuple[float, float]) -> list[str]:
 
 
 def rollout(env: EnvBase, policy: TensorDictModuleBase | None, steps: int, kind: ExplorationType) -> TensorDict:
-    """Whole episodes ``[B, T]``."""
+    """Returns whole episodes ``[B, T]``."""
     with torch.no_grad(), set_exploration_type(kind):
         return env.rollout(steps, policy, break_when_any_done=False)
 

@@ -65,7 +65,7 @@ def part(study: Study, task: str, cell: tuple[float, float], arm: str, seed: int
 
 
 def jobs(study: Study, seed: int, budget: Budget) -> Iterator[partial]:
-    """All runs with a seed."""
+    """Yields all runs with a seed."""
     for task in study.tasks:
         for cell in CELLS[task][: study.cells]:
             for arm in arms_of(task, cell):

@@ -97,7 +97,7 @@ def without(data: TensorDict, *sensors: str) -> TensorDict:
 def faulty(
     task: Task, data: TensorDict, sensor: str, fault: str, begin: Tensor, end: Tensor, generator: torch.Generator
 ) -> TensorDict:
-    """The recordings with one sensor out of order from ``begin`` to ``end`` ``[N]``, which its mask does not tell."""
+    """Returns the recordings with an unmasked fault of one sensor from ``begin`` to ``end`` ``[N]``."""
     time = torch.arange(data.shape[1]).unsqueeze(0)
     bad = ((time >= begin.unsqueeze(-1)) & (time < end.unsqueeze(-1))).unsqueeze(-1)
     reading = data[sensor]

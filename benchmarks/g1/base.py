@@ -68,7 +68,7 @@ class TrainedSensor:
 
     @cached_property
     def trained(self) -> tuple[list[ImageSensor], Statistics]:
-        """The trained networks. Their statistics lie beside them: a resumed study does not read the pictures."""
+        """Returns the trained networks, with saved statistics, so that a resumed study reads no images."""
         folders, facts_file = [self.out / str(k) for k in range(self.budget.networks)], self.out / "facts.pt"
         done = facts_file.exists() and all((folder / "sensor.pt").exists() for folder in folders)
         train = held_out = None

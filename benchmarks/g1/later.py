@@ -129,7 +129,7 @@ def looked(motion: Motion, data: TensorDict, kind: str, factor: float, steps: in
 
 
 def scores(motion: Motion, data: TensorDict, out: TensorDict, ahead: int) -> tuple[float, ...]:
-    """Errors of the belief of the last reading and of the belief ahead, in degrees, and the share within 90 %."""
+    """Returns errors of the last belief and of the predicted belief, in degrees, and the 90 % coverage."""
     last = data["valid"].shape[1] - ahead
     rows = data["valid"][:, ahead:] & (torch.arange(last) >= FIRST)
     truth = (data["joints"] - motion.center)[:, ahead:][rows]

@@ -61,7 +61,7 @@ def of_filters(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case
 
 
 def of_paper(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """The paper's networks (Table I, S = 5, O = 2, E = 32), as ``benchmarks.speed`` has them, beside cuthbert."""
+    """Yields cases of the paper's networks (Table I, S = 5, O = 2, E = 32) and of cuthbert."""
     steps = 2 if smoke else 20
     for batch in (2,) if smoke else (64, 4096):
         for way in ways:
@@ -124,7 +124,7 @@ def of_peers(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
 
 
 def of_training(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """Yields a training step of the KITTI preset on 64 sequences of 20 pictures, beside its trunk alone."""
+    """Yields a training step of the KITTI preset on 64 sequences of 20 images, and one of its trunk alone."""
     from benchmarks.speed import training_step as preset
 
     batch, steps = (2, 3) if smoke else (preset.BATCH, preset.STEPS)

@@ -94,7 +94,7 @@ def evaluate(
 
 
 def _mean(rows: list[dict]) -> dict:
-    """One row of several that differ in their numbers alone: which frames are missing is chance, as are draws."""
+    """Returns the mean of rows that differ only by the random draw of missing frames and noise."""
     mean = {
         key: fmean(row[key] for row in rows) if isinstance(value, float) else value for key, value in rows[0].items()
     }

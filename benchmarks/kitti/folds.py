@@ -139,7 +139,7 @@ def _rows(stream: Stream) -> int:
 
 
 def statistics(parts: Sequence[Part], cache: Path) -> Statistics:
-    """Means and standard deviations over clean training drives, each counted mirrored, too."""
+    """Returns means and standard deviations over clean training drives and their mirror images."""
     data = [part.read(cache) for part in parts if part.stream.condition == "clean" and part.stream.steps == 1]
     velocity = torch.cat([part["state"][:, VELOCITIES] for part in data])
     loc, scale = velocity.mean(0), velocity.std(0)

@@ -97,7 +97,7 @@ class SensorTraining:
     def unseen_readings(
         self, sensor: SubModel, fold: Fold, out: Path, updates: int, lr: float
     ) -> list[tuple[TensorDict, TensorDict, float]]:
-        """Readings of drives by sensors that have not seen them, also where drives are too few to set some aside.
+        """Returns readings of drives by sensors that were not trained on them (cross-fitting).
 
         A filter learns from its sensor's errors, which are smaller on drives that the sensor was trained on. So drives
         that are in both lists are read by one of two sensors that stand in: each is trained on one half of those

@@ -52,7 +52,7 @@ class Stream:
         return f"{self.drive}/{self.camera}"
 
     def seed(self) -> int:
-        """Random numbers of the condition: its own, the same each time; not changed by what is made of the images."""
+        """Returns the seed of the condition, the same in each run."""
         what = (self.drive, self.camera, self.condition, self.size, self.pitch, self.steps)
         return int.from_bytes(hashlib.blake2b(repr(what).encode(), digest_size=4).digest(), "big")
 

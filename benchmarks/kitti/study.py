@@ -150,7 +150,7 @@ class Job:
 
 
 def evaluate_and_draw(recipe, model, streams: Sequence[Stream], cache: Path, plots: Path | None, **names) -> list[dict]:
-    """Rows of some drives, and pictures of each, clean and with missing frames, in a folder if one is given."""
+    """Returns rows of some drives; draws each, clean and with missing frames, if a folder is given."""
     rows = []
     for stream in streams:
         own, beliefs = evaluate(recipe, model, stream, cache, **names)

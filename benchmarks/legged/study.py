@@ -242,7 +242,7 @@ def grounds(study: Study, kind: str) -> dict[str, Robot]:
 
 
 def walked(study: Study, kind: str) -> list[dict]:
-    """The rows of a simulated robot; of the quadruped the picture and the trained filter are left in the folder."""
+    """Returns the rows of a simulated robot; for the quadruped it also saves the picture and the trained filter."""
     length = 0.3 if study.smoke else 6.0
     make = partial(simulated, kind, VALIDATION_RUNS, length, study.seed + 2)
     noises = chosen(make, f"{kind}, all grounds", feet_grid(study.smoke), study.out)

@@ -111,7 +111,7 @@ SIMULATED: dict[str, tuple[dict[str, Any], Callable]] = {
 
 
 def simulated(kind: str, runs: int, seconds: float, seed: int, ground: Ground | None = None) -> Robot:
-    """A robot of dm_control that walks at a pace, with strides and turns of its own in each run; all sensors err.
+    """Returns a walking robot of dm_control, with other strides and turns in each run and noise on all sensors.
 
     Args:
         kind: one of ``SIMULATED``.
@@ -138,7 +138,7 @@ def simulated(kind: str, runs: int, seconds: float, seed: int, ground: Ground | 
 
 
 def icub(folder: Path) -> Robot:
-    """The walk of iCub. Its truth is in doubt where motion capture moves a foot that carries the whole robot.
+    """Returns the walk of iCub; its truth is doubtful where motion capture moves the stance foot.
 
     Args:
         folder: with ``model.urdf`` and ``walking.npz``.

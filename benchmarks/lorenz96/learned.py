@@ -113,7 +113,7 @@ def make_filter(
 
 
 def climate_of(record: TensorDict) -> tuple[float, float]:
-    """Mean and standard deviation of a variable, from observations: their variance is the system's plus R."""
+    """Returns mean and standard deviation of a variable, from observations whose variance includes R."""
     observation = record["observation"]
     return observation.mean().item(), (observation.var().item() - R**2) ** 0.5
 
@@ -155,6 +155,6 @@ def learn(denkf: DEnKF, record: TensorDict, updates: int, rng: torch.Generator, 
 
 @torch.no_grad()
 def evaluate(denkf: DEnKF, states: torch.Tensor, record: TensorDict, skip: int) -> float:
-    """Root mean square error of the belief's mean on an unseen record; here alone the true states are used."""
+    """Returns the RMSE of the belief's mean on an unseen record, whose true states no training uses."""
     mean = denkf.sequence(record.copy())["belief", "mean"]
     return (mean - states)[:, skip:].square().mean().sqrt().item()

@@ -196,7 +196,7 @@ def lorenz96(seeds: int = 4, cycles: int = 600, inflations: tuple[float, ...] = 
 
 
 def manipulator(folder: Path, demos: int = 100, updates: int = 8000) -> Task:
-    """Joint velocities of dm_control's manipulator by the filter of ``benchmarks.arms``, which learned its motion.
+    """Returns joint velocities of dm_control's manipulator, by the filter of ``benchmarks.arms``.
 
     Cosine, sine and velocity of its joints are 12 numbers, of which noisy encoders read 8.
     """
@@ -221,7 +221,7 @@ def localise(filter: Filter, threshold: float | None) -> Filter:
 
 
 def resized(filter: Any, members: int, threshold: float | None) -> Any:
-    """A filter that comes with the library, with so many members; their noise models stay those of its training."""
+    """Returns a pretrained filter with so many members and the noise models of its training."""
     new = type(filter)(replace(filter.settings, ensemble_size=members))
     new.load_state_dict(filter.state_dict())
     return localise(new.eval(), threshold)
@@ -245,7 +245,7 @@ def _pushes(noise: float, episodes: int, seed: int) -> TensorDict:
 
 
 def cartpole(noise: float = 0.3, episodes: int = 20) -> Task:
-    """Velocities of the cartpole of ``benchmarks.control`` under random pushes, by a filter that knows its physics."""
+    """Returns velocities of ``benchmarks.control``'s cartpole under random pushes; the filter has its physics."""
     data = [_pushes(noise, episodes, seed) for seed in (0, 1)]
 
     def make(members: int, threshold: float | None) -> Filter:
@@ -255,7 +255,7 @@ def cartpole(noise: float = 0.3, episodes: int = 20) -> Task:
 
 
 def ur5(folder: Path, demos: int = 200, others: int = 100) -> Task:
-    """Joints of the UR5 at its table by the filter that comes with the library, on demos that it has not seen."""
+    """Returns joints of the UR5 at its table, by the pretrained filter on test demos."""
     side = UR5TableSettings.pixels
     collect_ur5_demos(folder / "test", demos, size=(side, side), seed=0)
     collect_ur5_demos(folder / "validation", others, size=(side, side), seed=1)

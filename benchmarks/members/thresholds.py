@@ -86,7 +86,7 @@ def targets(runs: int, seed: int, steps: int = 40) -> TensorDict:
 
 @torch.no_grad()
 def bearings(runs: int) -> tuple[Score, Callable[[int, float | None], Score]]:
-    """The unscented Kalman filter's score, and an ensemble's: the median error of a run, a mean over components."""
+    """Returns the scores of the UKF and of an ensemble: median error of a run, mean over components."""
     data = targets(runs, 4)
     common = {"process_noise": WALK, "update_at_reset": True}
     reading = {"reading_space": Circle(), "observation_key": "reading"}

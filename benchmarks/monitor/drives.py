@@ -95,7 +95,7 @@ def _with_signs(reading: TensorDict, shown: Tensor, seen: Tensor) -> TensorDict:
 
 
 def _drive(root: Path, name: str, fault: str, steps: int) -> TensorDict:
-    """The drive with its fault: ``"steps"`` ``[N, 1]`` of a pair, and ``"fault"`` ``[N, 1]``, whether it is in it."""
+    """Returns the drive with its fault: ``"steps"`` ``[N, 1]`` of each frame pair, a mask ``"fault"`` ``[N, 1]``."""
     size = from_pretrained("car-odometry").settings.size
     drive = read_kitti_drive(root, name, size=size, colour=False, cache=None).copy()
     image, hit = drive["image"].clone(), torch.zeros(len(drive), dtype=torch.bool)
@@ -125,7 +125,7 @@ def _picture_signs(root: Path, name: str, fault: str, steps: int) -> TensorDict:
 
 
 def _by_flow(root: Path, name: str, fault: str, known: TensorDict | None, cache: Path) -> TensorDict:
-    """Distance by the flow, and the road's correlation, ``[N, 2]``, of what is repaired if more is known."""
+    """Returns distance by the flow and road correlation, ``[N, 2]``, after the repair if one is possible."""
     motion = _motion(root, name, fault, 1, known, cache, repair=known is not None)
     values = torch.stack([plane_distance(motion["flow"].float()), motion["road"].float().amax((1, 2))], -1)
     return TensorDict({"by_flow": torch.where(motion["steps"] > 0, values, torch.nan)}, [len(motion)])
@@ -178,7 +178,7 @@ def from_truth(reading: TensorDict) -> TensorDict:
 
 @torch.no_grad()
 def filtered(model: Filter, readings: Sequence[TensorDict], draws: int = 1, seed: int = 0) -> list[TensorDict]:
-    """Beliefs on readings ``[N]`` each, ``[draws, N]``, from the true pose on; those of one length run side by side."""
+    """Returns beliefs ``[draws, N]`` on each of some readings ``[N]``, from the true pose on."""
     groups: dict[int, list[int]] = defaultdict(list)
     for place, reading in enumerate(readings):
         groups[len(reading)].append(place)

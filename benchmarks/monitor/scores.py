@@ -40,7 +40,7 @@ def auroc(score: Tensor, positive: Tensor) -> float:
 
 
 def detection(runs: Sequence[Run]) -> dict[str, float]:
-    """Scores of runs with faults.
+    """Returns scores of runs with faults.
 
     Neither the first step, which sees no reading, nor the ten steps after a fault count.
 

@@ -43,7 +43,7 @@ class Study:
 
 
 def invented(study: Study, kind: str) -> tuple[Path, list[str]]:
-    """The folder of rendered drives along random roads, and their names."""
+    """Returns the folder of rendered drives along random roads, and their names."""
     names = [f"{kind[0]}{number:02d}" for number in range(2 if study.smoke else INVENTED[kind])]
     frames = 80 if study.smoke else 500
     render_drives(study.out / kind, names=names, frames=frames, seed=77, size=(100, 300), processes=1)

@@ -39,7 +39,7 @@ class Calibration:
 
 
 def lasting_square(car: CarFilter, root: Path, name: str) -> float:
-    """Mean square of the logarithm of read over true speed, of means over a second each."""
+    """Returns the mean square of the log ratio of estimated to true speed, each averaged over one second."""
     drive = Drive(root, name, car.settings.size, True, two_view=car.settings.two_view)
     run = all_frames(read_spans(car.sensor, [each.read() for each in drive.spans(1)], car.settings.longest))
     read, true = run["sensor", "ensemble"].mean(1)[1:, 0], run["state"][1:, VELOCITIES[0]]

@@ -85,7 +85,7 @@ def learned(members: int = 32) -> Filter:
 
 
 def lstm(hidden: int = 64) -> Filter:
-    """A recurrent network of the same readings and drives."""
+    """Returns a recurrent network of the same readings and drives."""
     return LSTMFilter(
         None,
         state_dim=2,

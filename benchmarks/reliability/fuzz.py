@@ -107,7 +107,7 @@ def _work(number: int) -> list[Row]:
 
 
 def side_by_side(works: Sequence[Callable[[], list[Row]]], processes: int) -> list[Row]:
-    """The rows of all works, each of which goes to the first process that is free."""
+    """Runs all jobs, each on the first free process, and returns their rows."""
     rows: list[Row] = []
     _WORKS[:], at = works, time.monotonic()
     with multiprocessing.get_context("fork").Pool(processes) as pool:

@@ -98,7 +98,7 @@ class TurnRate(SubModel):
         super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
 
     def compute(self, ensemble):
-        """The twist's turn and the bias."""
+        """Returns the angular velocity and the gyro bias."""
         return ensemble[..., TWIST][..., :3] + ensemble[..., BIAS]
 
 

@@ -97,7 +97,7 @@ def believe(model: Model, series: Series, lag: int) -> tuple[Tensor, Tensor]:
 
 
 def fit(series: Sequence[Series], lag: int, updates: int) -> Parameters:
-    """The parameters whose beliefs of x are nearest to the truth, with ``lag`` later readings; 0 fits a filter."""
+    """Returns the parameters with the least error of x, given ``lag`` later readings; a lag of 0 fits a filter."""
     steps = torch.cat([each.truth.diff(dim=1).flatten(0, 1) for each in series]).square().mean(0).sqrt()
     errors = torch.cat([(each.reading - each.truth)[:, 1:].flatten(0, 1) for each in series]).square().mean(0).sqrt()
     zero = torch.zeros_like(steps)

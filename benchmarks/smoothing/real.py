@@ -85,7 +85,7 @@ def series_of(task: Task, batches: Group) -> dict[str, Series]:
 
 
 def gaussians(make: Callable[[], Task], readings: Path, updates: int) -> list[dict]:
-    """The Kalman filter behind the same sensor, and its smoother; how large and how slow the sensor's errors are."""
+    """Returns the Kalman filter of the same sensor, its smoother, std and time constant of the sensor's errors."""
     task, rows = make(), []
     groups = {name: series_of(task, each) for name, each in task.groups(task.members[0], readings).items()}
     chosen = list(groups["validation"].values())

@@ -66,7 +66,7 @@ class Task:
 
 
 def kitti(root: Path, out: Path, *, smoke: bool = False) -> Task:
-    """Drives of KITTI's layout below ``root``, and drives rendered along its eleven official trajectories.
+    """Returns drives in KITTI's layout below ``root``, and drives rendered along its eleven official trajectories.
 
     Eight drives rendered along invented trajectories are for choices. No filter and no sensor has seen any of them.
     """
@@ -107,7 +107,7 @@ def drive(car: CarFilter, root: Path, name: str, cache: Path) -> TensorDict:
 
 
 def ur5(out: Path, *, smoke: bool = False) -> Task:
-    """Whole demonstrations of the table's UR5: those of the test side, and a ninth of the others for choices."""
+    """Returns demonstrations of the UR5 at its table: the test split, and a ninth of the others for validation."""
 
     def model(members: int) -> UR5TableFilter:
         trained = from_pretrained("ur5-table")

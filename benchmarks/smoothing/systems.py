@@ -76,7 +76,7 @@ class Cycle(SubModel):
 
 
 def simulate(system: System, seeds: Sequence[int], cycles: int) -> tuple[Tensor, Tensor]:
-    """The truth at every small step, ``[seeds, cycles * steps + 1, N]``, and the readings, ``[seeds, cycles, N]``."""
+    """Returns true states of all small steps ``[seeds, cycles * steps + 1, N]``, readings ``[seeds, cycles, N]``."""
     mean = torch.tensor(system.mean, dtype=torch.float64)
     generators = [torch.Generator().manual_seed(seed) for seed in seeds]
     normal = torch.stack([torch.randn(cycles + 1, len(mean), generator=g, dtype=torch.float64) for g in generators])

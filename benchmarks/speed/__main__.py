@@ -85,7 +85,7 @@ def in_own_process(name: str, seconds: float) -> list[dict] | dict:
 
 
 def measured(name: str, seconds: float) -> list[dict]:
-    """The rows of a pair; of several runs each row is the one with the middle ratio, and ``range`` the outer two."""
+    """Returns the rows of a pair: of several runs the median ratio, and as ``range`` the lowest and the highest."""
     runs = [{row["name"]: row for row in in_own_process(name, seconds)} for _ in range(RUNS.get(name, 1))]
     rows = []
     for row in runs[0]:

@@ -66,7 +66,7 @@ def kitti_filter() -> DEnKF:
 
 
 def kitti_env(folder: str) -> EnvBase:
-    """A rendered drive of 200 frames, 150x50, held in memory; its frames are emitted, and nothing reads them."""
+    """Returns an environment of a rendered drive in memory, 200 frames of 150x50; no module reads the frames."""
     render_drives(folder, names=["00"], frames=200, processes=1, progress=None)
     return TransformedEnv(KITTIReplayEnv(folder, sequence="00", cache=None), Reading())
 
@@ -151,7 +151,7 @@ def rows_of(name: str, timings: Timings) -> dict[str, Row]:
 
 
 def rows(seconds: float) -> list[Row]:
-    """The same for ``make bench``, which takes as long as it takes."""
+    """Returns the rows for ``make bench``; ``seconds`` does not limit them."""
     return [row for name, timings in measure().items() for row in rows_of(name, timings).values()]
 
 

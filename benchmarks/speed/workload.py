@@ -103,7 +103,7 @@ def make_frames(batch: int, steps: int = STEPS, *, samples: bool = True) -> Tens
 
 
 def start(filter: DEnKF, batch: int) -> Tensor:
-    """An ensemble to start from, ``[batch, E, S]``."""
+    """Returns an initial ensemble, ``[batch, E, S]``."""
     torch.manual_seed(2)
     return filter.initial(TensorDict({}, [batch])).get(("belief", "ensemble"))
 

@@ -92,7 +92,7 @@ def look_of(numbers: np.ndarray) -> Domain:
 
 
 def find_camera(pixels: np.ndarray, joints: np.ndarray, levels: Levels = LEVELS) -> tuple[Domain, float]:
-    """The camera that saw frames ``[N, S, S, 3]`` of the arm at joints ``[N, 7]``; and the share that does not fit.
+    """Fits the camera of frames ``[N, S, S, 3]`` to joints ``[N, 7]``; also returns the share that does not fit.
 
     Gauss-Newton steps on silhouettes that are blurred less and less, from the simulator's camera on.
     """

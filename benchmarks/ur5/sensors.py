@@ -83,7 +83,7 @@ class TurnedWrist(nn.Module):
     """
 
     def forward(self, state: Tensor) -> Tensor:
-        """Readings ``[*, 13]`` of states ``[*, 10 or more]``: J1..J5, cos and sin twice, the opening, x, y, z."""
+        """Returns readings ``[*, 13]`` of states ``[*, >= 10]``: J1..J5, cos and sin of 2 J6, the opening, x, y, z."""
         once = state[..., WRIST : WRIST + 1]
         wrist = [0.5 * (2 * once).cos(), 0.5 * (2 * once).sin(), once.cos(), once.sin()]
         return torch.cat([state[..., :WRIST], *wrist, state[..., WRIST + 1 : STATE]], -1)
@@ -104,7 +104,7 @@ def side_of(reading: Tensor, near: Tensor | None = None) -> Tensor:
 
 
 def wrist_of(reading: Tensor, near: Tensor) -> Tensor:
-    """States ``[*, 10]`` of readings ``[*, 13]``; of the two J6 half a turn apart, that next to ``near`` ``[*]``."""
+    """Returns states ``[*, 10]`` from readings ``[*, 13]``; of two J6 half a turn apart the one next to ``near``."""
     angle = torch.atan2(reading[..., WRIST + 1], reading[..., WRIST]) / 2
     angle = angle + torch.pi * ((near - angle) / torch.pi).round()
     return torch.cat([reading[..., :WRIST], angle.unsqueeze(-1), reading[..., WRIST + 4 :]], -1)

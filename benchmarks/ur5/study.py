@@ -88,7 +88,7 @@ class Base:
         return sequences_of(self.study.replay("sim-frames", "train"), self.study.sequences)
 
     def _sensor(self) -> tuple[ImageSensor, Statistics]:
-        """The trained sensor. Its statistics lie beside it, so that a resumed study does not read the pictures."""
+        """Returns the trained sensor, whose statistics are saved with it, so that a resumed study reads no images."""
         out = self.folder(self.kind)
         if (out / "sensor.pt").exists() and (out / "facts.pt").exists():
             facts = Statistics(**read_checkpoint(out / "facts.pt"))
@@ -130,7 +130,7 @@ class Base:
         return self.study.out / "sensors" / f"{self.training}-{kind}-{self.seed}"
 
     def _pasted(self, pool: FramePool) -> tuple[FramePool, Domain]:
-        """Frames, and pictures of the simulator's states as the other domain's camera would take them; that camera."""
+        """Returns frames, images of the simulator's states by the other domain's camera, and that camera."""
         assert self.parent is not None
         states = self.parent.states.flatten(0, 1)
         generator = torch.Generator().manual_seed(self.seed)
@@ -151,7 +151,7 @@ class Base:
         return train_motion(motion, paths, AHEAD, out=out, seed=self.seed, updates=self.study.budget.motion)
 
     def codes(self, role: str, condition: str = "clean", domain: str | None = None) -> TensorDict:
-        """Features of the demos of a role, in a domain of which they may not be, with rates and accelerations."""
+        """Returns features of the demos of a role in a domain, with rates and accelerations."""
         domain = self.domain if domain is None else domain
         demos = getattr(self.roles if domain == self.domain else real_roles(self.study), role)
         salt = SaltAndPepper(generator=torch.Generator().manual_seed(0))

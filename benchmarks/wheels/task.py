@@ -31,7 +31,7 @@ GYRO, WHEELS, GPS = (0.01, 1), (0.05, 5), (0.5, 100)
 
 
 def moved(state: Tensor) -> Tensor:
-    """States ``[*, 7]`` of a unicycle one step later: its speed goes to 1 m/s and its turn rate to zero in seconds."""
+    """Returns the next states ``[*, 7]`` of a unicycle whose speed decays to 1 m/s and turn rate to zero."""
     x, y, heading, speed, turn, bias, scale = state.unbind(-1)
     place = x + DT * speed * heading.cos(), y + DT * speed * heading.sin(), heading + DT * turn
     return torch.stack([*place, speed + 0.2 * DT * (1 - speed), turn - 0.2 * DT * turn, bias, scale], -1)
@@ -48,7 +48,7 @@ def wheel_speed(state: Tensor) -> Tensor:
 
 
 def recordings(runs: int, steps: int, seed: int) -> TensorDict:
-    """True states ``[runs, steps, 7]``, readings and their masks."""
+    """Returns true states ``[runs, steps, 7]``, readings and their masks."""
     generator = torch.Generator().manual_seed(seed)
     draw = partial(torch.randn, generator=generator)
     state, states = torch.tensor(MEAN) + torch.tensor(STD) * draw(runs, 7), []

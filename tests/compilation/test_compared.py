@@ -43,14 +43,14 @@ def right(graph, inputs):
 
 
 def half_blind(graph, inputs):
-    """Half of what readings ``[2, ..., 3]`` do is left out: right where they are zero, or hidden."""
+    """Drops half of the effect of readings ``[2, ..., 3]``, which zeros and missing readings do not reveal."""
     without = graph(*(0 * value if value.shape[:1] == (2,) and value.shape[-1] == 3 else value for value in inputs))
     pairs = zip(graph(*inputs), without, strict=True)
     return [(one + other) / 2 if one.is_floating_point() else one for one, other in pairs]
 
 
 def rounded(graph, inputs):
-    """Every input is off by its last digit, as of sums in another order."""
+    """Changes the last digit of every input, as sums in another order do."""
     eps, generator = torch.finfo(torch.float32).eps, torch.Generator().manual_seed(0)
 
     def changed(value):
@@ -168,7 +168,7 @@ def precise():
 
 
 def many_particles():
-    """One of so many falls on the other side of a border, and another particle is in its place."""
+    """Moves one particle across a resampling border, so that another takes its place."""
     filter = particles("systematic")
     filter.initial.module = GaussianPrior([0.5, -0.25], [1.0, 1.0], ensemble_size=3000)
     row = filter.initialise(TensorDict({"observation": torch.randn(60, 2)}, [60]))

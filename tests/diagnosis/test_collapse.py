@@ -30,7 +30,7 @@ def walk_filter(process_noise, members=32, **options):
 
 
 def walks(moving=(1.0, 1.0), steps=STEPS):
-    """Readings of walks, some of which stand still."""
+    """Returns readings of random walks, some of which are constant."""
     torch.manual_seed(0)
     state = (STEP * torch.tensor(moving) * torch.randn(2, steps, 2)).cumsum(1)
     return TensorDict({"reading": state + NOISE * torch.randn_like(state)}, [2, steps])

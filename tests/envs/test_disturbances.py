@@ -32,7 +32,7 @@ class Striped(Changed):
 
 
 def pictures_env(dtype=torch.uint8, batch=()):
-    """Rows end after three steps and after four."""
+    """Ends rows after three and after four steps."""
     return TransformedEnv(base_env(batch_size=batch, max_steps=[3, 4] if batch else 3), Striped(dtype))
 
 

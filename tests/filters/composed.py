@@ -91,7 +91,7 @@ def compose(features, *, frozen_start=True):
 
 
 def frames_for(features):
-    """Readings for every sensor, masks, actions and starts, ``[B, T]``."""
+    """Returns readings for every sensor, masks, actions and resets, ``[B, T]``."""
     torch.manual_seed(1)
     frames = TensorDict({"a": torch.randn(B, T, 4), "b": torch.randn(B, T, 4), "c": torch.randn(B, T, 2)}, [B, T])
     frames["action"] = torch.randn(B, T, A)

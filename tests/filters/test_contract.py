@@ -108,7 +108,7 @@ some_filters = pytest.mark.parametrize(
 
 
 def readings(*batch, width=1):
-    """Readings, masks, and starts that differ between rows."""
+    """Returns readings, masks, and resets that differ between rows."""
     frames = TensorDict({"observation": torch.randn(*batch, 2)}, batch)
     frames["observed"] = torch.rand(*batch, width) < 0.7
     frames["is_init"] = torch.rand(*batch, 1) < 0.2

@@ -92,7 +92,7 @@ def of_two_sensors(process_noise):
 
 
 def iterated(process_noise, iterations):
-    """Each iteration moves the noise, which is then exact no more: its mean is not zero."""
+    """Shifts the noise in each iteration, so that its mean is not zero."""
     modules, options = parts()
     return IEnKS(*modules, observation_key="reading", process_noise=process_noise, iterations=iterations, **options)
 

@@ -11,7 +11,7 @@ from torch_denkf.modules import GaussianPrior
 
 
 def numpy_kalman(F, Q, H, R, m0, P0, readings, observed, starts, update_at_reset):
-    """One row at a time, one step at a time, with plain inverses."""
+    """Runs one row and one step at a time, with plain inverses."""
     means, covs, squares, log_likelihoods = [], [], [], []
     m, P = m0, P0
     for y, seen, start in zip(readings, observed, starts, strict=True):

@@ -19,7 +19,7 @@ def readings(*batch):
 
 
 def by_steps(filter, frames):
-    """Means of single steps with the noise in ``frames`` ``[B, T]``, from the belief that is stored at the first."""
+    """Returns means of single steps with the noise in ``frames`` ``[B, T]``, from the first stored belief."""
     row, means = frames[:, 0].copy(), [frames[ENSEMBLE][:, 0].mean(-2)]
     for t in range(1, frames.shape[1]):
         row = filter.step(frames[:, t].copy().set(ENSEMBLE, row[ENSEMBLE]))

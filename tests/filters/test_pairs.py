@@ -90,7 +90,7 @@ def build(features):
 
 
 def frames_for(features):
-    """Pictures and readings ``[ROWS, T]`` of which some are black, late, missing or NaN."""
+    """Returns images and readings ``[ROWS, T]``, some of them black, late, missing or NaN."""
     generator = torch.Generator().manual_seed(0)
     pixels = 0.5 + 0.4 * torch.rand(ROWS, T, 1, 2, 2, generator=generator)
     wheel = torch.randn(ROWS, T, 1, generator=generator)
@@ -120,7 +120,7 @@ def correct(mean, cov, h, reading, r):
 
 
 def oracle(features, frames):
-    """Mean, variance, smoothed mean of the oldest state carried, and the monitor's p-value, ``[ROWS, T, ...]``."""
+    """Returns mean, variance, smoothed mean of the oldest clone, and the monitor's p-value, ``[ROWS, T, ...]``."""
     has, lag = features.__contains__, 3 if "joint past" in features else 2 * ("late reading" in features)
     found = {name: np.zeros((ROWS, T, 2)) for name in ("mean", "var", "smoothed")} | {"p": np.ones((ROWS, T, 1))}
     for row in range(ROWS):
@@ -154,7 +154,7 @@ def oracle(features, frames):
 
 
 def forecast(mean, cov):
-    """The present state moves on in front of the past ones; the oldest is forgotten."""
+    """Shifts the clones by one step, and drops the oldest."""
     move = np.eye(len(mean), k=-2)
     move[:2, :2] = F
     cov = move @ cov @ move.T

@@ -112,7 +112,7 @@ def turned(turn, value):
 
 
 def turned_beliefs(filter, turn, data):
-    """Filters data, and the same data in a world that is turned."""
+    """Filters data, and the same data in a rotated world."""
     other = data.clone()
     for key in ("start", "pose"):
         other[key] = turned(turn, data[key])
@@ -130,7 +130,7 @@ def assert_turned(here, there, turn, atol):
 
 
 def numpy_ekf(data):
-    """An error-state extended Kalman filter of one run, with scipy's rotations: means and covariances at each step."""
+    """Runs an error-state extended Kalman filter with scipy's rotations: means and covariances at each step."""
 
     def right(v):  # the right Jacobian
         a, k = np.linalg.norm(v), np.cross(np.eye(3), v)

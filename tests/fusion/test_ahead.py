@@ -52,7 +52,7 @@ def ensemble(**options):
 
 
 def fused(**options):
-    """The second reading is two steps late."""
+    """Delays the second reading by two steps."""
     F, Q, H, R = linear_system()
     sensors = {
         "observation": FusedSensor(LinearObservation(H), R.sqrt()),

@@ -195,7 +195,7 @@ def test_what_belongs_to_the_time_before_an_episode_is_not_observed(float64, kin
 
 
 def moved_and_read(steps, late, reading, *, mean, cov, noise):
-    """A prior after so many steps, with one reading of the second sensor that was taken ``late`` steps before."""
+    """Returns the belief after some steps with one reading of the second sensor, taken ``late`` steps before."""
     F, Q, H, R = linear_system()
     for step in range(steps + 1):
         mean, cov = (F @ mean, F @ cov @ F.mT + noise * Q) if step else (mean, cov)
@@ -255,7 +255,7 @@ SPREAD = {
 
 
 def inflated(frames, factor, *, noise=1.0, mean=None, cov=None):
-    """A Kalman filter by hand, one sensor after the other, each followed by inflation: beliefs and forecasts."""
+    """Runs a Kalman filter by hand, one sensor after the other, each followed by inflation."""
     F, Q, H, R = linear_system()
     means, covs = [mean.expand(B, 2)], [cov.expand(B, 2, 2)]
     moved = []
@@ -414,7 +414,7 @@ def with_lasting_errors(*, joint=False, delay=0, kind=None):
 
 
 def lasting_errors_in_numpy(frames, Q):
-    """Mean and covariance of a textbook Kalman filter whose state ends with both errors; predict, then update."""
+    """Runs a textbook Kalman filter whose state ends with both sensors' biases."""
     F, _, H, R = (value.numpy() for value in linear_system())
     decay = np.exp([-1 / 6, -1e-6])
     f = block_diag(F, np.diag(decay))

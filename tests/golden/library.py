@@ -170,7 +170,7 @@ def of_monitors() -> dict[str, list[float]]:
 
 
 def of_weights() -> dict[str, list[float]]:
-    """The filters that come with the library, on random readings; the car's on a rendered drive that fails, too."""
+    """Runs the pretrained filters on random readings; the car's also on a rendered drive with faults."""
     out = {f"weights: {name}": found for name, found in all_beliefs().items()}
     with tempfile.TemporaryDirectory() as folder:
         render_drives(Path(folder), names="drive", frames=30, size=(100, 300), seed=2032)

@@ -67,7 +67,7 @@ def normal(value, std):
 
 
 def on_line(reading, share, outlier_std, divergence=0.0):
-    """Mean, variance, log-likelihood and probability of an outlier of the exact posterior, on a fine grid."""
+    """Returns mean, variance, log-likelihood and outlier probability of the exact posterior, on a fine grid."""
     x = torch.linspace(MEAN - 30 * STD, MEAN + 30 * STD, 400_001, dtype=torch.float64)
     step = float(x[1] - x[0])
     prior, outlier = normal(x - MEAN, STD), share * normal(reading - x, outlier_std)

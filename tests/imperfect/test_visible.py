@@ -57,7 +57,7 @@ def forecast(reading, p, members=400, dtype=torch.float64):
 
 
 def grid(reading, p, broad):
-    """Mean, variance, log-likelihood and share of the exact posterior, on a fine grid."""
+    """Returns mean, variance, log-likelihood and visibility of the exact posterior, on a fine grid."""
     x = torch.linspace(MEAN - 12 * STD, MEAN + 12 * STD, 200_001, dtype=torch.float64)
     step = float(x[1] - x[0])
 

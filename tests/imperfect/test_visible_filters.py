@@ -61,7 +61,7 @@ BOTH = pytest.mark.parametrize("share", WRAPPED)
 
 
 def frames(*batch):
-    """Readings, masks, starts and p."""
+    """Returns readings, masks, resets and p."""
     torch.manual_seed(0)
     td = TensorDict({"observation": torch.randn(*batch, 2), "visible": torch.rand(*batch, 1)}, batch)
     td["observed"] = torch.rand(*batch, 2) < 0.8

@@ -25,7 +25,7 @@ def draw(sensor, batch):
 
 
 def naive(sensor, frames, noise):
-    """One forward of the whole network a frame and member."""
+    """Runs the whole network once for each frame and member."""
     out = []
     for index, frame in enumerate(frames):
         for member in range(sensor.ensemble_size):

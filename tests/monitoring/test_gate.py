@@ -152,7 +152,7 @@ def test_a_hidden_sensor_does_not_open_the_gate():
 
 
 def simulate(runs, steps, factor=1.0):
-    """States and readings of the linear system, whose noise is by a factor larger in variance than it says."""
+    """Returns states and readings of the linear system whose noise variance is larger by a factor than R."""
     F, Q, H, R = linear_system(torch.float64)
     generator = torch.Generator().manual_seed(0)
     moved, read = torch.randn(2, runs, steps, DIM, generator=generator, dtype=torch.float64)

@@ -17,7 +17,7 @@ MOTIONS = {
 
 
 def random_points(space, *shape):
-    """Points around the neutral one."""
+    """Returns points around the neutral one."""
     return space.exp(torch.randn(*shape, space.tangent_dim))
 
 
@@ -39,7 +39,7 @@ def observe(reading, state):
 
 
 def inertial_state(pose, gyro_bias=(0.0, 0.0, 0.0), accelerometer_bias=(0.0, 0.0, 0.0)):
-    """States [E, 16] of poses [E, 10]."""
+    """Returns states [E, 16] of poses [E, 10]."""
     biases = torch.tensor([*gyro_bias, *accelerometer_bias], dtype=pose.dtype)
     return torch.cat([pose, biases.expand(*pose.shape[:-1], 6)], -1)
 

@@ -13,7 +13,7 @@ CURE = r"TensorDictReplayBuffer.*reshape.*batch\[None\]"
 
 
 def episodes(*, following=True, init=False):
-    """Episodes end to end, as they are stored."""
+    """Returns concatenated episodes, as they are stored."""
     rows = []
     for index, count in enumerate(LENGTHS):
         values = torch.randn(count + 1, 2)

@@ -116,7 +116,7 @@ def test_the_observation_alone_is_the_term_of_the_whole():
 
 
 def forecasts_by_hand(filter, frames):
-    """One element and one time after the other, by the transition on a TensorDict."""
+    """Runs the transition on a TensorDict, one element and one time after the other."""
     out = torch.zeros(2, 7, E, S)
     for b in range(2):
         for t in range(1, 7):

@@ -14,7 +14,7 @@ DT = 0.1
 
 @cache
 def kalman_runs(batch=60, steps=80, lag=0):
-    """Sequences [batch, steps] of state [x, y, vx, vy], a third of the readings missing; smoothed, with a lag."""
+    """Returns sequences [batch, steps] of the state [x, y, vx, vy], with a third of the readings missing, smoothed."""
     F = torch.eye(4)
     F[0, 2] = F[1, 3] = DT
     H = torch.eye(2, 4)

@@ -19,7 +19,7 @@ def line(axes, label):
 
 
 def band(axes):
-    """Times, lower and upper edge [T], read from the polygon: start, lower edge, end, upper edge back."""
+    """Returns times, lower and upper edge [T] of the polygon: start, lower edge, end, upper edge back."""
     (polygon,) = axes.collections[0].get_paths()
     steps = (len(polygon.vertices) - 3) // 2
     lower = polygon.vertices[1 : 1 + steps]

@@ -19,7 +19,7 @@ def smooth_frames(count=6, height=48, width=64):
 
 
 def decoded(file):
-    """Frames [T, H, W, 3] RGB, and frames a second."""
+    """Returns RGB frames [T, H, W, 3], and frames per second."""
     if file.suffix == ".gif":
         with Image.open(file) as gif:
             durations = []

@@ -109,7 +109,7 @@ def test_own_builders(tmp_path):
 
 
 def ball(members=8, scheme="perturbed", std=0.5, gain=1.0, key="camera"):
-    """A filter each of whose settings changes what it believes, or where it reads; few of them are stored numbers."""
+    """Returns a filter each of whose settings changes its belief or its inputs."""
     return DEnKF(
         LearnedTransition(StochasticMLP(2, 2, (8,))),
         None,

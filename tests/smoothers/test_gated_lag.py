@@ -31,7 +31,7 @@ def off(frames, key="observation"):
 
 
 def hidden(frames, out, key="observed", gate="gate"):
-    """The recordings without what a gate rejected, which is more than what is wrong: it opens a little later."""
+    """Returns the recordings without the readings that the gate rejected, also good ones after a fault."""
     rejected = out[gate, "factor"].isinf()
     assert rejected[:, WRONG].all()
     assert rejected.sum() <= 4 * len(frames) * len(WRONG)

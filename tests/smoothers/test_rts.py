@@ -86,7 +86,7 @@ def test_a_learned_filter_learns_from_what_it_looks_back_at(float64, name):
 
 
 def unsure(name, dtype):
-    """A vehicle that knows its place to 1000 m, and reads it to 0.1 m; on a space its heading, too, to a few turns."""
+    """Returns a vehicle with a prior std of 1000 m and readings of 0.1 m; on a space also a heading."""
     dt, like = 0.1, {"dtype": dtype}
     if name == "SE2":
         motion = ConstantTwist(SE2(), dt, twist_noise=[0.05, 0.1, 0.1])

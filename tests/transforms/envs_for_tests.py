@@ -14,7 +14,7 @@ STEPS = [3, 5]  # episode lengths of the two (or first two) rows
 
 
 def forked_env(workers, *args, **kwargs):
-    """A ``ParallelEnv`` of copies of this process: workers that need not import anything, which takes seconds."""
+    """Returns a ``ParallelEnv`` of forked workers, which need no imports and so start fast."""
     return ParallelEnv(workers, *args, mp_start_method="fork", **kwargs)
 
 
@@ -91,5 +91,5 @@ def seeded_env(seed, **kwargs):
 
 
 def random_rollout(env, steps=12):
-    """Random actions, over the ends of episodes."""
+    """Runs random actions across the ends of episodes."""
     return env.rollout(steps, break_when_any_done=False)

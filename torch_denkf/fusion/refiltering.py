@@ -128,7 +128,7 @@ class Refiltering(Checked):
         return RefilteringWindow(tuple(rows), tuple(beliefs))
 
     def sequence(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Filters one episode ``[*B, T]`` and writes what each step wrote when it was made first.
+        """Filters one episode ``[*B, T]`` and writes the outputs of each step before later corrections.
 
         Raises:
             ValueError: if another episode begins within it.

@@ -231,7 +231,7 @@ class RejectReadings(Checked, Transform):
         usable: Mapping[NestedKey, Tensor],
         observed: Mapping[NestedKey, Tensor],
     ) -> Iterator[str]:
-        """Names the first bad number of each reading, and of its noise, that no mask hides."""
+        """Names the first invalid value of each reading, and of its noise, that the observed mask does not exclude."""
         for key, fine in usable.items():
             mask, noise = self.hidden_by[key], self.noises.get(key)
             lost = observed[mask] & ~fine

@@ -152,7 +152,7 @@ class ResampledTransition(Transition):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Names one uniform number, where the scheme needs it; for a jitter normal ones, too."""
+        """Declares one uniform number for schemes that need it, and normal numbers for a jitter."""
         if self.scheme not in ("systematic", "soft"):
             return ()
         return ("uniform", "normal") if self.jitter else ("",)

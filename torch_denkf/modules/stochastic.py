@@ -193,7 +193,7 @@ class StochasticMLP(nn.Module):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Names the tensors that one call needs, see :class:`torch_denkf.modules.SubModel`."""
+        """Declares the noise tensors that one call needs, see :class:`torch_denkf.modules.SubModel`."""
         if not self.noise_size or not self.sample:
             return ()
         return ("",) if self.layer == "dropout" else ("signs", "perturbation")

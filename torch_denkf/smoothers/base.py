@@ -59,7 +59,7 @@ class Smoother(Checked, TensorDictModuleBase):
     def sequence(
         self, tensordict: TensorDictBase, *, detach_every: int | None = None, keep: Sequence[NestedKey] | None = None
     ) -> TensorDictBase:
-        """Filters and smooths ``[*B, T]``; takes what :meth:`Filter.sequence` takes.
+        """Filters and smooths ``[*B, T]``; its arguments are those of :meth:`Filter.sequence`.
 
         Args:
             tensordict: frames, see there.

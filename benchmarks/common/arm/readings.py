@@ -104,7 +104,7 @@ def blackouts(lengths: Tensor, seed: int = 0) -> Tensor:
 
 
 def fail(readings: TensorDict, condition: str, seed: int = 0) -> TensorDict:
-    """Readings ``[N, T]`` of a camera that fails, ``"black20"`` or ``"missing"``; in other conditions as they are."""
+    """Returns readings ``[N, T]`` under a camera fault, ``"black20"`` or ``"missing"``; otherwise unchanged."""
     count, steps = readings.shape
     if condition == "missing":
         return without(readings, torch.rand(count, steps, 1, generator=torch.Generator().manual_seed(seed)) < MISSING)
@@ -146,7 +146,7 @@ class Windows:
         self.weights = (shares / counts).repeat_interleave(counts)
 
     def sample(self, generator: torch.Generator, batch: int, length: int | None = None) -> TensorDict:
-        """Windows ``[batch, length]``: in half of them up to half of the frames are missing, in a third a stretch."""
+        """Returns windows ``[batch, length]``; half of them have missing frames, a third a gap."""
         length = length or self.length
 
         def draw(*shape: int) -> Tensor:

@@ -122,7 +122,7 @@ class ArmRecipe(Recipe):
         return Filter(parts, initial=self.initial(self.start_std, "start") if training else model.initial)
 
     def begun(self, windows: TensorDict, generator: torch.Generator) -> TensorDict:
-        """Windows with the loss's ``"target"``, in which biases are zero, and the ``"start"`` of their beliefs."""
+        """Adds to windows the loss's ``"target"``, with biases of zero, and the ``"start"`` of their beliefs."""
         unknown = self.size - windows["motion"].shape[-1]
         windows["target"] = nn.functional.pad(windows["motion"], (0, unknown))
         windows["start"] = self.start(windows, generator)

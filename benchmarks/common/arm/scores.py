@@ -83,7 +83,7 @@ def scores(out: TensorDict, names: Sequence[str], unit: Tensor, circular: Sequen
 
 
 def blackout(out: TensorDict, circular: Sequence[int] = ()) -> dict[str, float]:
-    """Error of the joints in the black frames, and their mean standard deviation before, at the end of, and after."""
+    """Returns the joint error in black frames, and the mean standard deviation before, at the end and after."""
     begin, steps, rows = blackouts(out["valid"].sum((1, 2))), out.shape[1] - 1, torch.arange(len(out))
     at = rows.unsqueeze(-1), (begin.unsqueeze(-1) + torch.arange(BLACK)).clamp(max=steps)
     error = absolute_errors(out["belief", "mean"][at].flatten(0, 1), out["state"][at].flatten(0, 1), circular)

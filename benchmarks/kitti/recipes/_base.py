@@ -74,7 +74,7 @@ class KITTIRecipe(Recipe):
         return Filter(OrderedDict(sensor=self.sensor, **self.modules()), initial=self.initial(INITIAL_STD, "state"))
 
     def part(self, model: Filter, *, sensor: bool, start_std: Tensor | None = None) -> Filter:
-        """The same filter, sharing all parameters, with or without its sensor; from a wrong ``"start"`` if told so."""
+        """Returns the same filter with shared parameters, with or without its sensor, or with a wrong ``"start"``."""
         names = [name for name in model.module if sensor or name != "sensor"]
         initial = model.initial if start_std is None else self.initial(start_std, "start")
         return Filter(OrderedDict((name, model[name]) for name in names), initial=initial)

@@ -56,7 +56,7 @@ def step(filter: Filter, frames: TensorDict, front: Front) -> TensorDict:
 
 
 def sequence(filter: Any, frames: TensorDict, front: Front) -> TensorDict:
-    """Filters, or smooths, a sequence."""
+    """Filters or smooths a sequence."""
     smoothed = [key for key in getattr(filter, "out_keys", ()) if key[0] == "smoothed"]
     keys = getattr(filter, "smoothed_keys", None) or smoothed or filter.belief_keys
     return filter.sequence(front(frames.copy())).select(*keys)
@@ -81,7 +81,7 @@ def fed(
     way: str,
     front: Front = lambda frames: frames,
 ) -> Source:
-    """Frames, and a filter that reads them in one way; a warning of a NaN in a sequence is as good as an error."""
+    """Runs a filter on frames in one way; a warning of NaN in a sequence counts as an error."""
 
     def read(rows: TensorDict, *, double: bool = False) -> TensorDict:
         torch.manual_seed(0)
@@ -95,7 +95,7 @@ def fed(
 
 
 def both(first: Change, then: Change) -> Change:
-    """One change after another."""
+    """Applies one change after another."""
 
     def change(frames: TensorDict) -> TensorDict:
         for one in (first, then):
@@ -245,7 +245,7 @@ NUMBERS = d.Wrong(
 
 
 def beliefs(one: Fed) -> Iterator[Target]:
-    """Steps from damaged beliefs; right where a filter does not read what is damaged, as an LSTM its last mean."""
+    """Runs steps from damaged beliefs; correct if the filter does not read the damaged entry."""
 
     def made() -> Filter:
         torch.manual_seed(0)
@@ -304,7 +304,7 @@ LAYOUTS: dict[str, tuple[tuple[str, ...], Use]] = {
 
 
 def laid_out(one: Fed, layouts: dict[str, tuple[tuple[str, ...], Use]]) -> Iterator[Target]:
-    """Frames and calls of a wrong layout."""
+    """Yields frames and calls of a wrong layout."""
     for what, (words, use) in layouts.items():
         read = lambda frames, use=use: use(one.make(), frames)  # noqa: E731
         yield Source(one.border, one.frames, read, one.name).target(

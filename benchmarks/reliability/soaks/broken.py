@@ -265,7 +265,7 @@ def on_disk(name: str, full: bool) -> dict[str, Any]:
 
 
 def two(name: str) -> dict[str, Any]:
-    """Two processes do the same in one folder at a time."""
+    """Runs the same job in two processes in one folder."""
     work = WORKS[name]
     with two_folders() as (broken, sound, log):
         logs = [log.with_suffix(f".{k}") for k in range(2)]
@@ -293,7 +293,7 @@ def kill_jobs(kills: int, seed: int) -> Rows:
 
 
 def disk_jobs() -> Rows:
-    """Each work on each kind of disk, and in two processes; what they start from is made here.
+    """Runs each job on each kind of disk, and in two processes.
 
     Raises:
         PermissionError: where one may not mount file systems.

@@ -47,7 +47,7 @@ SAMPLED: dict[str, Callable[[], Filter]] = {
 
 
 def drawn(number: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """States, readings, and whether they arrive, NaN where not, of a chunk, which follow from its number alone."""
+    """Returns states, readings (NaN for missing ones) and observed masks of a chunk, seeded by its number."""
     F, Q, H, R = linear_system()
     random = torch.Generator().manual_seed(number)
     state, states = torch.zeros(2), []

@@ -32,7 +32,7 @@ def flags(*places):
 
 
 def drive(seconds=60.0, seed=0):
-    """Times at 20 Hz, places, headings, speeds and turn rates of a car."""
+    """Returns times at 20 Hz, positions, headings, speeds and turn rates of a car."""
     rng, dt = np.random.default_rng(seed), 0.05
     time = np.arange(0, seconds, dt)
     turn, speed = np.zeros(len(time)), np.full(len(time), 5.0)
@@ -45,7 +45,7 @@ def drive(seconds=60.0, seed=0):
 
 
 def write_log(file, seconds=60.0):
-    """A wide log as a phone writes it: degrees, km/h, fixes once a second that are repeated until the next one."""
+    """Writes a wide log of a phone: degrees, km/h, and GPS fixes at 1 Hz that are repeated in between."""
     rng = np.random.default_rng(1)
     time, place, _, speed, turn = drive(seconds)
     fixes = place + 0.3 * rng.normal(size=place.shape)

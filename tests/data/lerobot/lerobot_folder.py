@@ -14,7 +14,7 @@ NAMES = ["shoulder", "elbow", "wrist"]
 
 
 def colours(episode, length):
-    """Mean colour of each frame: neighbours differ by 14 grey values in red, so that a shift by one shows."""
+    """Returns the mean colour of each frame; neighbours differ by 14 in red, so that a shift by one shows."""
     k = np.arange(length)
     return np.stack([20 + 14 * k, 230 - 10 * k, np.full(length, 40 + 30 * episode)], -1)
 

@@ -85,7 +85,7 @@ def test_origins_that_are_none(tmp_path, origin, error, match):
 
 
 def fixes(count=60, held=8, seed=0):
-    """A random walk at 10 Hz, read each ``held`` rows with a standard deviation of one, and repeated until then."""
+    """Returns a random walk at 10 Hz, read every ``held`` rows with unit noise, and repeated in between."""
     random = np.random.default_rng(seed)
     walk = random.normal(size=count * held).cumsum() * 0.3
     return walk, (walk[::held] + random.normal(size=count)).repeat(held), held

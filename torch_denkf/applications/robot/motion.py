@@ -120,7 +120,7 @@ class RobotMotion(Motion):
         return moved, out
 
     def _moved(self, state, dt):
-        """The states later, the way, the body's axes in the world, the angles' rates by turn rates, and the yaw."""
+        """Returns later states, distance travelled, body axes in the world, angle rates from turn rates, and yaw."""
         place, angles, velocity, rates, force, slow = state.split([3, 3, 3, 3, 3, state.shape[-1] - 15], -1)
         (sr, sp), (cr, cp) = angles[..., :2].sin().unbind(-1), angles[..., :2].cos().unbind(-1)
         one, zero = torch.ones_like(sr), torch.zeros_like(sr)

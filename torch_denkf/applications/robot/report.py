@@ -63,7 +63,7 @@ def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]
 
 
 def _drift(model: RobotModel, name: str, at: int) -> tuple[float, float] | None:
-    """Standard deviation and time, s, of the drift of a sensor's reading; ``None`` for one that has none."""
+    """Returns standard deviation and time constant (s) of a sensor's drift; ``None`` for a sensor without drift."""
     place = model.reading(name).slow[at]
     if place is None or model.drifts is None:
         return None

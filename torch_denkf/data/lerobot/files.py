@@ -92,7 +92,7 @@ class Layout:
         return int(width)
 
     def names(self, key: str) -> tuple[str, ...] | None:
-        """Names of a feature's numbers, where each has one: lists, lists in lists, or lists below a common name."""
+        """Returns the names of a feature's components from lists, nested lists, or lists under a common name."""
         names = self.features[key].get("names")
         if isinstance(names, dict):
             names = list(names.values())

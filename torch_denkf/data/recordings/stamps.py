@@ -62,7 +62,7 @@ def nanoseconds_beside(time: str, names: Sequence[str]) -> str | None:
 
 
 def seconds_of(text: str) -> float | None:
-    """A date, a time of the day, or both, in s, since 1970 in UTC where there is a date; ``None`` for another text.
+    """Parses a date, a time of the day, or both, to s, since 1970 in UTC if it has a date; ``None`` for other text.
 
     Examples:
         >>> seconds_of("2014-03-26T15:10:23.825Z"), seconds_of("0:01:02.5"), seconds_of("12.5")

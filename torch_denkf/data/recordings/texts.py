@@ -119,7 +119,7 @@ def _split(file: Path, lines: Sequence[str], mark: str) -> tuple[list[list[str]]
 
 
 def _pointed(cell: str) -> str:
-    """A number with a decimal comma, as files have it whose columns are separated by semicolons, with a point."""
+    """Replaces a decimal comma by a point, for files whose columns are separated by semicolons."""
     return re.sub(r"^(\s*[-+]?\d+),(\d+)", r"\1.\2", cell)
 
 

@@ -31,7 +31,7 @@ def _double(float64):
 
 
 def drawn(batch=20, count=60, noise=None, seed=0):
-    """Points ahead, a motion of a metre, and the corners of both rows."""
+    """Returns points ahead, a motion of a metre, and the corners of both rows."""
     torch.manual_seed(seed)
     points = torch.randn(batch, count, 3) * torch.tensor([8.0, 2.0, 10.0]) + torch.tensor([0.0, 0.0, 25.0])
     points[..., 2] = points[..., 2].clamp_min(5.0)

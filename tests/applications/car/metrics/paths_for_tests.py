@@ -25,7 +25,7 @@ def winding(seed, rows=400, step=None, batch=()):
 
 
 def matrices(path):
-    """Poses [T, 3] as SE(3) matrices, in the plane z = 0."""
+    """Returns poses [T, 3] as SE(3) matrices, in the plane z = 0."""
     out = np.tile(np.eye(4), (len(path), 1, 1))
     x, y, theta = path.T.numpy()
     out[:, 0, 0] = out[:, 1, 1] = np.cos(theta)

@@ -33,7 +33,7 @@ def random_frames(*batch):
 
 
 def known_frame(pitch, distance, turn):
-    """One peak in the table, and a flow of ``turn`` that is the same everywhere ahead."""
+    """Returns a table with one peak, and a flow with the same ``turn`` everywhere ahead."""
     flow, road = 0.1 * torch.randn(FLOW_SHAPE), torch.zeros(ROAD_SHAPE)
     flow[0, 8:12, 28:51] = turn
     road[np.abs(ROAD_PITCHES - pitch).argmin(), np.abs(ROAD_SHIFTS - distance).argmin()] = 1.0
@@ -41,7 +41,7 @@ def known_frame(pitch, distance, turn):
 
 
 def known_travel(pitch, length=0.1):
-    """The flow of a camera that looks up by ``pitch`` from where it travels: away from a focus, near things faster."""
+    """Returns the flow of a camera whose pitch over the direction of travel is ``pitch``."""
     rows, columns = ((torch.arange(n) + 0.5) / n * 2 - 1 for n in (25, 79))
     down, right = torch.meshgrid(rows * 0.2708 - pitch, columns * 0.8625, indexing="ij")
     return torch.stack([right, down, torch.zeros(25, 79)]) * length * torch.rand(25, 79)

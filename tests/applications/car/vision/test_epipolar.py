@@ -16,7 +16,7 @@ def rotation(left, up, around):
 
 
 def views(turn, focus, seed=0, count=200, way=0.8):
-    """Points 4 to 40 m off that a camera sees before and after it has turned and driven ``way`` metres."""
+    """Returns points at 4 to 40 m in both images of a camera that rotates and drives ``way`` metres."""
     rng = np.random.default_rng(seed)
     depth = rng.uniform(4, 40, count)
     points = np.stack([rng.uniform(-0.8, 0.8, count) * depth, rng.uniform(-0.25, 0.25, count) * depth, depth], 1)

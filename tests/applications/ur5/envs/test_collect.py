@@ -28,7 +28,7 @@ def demos_of(root):
 
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory):
-    """Three demos of one run in this process, without pictures."""
+    """Collects three demos in this process, without images."""
     root = tmp_path_factory.mktemp("unbroken")
     counts = []
     assert collect_ur5_demos(root, DEMOS, **BLIND, progress=counts.append) == DEMOS

@@ -13,7 +13,7 @@ __all__ = ["bridge_gaps", "steps_between"]
 
 
 def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
-    """Pairs each frame with the last one before it that is there, so that a gap hides no motion.
+    """Pairs each frame with the last existing one before it, so that a gap loses no motion.
 
     Without it a missing frame blinds two pairs of neighbours. What comes after,
     :func:`torch_denkf.applications.car.kitti.frames.frames_at`, :func:`torch_denkf.applications.car.with_motion` and

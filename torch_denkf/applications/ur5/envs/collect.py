@@ -95,7 +95,7 @@ def collect_ur5_demos(
 
 
 def _missing(root: Path, demos: int, options: Options) -> tuple[list[int], dict[int, Entry]]:
-    """Numbers of the demos to make, and the manifest without them."""
+    """Returns the numbers of the demos to record, and the manifest without them."""
     ours = {"format": FORMAT, **asdict(options)}
     ours |= {"size": list(options.size), "tasks": list(options.tasks)}  # as JSON gives them back
     entries = files.read_manifest(root, skip_damaged=True)
