@@ -83,7 +83,7 @@ def compare(rollout: TensorDict) -> str:
 
 
 def draw(rollout: TensorDict, file: Path) -> None:
-    """Draws the joint velocities over time, beside differences of the encoders."""
+    """Draws the joint velocities over time, next to differences of the encoders."""
     seen = rollout["next"]
     differences = seen["encoder"].diff(dim=0, prepend=seen["encoder"][:1]) / DT
     names, dots = ["joint 1, rad/s", "joint 2, rad/s"], {dim: differences[:, dim - 2] for dim in (2, 3)}

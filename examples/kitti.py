@@ -53,7 +53,7 @@ def make_filter(data: KITTIOdometryExperienceReplay) -> DEnKF:
 
 
 def train(denkf: DEnKF, data: KITTIOdometryExperienceReplay, out: Path, updates: tuple[int, int]) -> None:
-    """The sensor alone, then all of the filter through 16 steps; resumes where it was broken off."""
+    """The sensor alone, then all of the filter through 16 steps; resumes after an interruption."""
     scale = data.statistics["velocity", "std"]
     of_sensor = SensorLoss(denkf, observation_scale=scale)
     # The pose follows from the velocities: errors of an infinite scale do not count. nll moves the noise model.
@@ -117,7 +117,7 @@ def main() -> None:
 
 
 def draw(seen, reckoned: torch.Tensor, file: Path) -> None:
-    """The path with its ensemble beside the truth and dead reckoning; the velocities with their 90 % bands."""
+    """Draws the path with its ensemble, the truth and dead reckoning; the velocities with their 90 % bands."""
     import matplotlib
 
     matplotlib.use("agg")

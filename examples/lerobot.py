@@ -4,7 +4,7 @@
     python examples/lerobot.py --root FOLDER --camera top --state observation.state --joints 7:14
 
 Any folder of LeRobot 2.0, 2.1 or 3.0 will do. The sensor reads the joints from single pictures. Where commands were
-recorded, they drive the filter's motion, which is learned. The page prints errors on unseen episodes beside those of
+recorded, they drive the filter's motion, which is learned. The page prints errors on unseen episodes next to those of
 simpler ways, and leaves a picture and a video in --out. ``kitti.py``, ``ur5.py`` and ``own_recordings.py`` are the same
 page for other robots. Needs pyarrow: ``pip install "torch_denkf[lerobot,plots]"``.
 
@@ -130,11 +130,11 @@ def make_filter(data: LeRobotReplay) -> DEnKF:
     commands = {"action_key": "action", "action_loc": facts["action", "mean"]} if driven else {}
     if driven:
         commands["action_scale"] = facts["action", "std"].clamp_min(1e-3)
-    # Linear: joints go after their commands, and stay where they are without. Widths such as (64, 64) in the place of
+    # Linear: joints go after their commands, and stay where they are without. Widths such as (64, 64) instead of
     # () learn other motions, too.
     motion = StochasticMLP(joints + (row["action"].shape[-1] if driven else 0), joints, (), output_gain=0.0)
     motion.requires_grad_(driven)
-    wind = (0.1 if driven else 0.3) * scale  # what moves joints in a step beside their commands, before training
+    wind = (0.1 if driven else 0.3) * scale  # what moves joints in a step in addition to their commands, before training
     wind = ConstantNoise(wind, trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return DEnKF(
         transition=LearnedTransition(motion, loc=loc, scale=scale, **commands),
@@ -172,7 +172,7 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
         Stage("sensor", of_sensor, data.draw, updates[0], weight_decay=0.02, lengths={0: 1}),
         Stage("motion", of_motion, data.draw, updates[1], lengths={0: 2}),
     ]
-    FilterTrainer(denkf, stages, out=out / "parts", **trainer).fit()  # goes on where it was broken off
+    FilterTrainer(denkf, stages, out=out / "parts", **trainer).fit()  # resumes after an interruption
 
     # The filter behind its sensor: the same modules, for readings that were made before.
     behind = Filter({name: denkf[name] for name in denkf.module if name != "sensor"}, initial=denkf.initial)

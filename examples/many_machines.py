@@ -140,7 +140,7 @@ def windows(data: TensorDictBase, newest: int, oldest: int) -> tuple[TensorDictB
 
 
 def transitions(batch: TensorDictBase) -> TensorDict:
-    """Returns rows ``[N]`` for SAC: the belief of the next row stands beside each, but for the last of an episode."""
+    """Returns rows ``[N]`` for SAC: each with the belief of the next row, except the last of an episode."""
     first, second = batch[:, :-1], batch[:, 1:]
     rows = first.select(BELIEF, "action")
     rows["next"] = second.select(BELIEF).update({"reward": first["next", "reward"]})

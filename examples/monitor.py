@@ -122,7 +122,7 @@ def main() -> None:
     draw(options.out, plain, answered, monitor.cusum_limit.item())
     print(f"Picture: {options.out}")
 
-    # In an environment the alarm stands beside the belief.
+    # In an environment the alarm stands next to the belief.
     motion = torch.tensor([[1.0, DT], [0.0, 0.99]])
     plant = LinearGaussianEnv(motion, torch.eye(1, 2), [0.0, PUSH], [NOISE], initial_std=[0.3, 0.3], seed=0)
     rollout = TransformedEnv(plant, DEnKFTransform(Monitored(make_cart(), monitor))).rollout(20)

@@ -103,7 +103,7 @@ def make_filter(data: RecordingReplay) -> Filter:
     facts = data.statistics
     loc, scale = facts["state", "mean"], facts["state", "std"]
     transition = LearnedTransition(StochasticMLP(2, 2, output_gain=0.1), loc=loc, scale=scale)
-    pushes = (torch.tensor([0.01, 0.2]) * scale).tolist()  # what may change in a step beside the learned motion
+    pushes = (torch.tensor([0.01, 0.2]) * scale).tolist()  # what may change in a step in addition to the learned motion
     initial = FromSensor([0], mean=loc, std=scale, ensemble_size=32)
     encoder = {"observation_key": "encoder", "observed_key": "encoder_observed"}
     encoder |= {"predicted_key": "encoder_predicted", "noise_variance_key": "encoder_noise"}
@@ -132,7 +132,7 @@ def make_filter(data: RecordingReplay) -> Filter:
 
 
 def train(model: Filter, data: RecordingReplay, out: Path, updates: tuple[int, int]) -> None:
-    """The sensor alone, then all of the filter through 20 steps; resumes where it was broken off."""
+    """The sensor alone, then all of the filter through 20 steps; resumes after an interruption."""
     scale = data.statistics["state", "std"]
     loss = DEnKFLoss(model, state_scale=scale, observation_scale=scale[:1], nll=0.02)
     sensor = Stage("sensor", SensorLoss(model, observation_scale=scale[:1]), data.draw, updates[0], lengths={0: 8})

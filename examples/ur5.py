@@ -81,7 +81,7 @@ def make_filter(data: UR5ExperienceReplay) -> DEnKF:
 
 
 def train(denkf: DEnKF, shots: UR5ExperienceReplay, data: UR5ExperienceReplay, out: Path, updates) -> None:
-    """The sensor on single pictures, then all of the filter through 32 steps; resumes where it was broken off."""
+    """The sensor on single pictures, then all of the filter through 32 steps; resumes after an interruption."""
     scale = data.statistics["state", "std"]
     of_sensor = SensorLoss(denkf, observation_scale=scale)
     of_filter = DEnKFLoss(denkf, state_scale=scale, observation_scale=scale, nll=0.02)

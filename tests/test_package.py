@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """Built from a copy: setuptools writes build/ and *.egg-info beside the sources."""
+    """Built from a copy: setuptools writes build/ and *.egg-info next to the sources."""
     source = tmp_path_factory.mktemp("source")
     files = ["setup.py", "pyproject.toml", "README.md", "LICENSE", "torch_denkf", "modules", "tests", "benchmarks"]
     names = [name for name in [*files, "examples"] if (ROOT / name).exists()]
@@ -78,7 +78,7 @@ def check_trained_filters(wheel, folder):
         assert found[name] == pytest.approx(values, rel=1e-4, abs=1e-5), name
 
 
-#: The rooms that every user needs; with them go the files at the package's top, but for the one that looks robots up.
+#: Packages of the core; the files at the package's top belong to it, except the one that looks up robots.
 CORE = ("functional", "metrics", "modules", "filters", "smoothers", "transforms", "objectives")
 ROBOTS = {
     name

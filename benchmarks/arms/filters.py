@@ -18,7 +18,7 @@ from torch_denkf.training.parts import train_part
 
 # What follows was chosen on other episodes than those of the tests, see README.md.
 MEMBERS = 256
-DRIFT = 0.005  # noise of an angle after a way of 1 rad, beside those of the accelerations and of a step, rad
+DRIFT = 0.005  # noise of an angle after a way of 1 rad, in addition to those of the accelerations and of a step, rad
 LENGTH = 0.3  # rad: a motion after which a picture is read with other errors
 FASTER = 1.25  # than any joint was seen to turn: no member is
 

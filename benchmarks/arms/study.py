@@ -46,7 +46,7 @@ class Study:
     motion_updates: int = 8000
     sensor_updates: int = 6000
     seed: int = 0
-    out: Path = Path("runs/dm_control_arms")  # a run that was broken off goes on from here
+    out: Path = Path("runs/dm_control_arms")  # an interrupted run resumes from here
     smoke: bool = False  # some seconds, to see that it runs
 
 

@@ -137,7 +137,7 @@ def inertial_filter(
             module that writes variances ``[*B, 3]``.
         members: of ensembles.
         magnetometer: read it, too.
-        feet: read ``"leg"``, the velocity in the body's axes by the foot that stands, in the place of rest.
+        feet: read ``"leg"``, the body velocity by the stance foot, instead of a velocity of zero.
         **options: of the ensemble's analyses.
     """
     sheet = Sensors()

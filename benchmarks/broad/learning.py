@@ -265,7 +265,7 @@ def factor(needs: Sequence[ndarray]) -> float:
 
 
 def _means(sets: Sequence[ImuSettings]) -> dict:
-    """Returns geometric means of all numbers, but for the place."""
+    """Returns geometric means of all numbers, except for the place."""
     names = [name for name in asdict(sets[0]) if name != "place"]
     return {name: np.exp(np.mean(np.log([getattr(each, name) for each in sets]), 0)).tolist() for name in names}
 

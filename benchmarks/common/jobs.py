@@ -17,7 +17,7 @@ from torch_denkf.deployment.workers import follow_parent
 
 
 def once(file: Path, rows: Callable[[], list[dict]]) -> None:
-    """Computes rows and leaves them in a JSON file, unless it is there: a study that was broken off goes on."""
+    """Computes rows and leaves them in a JSON file, unless it is there: an interrupted study resumes."""
     if file.exists():
         return
     write_text(file, json.dumps(rows()))

@@ -25,7 +25,7 @@ def draw_frontier(
     """Draws error against milliseconds a step: one line a filter, a dot for each of its numbers of members.
 
     Args:
-        rows: with ``"filter"``, ``"members"``, the error and the time; the number is written beside the first and the
+        rows: with ``"filter"``, ``"members"``, the error and the time; the number is written next to the first and the
             last dot of a line.
         path: PNG.
         error: column of the error.

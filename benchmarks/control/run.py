@@ -48,12 +48,12 @@ class Budget:
     """Holds what all arms of all tasks may use.
 
     Attributes:
-        env_steps: in the place of the task's; ``None`` for those.
+        env_steps: instead of the task's; ``None`` for those.
         tests: in a run, evenly spaced.
         episodes: of a test.
         members: of an ensemble.
         updates: of a filter, as a share of the task's.
-        every: environment steps for each update of SAC, in the place of the task's; ``None`` for those.
+        every: environment steps for each update of SAC, instead of the task's; ``None`` for those.
     """
 
     env_steps: int | None = None

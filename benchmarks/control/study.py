@@ -40,7 +40,7 @@ SEEDS = range(100)  # that the tables know
 class Study:
     """Policies that read a belief, against policies that remember. See benchmarks/control/README.md."""
 
-    out: Path = Path("runs/control")  # a run that was broken off goes on from here
+    out: Path = Path("runs/control")  # an interrupted run resumes from here
     tasks: some_of(CELLS) = tuple(CELLS)
     cells: int = 6  # the first so many of each task
     seeds: int = 5  # 0 only makes the tables of what is there
@@ -102,7 +102,7 @@ def complete(study: Study) -> list[dict]:
 
 
 def main() -> None:
-    """Runs the study; one that was broken off goes on."""
+    """Runs the study; an interrupted one resumes."""
     study, budget = parse(Study), Budget()
     if study.smoke:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="control-")), seeds=1, cells=1)

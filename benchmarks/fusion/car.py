@@ -123,7 +123,7 @@ def car_task(root: Path | None, *, frames: int = 60, validate: bool = False) -> 
     test = delayed(readings(*paths, 2), "gps", LATE)
     noises = {"camera": CAMERA, "wheels": WHEELS, "gps": GPS}
     models = {"camera": Select(VELOCITIES), "wheels": Select(VELOCITIES), "gps": Select([0, 1])}
-    late = {"camera": FINER, "wheels": FINER, "gps": 0}  # beside what they are late anyway
+    late = {"camera": FINER, "wheels": FINER, "gps": 0}  # in addition to their usual latency
     longest = {"camera": MIDDLE + FINER, "wheels": FINER, "gps": LATE}
     parts = {name: ConstantNoise(noises[name], trainable=True, in_key=name) for name in models}
     walk = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}

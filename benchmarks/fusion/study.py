@@ -95,7 +95,7 @@ def rows(task: Task, weights: torch.nn.Module) -> list[dict]:
 
 
 def run(model, data: TensorDict) -> TensorDict:
-    """Returns the filter's means beside the truth."""
+    """Returns the filter's means and the truth."""
     return model.sequence(data.copy(), keep=[("belief", "mean")])
 
 
@@ -138,7 +138,7 @@ def page(found: Sequence[dict], study: Study) -> str:
         subset = pick(own, condition="as it is")
         for sensors in dict.fromkeys(row["sensors"] for row in subset):
             lines.append(line(sensors, *(middle(pick(subset, sensors=sensors, method=method)) for method in METHODS)))
-        lines += ["", f"A sensor fails for {SECONDS:g} s, unannounced; the error in that time, beside the error of the"]
+        lines += ["", f"A sensor fails for {SECONDS:g} s, unannounced; the error in that time, compared with the error of the"]
         lines += ["filter that never had the sensor, in the same time.", ""]
         lines += head("fault", "plain", "weights", "never had it", "plain, times", "weights, times", "worst training")
         failing = [row for row in own if "error_ratio" in row]
@@ -155,7 +155,7 @@ def page(found: Sequence[dict], study: Study) -> str:
 
 
 def main() -> None:
-    """Runs the study; one that was broken off goes on."""
+    """Runs the study; an interrupted one resumes."""
     study = parse(Study)
     if study.smoke:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="fusion-")), seeds=1)

@@ -1,4 +1,4 @@
-"""The study's options, and the jobs of its table, each of which can be broken off and resumed."""
+"""The study's options, and the jobs of its table, each of which can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Study(Recordings):
     """A real arm that its head camera watches: seven joints, with every filter that is registered.
 
     table: estimate the lag, train sensors and filters, test. diagnosis: how the trained sensors err. pictures: plots
-    of what a table left in --out. What was broken off goes on where it stopped. See benchmarks/g1/README.md.
+    of what a table left in --out. An interrupted run resumes. See benchmarks/g1/README.md.
     """
 
     command: Positional[Literal["table", "diagnosis", "pictures"]] = "table"

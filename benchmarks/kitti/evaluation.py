@@ -1,4 +1,4 @@
-"""Errors of a trained filter on the drive that was left out, beside dead reckoning and its floor."""
+"""Errors of a trained filter on the drive that was left out, compared with dead reckoning and its floor."""
 
 from __future__ import annotations
 

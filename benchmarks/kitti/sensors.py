@@ -159,7 +159,7 @@ def sensor_of_fold(
         out: checkpoints and logs.
         cache: of the streams.
         seed: of all random numbers.
-        updates: of a sensor that starts anew.
+        updates: of a sensor that starts again.
         fine_tuning: updates of one that is ``pretrained``, and of the stand-ins that read shared drives.
         pretrained: where to start.
     """

@@ -1,4 +1,4 @@
-"""The study's options, and the jobs of its table, each of which can be broken off and resumed."""
+"""The study's options, and the jobs of its table, each of which can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SHARED = ("dead_reckoning", "floor")  # rows that come with every filter
 class Study:
     """Visual odometry on KITTI: the paper's protocol, with every filter that is registered.
 
-    table: leave one drive out after the other, in all conditions. What was broken off goes on where it stopped. See
+    table: leave one drive out after the other, in all conditions. An interrupted run resumes. See
     benchmarks/kitti/README.md.
     """
 
@@ -165,7 +165,7 @@ def evaluate_and_draw(recipe, model, streams: Sequence[Stream], cache: Path, plo
 
 
 def make_jobs(study: Study) -> list[Job]:
-    """Returns every combination; seeds last, so that a study that is broken off has whole folds."""
+    """Returns every combination; seeds last, so that an interrupted study has whole folds."""
     streams, rendered = find_streams(study.root, study.size, list(study.drives) or None), study.rendered_parts()
     names = study.test or list(dict.fromkeys(stream.drive for stream in streams))
     folds = [make_fold(name, streams, *rendered) for name in names]

@@ -106,7 +106,7 @@ def train_filter(
     budget: Budget,
     loggers: Sequence[str] = ("csv",),
 ) -> tuple[KITTIRecipe, Filter]:
-    """Trains one filter on a fold, or goes on where it was broken off; the model at the end is the best one."""
+    """Trains one filter on a fold, or resumes after an interruption; the model at the end is the best one."""
     torch.manual_seed(seed)
     facts, kind = base.facts, base.kind
     sensor = SENSORS[kind](facts)

@@ -1,4 +1,4 @@
-"""Error against milliseconds a step on Lorenz-96: ensemble filters of many sizes beside EKF, UKF and particle filter.
+"""Error against milliseconds a step on Lorenz-96: ensemble filters of many sizes, EKF, UKF, particle filter.
 
 The standard set-up of :mod:`benchmarks.lorenz96.schemes`: 40 variables, all observed with unit variance, no model
 noise. All filters know the equations and R. Each filter, at each size, gets one setting on validation records: an
@@ -131,7 +131,7 @@ class Frontier:
     steps: int = 600  # of each
     burn_in: int = 100  # of these, which do not count
     out: Path = Path("benchmarks/lorenz96/results/frontier.md")
-    rows: Path = Path("runs/lorenz96-frontier")  # what was broken off goes on from here
+    rows: Path = Path("runs/lorenz96-frontier")  # an interrupted run resumes from here
     smoke: bool = False  # one size on short records, nothing compiled, nothing written
 
     def __call__(self) -> None:

@@ -145,7 +145,7 @@ def learn(denkf: DEnKF, record: TensorDict, updates: int, rng: torch.Generator, 
         with torch.no_grad():
             warm = denkf.sequence(frames[:, : WARM_UP + 1].copy()).select(*denkf.belief_keys)
         frames = frames[:, WARM_UP:].copy()
-        # A stored belief needs an entry for every time; only the first is read, as nothing starts anew in between.
+        # A stored belief needs an entry for every time; only the first is read, as nothing starts again in between.
         frames.update(warm[:, -1:].expand(BATCH, WINDOW + 1))
         return loss(frames)["loss_nll"]
 

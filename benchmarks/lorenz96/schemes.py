@@ -175,7 +175,7 @@ class Schemes:
     burn_in: int = 400  # cycles before those
     first: int = 0  # seed
     schemes: tuple[str, ...] = ("perturbed", "sakov", "etkf", "letkf")
-    inflation: float | None = None  # in the place of the published ones
+    inflation: float | None = None  # instead of the published ones
     draws: Literal["exact", "random"] = "exact"  # of the start and of perturbations
     out: Path | None = None  # also write the table to this Markdown file
     smoke: bool = False  # a few cycles: does it run?

@@ -1,4 +1,4 @@
-"""The UR5 at its table, watched by a camera and by noisy encoders, of which one fails without a word."""
+"""The UR5 at its table, watched by a camera and by noisy encoders, of which one fails silently."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drives whose camera fails without a word: what the trained sensor reads of them."""
+"""Drives whose camera fails silently: what the trained sensor reads of them."""
 
 from __future__ import annotations
 

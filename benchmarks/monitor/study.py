@@ -151,7 +151,7 @@ def page(rows: Sequence[dict], study: Study) -> str:
 
 
 def main() -> None:
-    """Runs the study; one that was broken off goes on."""
+    """Runs the study; an interrupted one resumes."""
     study = parse(Study)
     if study.smoke:
         out = Path(tempfile.mkdtemp(prefix="monitor-"))

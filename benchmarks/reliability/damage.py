@@ -316,7 +316,7 @@ def same(result: Any, expected: Any, *, rtol: float = 0.0, atol: float = 0.0) ->
 
 
 def kept(result: Any, expected: Any, *, most: int = 1, rtol: float = 0.0) -> bool:
-    """Tells whether rows are as expected, but for some that are marked as missing, or lack at the end.
+    """Tells whether rows are as expected, except for some that are marked as missing, or lack at the end.
 
     Args:
         result: entries ``[N, ...]``.

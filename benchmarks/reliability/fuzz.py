@@ -154,8 +154,8 @@ def sampled(targets: Sequence[Target], count: int, seed: int) -> list[Callable[[
 class Fuzz:
     """Runs damaged inputs and counts what comes of them; leaves fuzz.json."""
 
-    sample: int = 0  # so many cases, drawn of all; 0 for all that have names, and those that are drawn beside
-    drawn: int = 3  # so many cases beside those with names, of each thing that may be damaged
+    sample: int = 0  # so many cases, drawn of all; 0 for all that have names, and some random ones in addition
+    drawn: int = 3  # number of random cases in addition to the named ones, of each thing that may be damaged
     seed: int = 0  # of what is drawn
     borders: some_of(BORDERS) = BORDERS  # type: ignore[valid-type]
     """where the inputs come in"""

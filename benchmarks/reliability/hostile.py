@@ -73,7 +73,7 @@ def _pickle_in_zip(file: Path) -> None:
     archive(members | {name: Bomb.pickled() for name in members if name.endswith("data.pkl")})(file)
 
 
-#: What writes a file in the place of weights.
+#: Payload that writes a file, saved as weights.
 PICKLES: dict[str, Callable[[Path], Any]] = {
     "a pickle": lambda file: file.write_bytes(Bomb.pickled()),
     "torch's pickle of code": _saved(Bomb()),

@@ -163,7 +163,7 @@ class Source:
         Args:
             file: the document.
             right: whether a result is right, in a loose place.
-            words: of clear messages, beside the file's name and the place's.
+            words: of clear messages, in addition to the file's name and the place's.
             skip: whether a place is left out.
             loose: whether what stands in a place may be wrong without an error.
             then: wraps a change of the file, as to adapt a checksum.

@@ -36,7 +36,7 @@ PAIRS = (
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 #: How many processes, one after the other, measure a pair: a ratio that jumps from run to run is their median.
 RUNS = {"against_cuthbert": 3}
-LIMIT_S = 2400  # for a pair: four compiled filters take twenty minutes beside other jobs
+LIMIT_S = 2400  # for a pair: four compiled filters take twenty minutes next to other jobs
 
 
 def in_this_process(name: str, seconds: float, out: Path) -> None:

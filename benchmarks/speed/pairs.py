@@ -117,7 +117,7 @@ def interleave(
 
 
 def against(ours: Mapping[str, Call], name: str, theirs: Call, title: str, *, how: dict, **fields) -> list[Row]:
-    """Returns a line for each of ours beside another package's.
+    """Returns a line for each of ours and of another package's.
 
     Args:
         ours: by kind.

@@ -1,4 +1,4 @@
-"""A training step of the README's KITTI filter with Table I's image sensor, beside its image trunk alone.
+"""A training step of the README's KITTI filter with Table I's image sensor, compared with its image trunk alone.
 
 64 sequences of 20 frames, 150x50x6, in single precision: filter, fair CRPS, backward, clipping, AdamW. Beside it, in
 the same rounds and on the same frames, the trunk's own forward and backward, once on all 1,280 frames in one call, as

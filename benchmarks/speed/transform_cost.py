@@ -61,7 +61,7 @@ class Reading(Transform):
 
 
 def kitti_filter() -> DEnKF:
-    """Returns the README's, with Table I's stochastic head on a reading in the place of the image sensor."""
+    """Returns the README's, with Table I's stochastic head on a reading instead of the image sensor."""
     return car_filter(lambda: VectorSensor(2, 2, in_key="reading"))
 
 

@@ -1,4 +1,4 @@
-"""The study's options, and the jobs of its table, each of which can be broken off and resumed."""
+"""The study's options, and the jobs of its table, each of which can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Study(Collections):
 
     collect: demos into --root. table: collect what is missing, train, test. pictures: plots of what a table left in
     --out. frontier: error against milliseconds a step of the filters that a table left there. members: DEnKFs that are
-    trained with few members, by localisation. What was broken off goes on where it stopped. See the README.
+    trained with few members, by localisation. An interrupted run resumes. See the README.
     """
 
     command: Positional[Literal["collect", "table", "pictures", "frontier", "members"]] = "table"

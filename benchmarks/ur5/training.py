@@ -43,7 +43,7 @@ def with_missing(recipe: UR5Recipe, codes: TensorDict) -> TensorDict:
 
 
 class WithHead(nn.Module):
-    """The filter's objective with the sensor's head in front, and the head's own beside it."""
+    """The filter's objective with the sensor's head in front, and the head's own in addition."""
 
     def __init__(self, objective: nn.Module, recipe: UR5Recipe):
         super().__init__()
@@ -68,7 +68,7 @@ def train_filter(
     budget: Budget,
     begin: Filter | None = None,
 ) -> Filter:
-    """Trains one filter on features of demos ``[N, T]``, or goes on where it was broken off.
+    """Trains one filter on features of demos ``[N, T]``, or resumes after an interruption.
 
     Args:
         recipe: with the trained sensor, whose head is changed.

@@ -137,7 +137,7 @@ plt.show()
 # %%
 # From here
 # ---------
-# * Videos and tables of your own, pictures in the place of the reading: :doc:`plot_own_recordings`.
+# * Videos and tables of your own, pictures instead of the reading: :doc:`plot_own_recordings`.
 # * A sensor of your own: give ``sensor=ImageSensor(...)``, see :doc:`/how_to/own_sensor`.
-# * The known equation in the place of the network: see :doc:`/how_to/own_dynamics`.
+# * The known equation instead of the network: see :doc:`/how_to/own_dynamics`.
 # * The same filter in an environment or in a policy: see :doc:`plot_policy` and :doc:`/start/three_ways`.

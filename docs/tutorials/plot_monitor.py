@@ -1,5 +1,5 @@
 r"""
-A sensor that fails without a word
+A sensor that fails silently
 ==================================
 
 An arm's joint has an encoder. One day the encoder slips: for a while it reads a few degrees too much. Nothing in the

@@ -184,4 +184,4 @@ assert apart < 0.5 * error("smoothed", torch.arange(STEPS) > 0)
 # From here
 # ---------
 # * Which smoother for which filter, masks, late readings, training through a smoother: :doc:`/how_to/smoothing`.
-# * Errors beside those of DAPPER, a library for data assimilation: :doc:`/results/smoothing`.
+# * Errors next to those of DAPPER, a library for data assimilation: :doc:`/results/smoothing`.

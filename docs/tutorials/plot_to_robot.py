@@ -82,7 +82,7 @@ assert abs(learned[1, 0] + 40 * DT) < 0.15
 # %%
 # The same random numbers everywhere
 # ----------------------------------
-# The filter draws random numbers in each step. ``draw_noise`` writes them beside the reading, and whatever runs the
+# The filter draws random numbers in each step. ``draw_noise`` writes them next to the reading, and whatever runs the
 # step then uses these numbers instead of its own. So several ways to run a step can be compared to the last digits.
 # Here the numbers of all steps are drawn in advance.
 

@@ -1,4 +1,4 @@
-"""Cache entries: what is opened is what was written, or it is made anew; nothing in them is executed."""
+"""Cache entries: what is opened is what was written, or it is made again; nothing in them is executed."""
 
 import json
 import logging
@@ -135,7 +135,7 @@ def truncate(file, *sizes):
 
 
 def replace_by(make):
-    """Puts something else in the place of a file."""
+    """Replaces a file by something else."""
 
     def replace(file):
         file.unlink()

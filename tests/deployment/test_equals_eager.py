@@ -1,7 +1,7 @@
 """A packaged step gives the eager step's numbers where there is more to trace than plain arithmetic.
 
 Jacobians by automatic differentiation, a Gauss-Newton search, an LSTM cell: traced wrongly, each gives a package that
-runs without a word, and is wrong.
+runs silently, and is wrong.
 """
 
 import pytest

@@ -29,7 +29,7 @@ def by_hand(data):
 
 
 def test_episodes_that_end_apart():
-    """Rows of 3, 5 and 4 steps: each begins anew, and the others keep what they hold."""
+    """Rows of 3, 5 and 4 steps: each is reset, and the others keep what they hold."""
     env = held_env(batch_size=[3], max_steps=[3, 5, 4])
     data = env.rollout(60, break_when_any_done=False)
     assert (data["step"] == 0).sum((1, 2)).tolist() == [20, 12, 15]

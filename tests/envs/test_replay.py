@@ -63,7 +63,7 @@ def same(shown, data, row):
 def test_every_data_set_replays_its_rows(data, batch_size):
     env = ReplayEnv(data, batch_size=batch_size, length=4)
     check_env_specs(env)
-    env.set_seed(0)  # the turn begins anew
+    env.set_seed(0)  # the turn is reset
     rollout = env.rollout(100)
     assert rollout.batch_size == (*batch_size, 3)
     count = max(1, torch.Size(batch_size).numel())

@@ -154,7 +154,7 @@ def test_steps_are_the_sequence(float64, name):
     row, rows = filter.initialise(frames[:, 0].copy()), []
     for t in range(7):
         row = frames[:, t].copy().update(row.select(*filter.carry_keys))
-        row = filter(row)  # a start starts anew
+        row = filter(row)  # a start starts again
         rows.append(row)
     assert_equal(torch.stack(rows, 1), expected, filter.out_keys, atol=1e-10)
     with set_recurrent_mode(True):

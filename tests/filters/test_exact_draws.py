@@ -153,7 +153,7 @@ def test_on_a_circle_members_lie_on_both_sides_of_the_turn():
 def test_a_gate_that_never_acts_changes_no_perturbation(space):
     """Each run of its analysis makes the draws exact for the predictions that are aligned there."""
     dim, start = space.tangent_dim, torch.zeros(space.point_dim).index_fill(0, torch.tensor([0]), 3.0)
-    start = space.plus(space.normalise(start), torch.zeros(dim))  # beside the turn of a circle
+    start = space.plus(space.normalise(start), torch.zeros(dim))  # next to the turn of a circle
     filter = DEnKF(
         LearnedTransition(nn.Identity(), residual=False),
         None,

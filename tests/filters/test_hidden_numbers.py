@@ -50,7 +50,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 class Stays(SubModel):
-    """States that stay where they are, but for noise."""
+    """States that stay where they are, except for noise."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("belief", "ensemble")], [("forecast", "ensemble")])

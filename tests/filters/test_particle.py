@@ -96,5 +96,5 @@ def test_gradient_through_a_sequence_by_finite_differences(float64):
     loss = lambda: filter.sequence(frames.copy())["belief", "mean"].square().sum()  # noqa: E731
     loss().backward()
     parts = [filter[name] for name in ("transition", "observation", "noise")]
-    # A particle that is picked anew within 1e-6 would show as a difference of order 1e6.
+    # A particle that is picked again within 1e-6 would show as a difference of order 1e6.
     assert check_largest_gradients(parts, loss, rtol=1e-5, atol=1e-7) >= 8

@@ -128,7 +128,7 @@ def test_what_ends_an_episode_starts_the_next_unless_beginnings_are_marked(float
 
 
 def test_other_modules_make_a_new_filter():
-    """The filter itself stays as it is, and the modules of both are the same but for the new one."""
+    """The filter itself stays as it is, and the modules of both are the same except for the new one."""
     filter = blocks(named=True)
     frames = TensorDict({"y0": torch.randn(5, 1), "y1": torch.randn(5, 1)}, [5])
     before = filter.structure

@@ -94,7 +94,7 @@ def test_flat_slices_are_the_slices():
     flat = torch.cat([whole[start : start + 5] for start in starts])
     expected = flat.clone()
     flat["is_init"] = (torch.arange(15) % 5 == 0).unsqueeze(-1)
-    torch.nn.init.normal_(flat["forecast", "ensemble"])  # what follows from the belief is computed anew
+    torch.nn.init.normal_(flat["forecast", "ensemble"])  # what follows from the belief is computed again
     out = filter.sequence(flat)
     close(out, expected, BELIEF)
     inside = ~flat["is_init"].squeeze(-1)
@@ -121,7 +121,7 @@ def policy_data(filter, *, anew=()):
 @every_filter
 @pytest.mark.parametrize("anew", [(), (3,), (0, 5)])
 def test_every_element_is_a_step_diagnostics_and_all(name, anew):
-    """Without a belief before it, an element starts anew: not from what the policy stored for its actor."""
+    """Without a belief before it, an element is reset: not from what the policy stored for its actor."""
     filter = FILTERS[name]()
     data, steps = policy_data(filter, anew=anew)
     close(filter.sequence(data.copy()), steps, filter.out_keys)

@@ -350,7 +350,7 @@ def test_the_mean_of_moved_points_is_the_moved_mean(space):
     weights, move = torch.rand(12).softmax(-1), points(space)
     mean = space.mean(members, weights)
     left = space.mean(space.compose(move.expand_as(members), members), weights)
-    # The same numbers, but for rounding; of an opposite space they turn.
+    # The same numbers, up to rounding; of an opposite space they turn.
     loose = {"rtol": 0, "atol": 1e-7} if isinstance(space, Opposite) else {}
     assert_same_points(space, left, space.compose(move, mean), **loose)
     right = space.mean(space.compose(members, move.expand_as(members)), weights)

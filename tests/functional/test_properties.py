@@ -182,7 +182,7 @@ def test_sigma_points_have_the_moments(seed, batch, states, scale, spread, dtype
     found, found_cov = unscented_moments(points, weights)
     near = max(scale, spread)
     torch.testing.assert_close(found / near, mean / near, rtol=1e-9, atol=1e-9)
-    limit = 1e-7 + 1e-13 * (scale / spread) ** 2  # what is left of a spread that is small beside the mean
+    limit = 1e-7 + 1e-13 * (scale / spread) ** 2  # what is left of a spread that is small compared with the mean
     outer = units * units.unsqueeze(-1)
     torch.testing.assert_close(found_cov / outer, cov / outer, rtol=limit, atol=limit)
     assert sigma_points(mean.to(dtype), cov.to(dtype)).dtype == dtype

@@ -188,7 +188,7 @@ def test_the_transform_looks_ahead_as_a_sequence_does(options):
     filter = kalman(update_at_reset=True, **options)
     env = late_world(filter)
     check_env_specs(env)
-    data = env.rollout(9, break_when_any_done=False)  # a row starts anew within it, twice
+    data = env.rollout(9, break_when_any_done=False)  # a row is reset within it, twice
     rows = data.select("observation", "observed", NEXT, ("next", "done")).set("action", data[NEXT][:, :, 0])
     expected = BeliefAhead(filter, K)(filter.sequence(rows))
     keys = [("ahead", *filter.outer(("belief", name))) for name in ("mean", "var")]

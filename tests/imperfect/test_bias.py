@@ -92,7 +92,7 @@ def test_biases_stay_as_large_and_are_correlated_as_said():
 
 
 def test_a_likelihood_learns_size_and_time():
-    """At the true values the slope of the readings' likelihood is zero but for chance: on many runs it is small."""
+    """At the true values the slope of the readings' likelihood is zero on average: on many runs it is small."""
     _, transition, q, observation, r = parts()
     bias = FadingBias(torch.tensor(STD, dtype=torch.double), TIME)
     for part in (transition, q, observation):

@@ -126,7 +126,7 @@ def test_a_lag_goes_inside_of_what_goes_around(name):
 
 
 def test_a_wrapper_in_a_filter_and_in_its_fixed_lag(float64):
-    """A share of 1 changes nothing but for rounding, in a step, in a sequence and with a lag; noise keeps its place."""
+    """A share of 1 changes nothing up to rounding, in a step, in a sequence and with a lag; noise keeps its place."""
     _, _, H, _ = linear_system()
     frames = TensorDict({"observation": torch.randn(3, 6, len(H)), "observed": torch.rand(3, 6, 1) < 0.8}, [3, 6])
     plain, around = linear_denkf("perturbed"), linear_denkf("perturbed")

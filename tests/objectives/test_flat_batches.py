@@ -148,7 +148,7 @@ def rows_of(count=12):
 
 
 def with_next(rows, breaks_at=None):
-    """``rows`` and a ``"next"`` part that is what follows, but for one break."""
+    """``rows`` and a ``"next"`` part that is what follows, except for one break."""
     following = torch.roll(rows["observation"], -1, 0).clone()
     if breaks_at is not None:
         following[breaks_at - 1] += 1.0

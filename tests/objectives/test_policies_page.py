@@ -1,4 +1,4 @@
-"""The programs of the page on policies: which gradients reach the filter, and what is filtered anew."""
+"""The programs of the page on policies: which gradients reach the filter, and what is filtered again."""
 
 from functools import cache
 

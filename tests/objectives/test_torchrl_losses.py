@@ -194,7 +194,7 @@ def critics_by_hand(data, roots, nexts, head, q):
 
 
 def filtered(filter, batch):
-    """Puts what the filter believes now in the place of what it believed while it collected, as on the page."""
+    """Replaces the beliefs stored at collection by those of the present filter, as on the page."""
     with set_recurrent_mode(True):
         filter(batch)
         for key in filter.carry_keys:
@@ -257,7 +257,7 @@ def test_sac_on_what_the_filter_believes_now(float64):
 
 @pytest.mark.parametrize("vmap", [True, False])
 def test_sac_with_the_filter_in_the_critic_too(float64, vmap):
-    """``separate_losses`` alone leaves the filter its weights; otherwise torchrl draws a critic's weights anew."""
+    """``separate_losses`` alone leaves the filter its weights; otherwise torchrl draws a critic's weights again."""
     filter, frames = filter_and_frames()
     data = collected(filter, frames)
     actor, head, options = sac(filter, inside=True)

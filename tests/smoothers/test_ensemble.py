@@ -144,7 +144,7 @@ def test_damping_holds_the_inflation_that_goes_back(float64):
 
 @pytest.mark.parametrize("lag", [None, 1])
 def test_inflation_needs_a_damping(float64, lag):
-    """A direction that nobody reads: without a word the smoothed spread was that of the filter times the inflation."""
+    """In an unobserved direction the smoothed spread is not the filter's times the inflation."""
     frames = drive(2, 8, missing=0.0, resets=False)
     filter = DEnKF(
         NoisyLinear(torch.eye(2)),

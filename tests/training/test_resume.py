@@ -1,4 +1,4 @@
-"""Killed with SIGKILL and started again: every file is that of a training that was never broken off."""
+"""Killed with SIGKILL and started again: every file is that of a training that was never interrupted."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""The belief of t - lag beside that of t, in environments: specs, workers, resets, and the smoother as the oracle."""
+"""The belief of t - lag next to that of t, in environments: specs, workers, resets, and the smoother as the oracle."""
 
 import pytest
 import torch

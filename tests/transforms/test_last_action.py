@@ -1,4 +1,4 @@
-"""The action that led to an observation: beside it, zero after a reset, in every kind of environment."""
+"""The action that led to an observation: in the same row, zero after a reset, in every kind of environment."""
 
 import torch
 from torchrl.envs import SerialEnv, TransformedEnv

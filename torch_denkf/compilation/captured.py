@@ -372,7 +372,7 @@ def _own_tensors(part: nn.Module) -> Iterator[Tensor]:
 
 @contextmanager
 def _in_place(aliases: Sequence[tuple[dict, dict]]) -> Iterator[None]:
-    """Puts aliases in the place of parameters and buffers."""
+    """Replaces parameters and buffers by aliases."""
     before = [(table, dict(table)) for table, _ in aliases]
     try:
         for table, others in aliases:

@@ -72,7 +72,7 @@ def rts_in_time(
 ) -> tuple[Tensor, Tensor]:
     """Does what :func:`~torch_denkf.functional.smoothing.rts.rts_smooth` does for plain numbers and all later readings.
 
-    It takes three times the arithmetic of one step after the other, and one call for each level in the place of one for
+    It takes three times the arithmetic of one step after the other, and one call for each level instead of one for
     each step.
 
     Args:

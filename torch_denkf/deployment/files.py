@@ -125,7 +125,7 @@ def replacing(file: str | Path) -> Iterator[Path]:
     with clear_errors(file, beside=file.parent / _WRITING), place_beside(file) as beside:
         beside.touch()
         yield beside
-        sync(beside)  # else a power failure could put an empty file in the place of a good one
+        sync(beside)  # else a power failure could put an empty file instead of a good one
         os.replace(beside, file)
         sync(file.parent)
 

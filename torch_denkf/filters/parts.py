@@ -156,7 +156,7 @@ class FilterParts:
         return {name: value for name, value in found.items() if value is not None}
 
     def in_order(self, **others: TensorDictModuleBase | None) -> OrderedDict[str, TensorDictModuleBase]:
-        """Returns the modules by name, the ``others`` last, but for ``None``; the ``analysis`` heeds a visibility."""
+        """Returns the modules by name, without ``None``, the ``others`` last; ``analysis`` gets the visibility."""
         if self.visibility is not None:
             others["analysis"] = self.visibility.heeded_by(others["analysis"])
         named = {"sensor": self.sensor, "visibility": self.visibility, "noise": self.noise, **others}

@@ -192,7 +192,7 @@ def _unbound(entries: Entries, time: int, count: int) -> list[Entries]:
 
 
 def _masked(module: Update, entries: Entries, call: Call) -> Entries:
-    """Returns the entries with ones in the place of missing observations, and a mask that says so."""
+    """Returns the entries with ones instead of missing observations, and a mask that says so."""
     like = next(entries[key] for key in module.in_keys if key in entries)
     dims = zip(module.reading_keys, module.reading_dims(entries, call), strict=True)
     ones = {

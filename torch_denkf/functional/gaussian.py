@@ -147,7 +147,7 @@ def innovation_update(
 
 
 def hide(observed: Tensor, noise: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns a mask of each component, R ``[*B, O, O]`` with ones in the place of the others, and how many they are.
+    """Returns a mask of each component, R ``[*B, O, O]`` with ones instead of the others, and how many they are.
 
     Args:
         observed: ``[*B, 1]`` or ``[*B, O]``.

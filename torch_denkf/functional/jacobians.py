@@ -76,7 +76,7 @@ def is_older(kind: type, names: Set[str], others: Set[str]) -> bool:
 
 
 def _flat(network: nn.Module) -> Iterator[nn.Module]:
-    """Yields the layers of sequences, and of those in them, but for the identity."""
+    """Yields the layers of sequences, and of those in them, except for the identity."""
     if type(network) is nn.Sequential and not _hooked(network):
         for layer in network:
             yield from _flat(layer)

@@ -84,7 +84,7 @@ def semidefinite_solve(cov: Tensor, right: Tensor, *, spare: float = 0) -> Tenso
     Args:
         cov: P, ``[*B, N, N]``, symmetric positive semi-definite.
         right: Y, ``[*B, N, M]``.
-        spare: is added to the correlations' diagonal where P is not positive semi-definite, but for rounding.
+        spare: is added to the correlations' diagonal where P is not positive semi-definite, up to rounding.
 
     Returns:
         X, ``[*B, N, M]``; NaN where P is not positive semi-definite.

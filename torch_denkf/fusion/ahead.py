@@ -21,7 +21,7 @@ __all__ = ["BeliefAhead"]
 
 
 class BeliefAhead(Checked, TensorDictModuleBase):
-    """Writes the belief of the moment when the next action will run, beside the belief of now.
+    """Writes the belief of the moment when the next action will run, next to the belief of now.
 
     Between a reading and the action that follows from it a robot needs time, and moves on by the actions that were sent
     before. The belief of now is forecast through these, one step of the filter after the other, with its process noise:

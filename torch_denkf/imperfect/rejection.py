@@ -182,7 +182,7 @@ class RejectReadings(Checked, Transform):
         Args:
             key: of the reading.
             tensordict: with the reading.
-            written: gets the reading, and its noise, with neutral numbers in the place of bad ones.
+            written: gets the reading, and its noise, with neutral numbers instead of bad ones.
         """
         size, value = tensordict.ndim, entry_of(tensordict, key, "RejectReadings", "Rename it in the constructor.")
         good, neutral = self._within(value), value.new_zeros(())
@@ -215,7 +215,7 @@ class RejectReadings(Checked, Transform):
         return value.abs() <= min(self.limit, torch.finfo(value.dtype).max)  # also false for NaN
 
     def _judged_noise(self, noise: Tensor, size: int) -> tuple[Tensor, Tensor]:
-        """Tells which variances ``[*B, O]`` are some, and returns them with ones in the place of others."""
+        """Tells which variances ``[*B, O]`` are some, and returns them with ones instead of others."""
         good = self._within(noise)
         if noise.ndim < size + 2:
             good = good & (noise >= 0)

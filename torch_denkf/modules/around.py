@@ -80,7 +80,7 @@ class Wrapper(SubModel):
 
 
 def passes_on(kind: type[SubModel]) -> Callable[[type[W]], type[W]]:
-    """Lets a class of wrappers pass on all that a role declares, but for what the class defines itself."""
+    """Lets a class of wrappers pass on all that a role declares, except for what the class defines itself."""
 
     def passing(wrapper: type[W]) -> type[W]:
         for name in vars(kind):

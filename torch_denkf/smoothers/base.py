@@ -97,7 +97,7 @@ class Smoother(Checked, TensorDictModuleBase):
     def _filter_for(self, count: int) -> Filter:
         """Returns the filter that runs on sequences of ``count`` steps; made again where a module has been replaced."""
         own = self.lag if self.lag is not None else max(count - 1, 1)
-        lag = own if self._by_lag else None  # another filter would compile anew
+        lag = own if self._by_lag else None  # another filter would compile again
         if self._running[0] != lag or self._running[1] is not self.filter.structure:
             self._running = (lag, self.filter.structure, self._extended(lag))
         filter, compiled = self._running[2], self.filter.compiled

@@ -23,7 +23,7 @@ from torch_denkf.submodel import Call, Entries
 
 __all__ = ["ParticleSmoother"]
 
-_STILL = 1e-12  # variance in the place of none
+_STILL = 1e-12  # variance instead of none
 
 
 class ParticleSmoother(Smoother):

@@ -44,8 +44,8 @@ class Stage:
             returns one of torch's schedulers; it is stepped after each update.
         clip: largest norm of the gradient; ``None`` for no limit.
         lengths: sequence lengths, ``{from_update: length}``, e.g. ``{0: 4, 500: 16}``: short ones first.
-        validate: in the place of the trainer's, e.g. where a sensor is trained alone.
-        monitor: in the place of the trainer's.
+        validate: instead of the trainer's, e.g. where a sensor is trained alone.
+        monitor: instead of the trainer's.
 
     Raises:
         ValueError: on a bad name, no updates, an unknown schedule, or lengths that say nothing about update 0.

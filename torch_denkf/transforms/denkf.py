@@ -63,7 +63,7 @@ class DEnKFTransform(Checked, Transform):
         check_finite: whether a belief that is not finite raises; on a GPU, which a step would wait for, none does.
             Where an environment emits readings that are not finite, put ``torch_denkf.imperfect.RejectReadings`` in
             front.
-        ahead: writes the belief of a later moment beside that of now: :class:`~torch_denkf.fusion.BeliefAhead`.
+        ahead: writes the belief of a later moment next to that of now: :class:`~torch_denkf.fusion.BeliefAhead`.
         packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step` (native code:
             load only what you would execute). At B=1 it is ten times as fast as the filter itself. It has the
             parameters of its export, is for environments of the batch size of the export, and not for use inside a

@@ -83,7 +83,7 @@ def read_heads(
 def with_head(
     sensors: Sequence[ImageSensor], codes: TensorDict, size: int, generator: torch.Generator | None = None
 ) -> TensorDict:
-    """Codes with ``("sensor", "ensemble")`` and ``("sensor", "encoding")`` in the place of features."""
+    """Codes with ``("sensor", "ensemble")`` and ``("sensor", "encoding")`` instead of features."""
     samples, encoding = read_heads(sensors, codes["code"], size, generator)
     out = codes.exclude("code")
     out["sensor"] = TensorDict({"ensemble": samples, "encoding": encoding}, batch_size=out.batch_size)

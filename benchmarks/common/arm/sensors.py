@@ -94,7 +94,7 @@ def train_sensor(
     lr: float,
     weight_decay: float,
 ) -> ImageSensor:
-    """Trains a sensor, or goes on where that was broken off, or reads it where it was done.
+    """Trains a sensor, or resumes after an interruption, or reads it where it was done.
 
     Args:
         sensor: trained in place.

@@ -85,7 +85,7 @@ class SpeedGain(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.register_buffer("logarithm", torch.zeros(()), persistent=False)  # it lies beside the weights
+        self.register_buffer("logarithm", torch.zeros(()), persistent=False)  # it lies next to the weights
 
     def forward(self, velocity: torch.Tensor) -> torch.Tensor:
         """Predicts (v, theta_dot) ``[*, 2]``."""

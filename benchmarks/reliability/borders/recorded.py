@@ -187,7 +187,7 @@ def _rows_kept(result: TensorDict) -> bool:
 
 
 def _video_shown(result: TensorDict) -> bool:
-    """Tells whether every row that counts as seen shows its own picture, but for a codec's rounding."""
+    """Tells whether every row that counts as seen shows its own picture, except for a codec's rounding."""
     expected = V3.reference()
     seen = result["observed"].squeeze(-1)
     numbers = [key for key in expected.keys(True, True) if key != "pixels" and key != "observed"]

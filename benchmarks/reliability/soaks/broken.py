@@ -1,4 +1,4 @@
-"""Work that is broken off: by kills at random moments, by disks that are full or read-only, by a second process.
+"""Work that is interrupted: by kills at random moments, by disks that are full or read-only, by a second process.
 
 Each work writes to a folder. Started again, it is to end as if nothing had happened, and to leave nothing half written.
 """
@@ -179,7 +179,7 @@ def left_behind(folder: Path) -> list[str]:
 
 @contextmanager
 def two_folders() -> Iterator[tuple[Path, Path, Path]]:
-    """One folder for work that is broken off, one for work that is not, and a file for what is said."""
+    """One folder for work that is interrupted, one for work that is not, and a file for what is said."""
     with tempfile.TemporaryDirectory(prefix="broken-", ignore_cleanup_errors=True) as root:
         broken, sound = Path(root, "broken"), Path(root, "sound")
         broken.mkdir()

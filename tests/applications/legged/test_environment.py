@@ -26,7 +26,7 @@ def log():
 
 
 def test_the_sensors_read_how_their_place_moves():
-    """Its place is beside the base's origin, turned. With the simulator's own steps: contacts are short."""
+    """Its place is next to the base's origin, turned. With the simulator's own steps: contacts are short."""
     env = LeggedEnv(quadruped_env().model, **QUADRUPED, dt=0.0025, errors=PERFECT)
     log = trotting(env, 800).double()
     sensor = LegKinematics(env.model, QUADRUPED["feet"], QUADRUPED["imu"]).base.double()

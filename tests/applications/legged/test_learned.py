@@ -82,8 +82,8 @@ def test_a_foot_walks_as_its_noise_says():
 
 
 @pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
-def test_untrained_they_are_the_noises(kind, model, log):
-    """Constant covariances are those of LeggedNoises(slip=, rate=); a foot walks for each step anew."""
+def test_untrained_covariances_equal_legged_noises(kind, model, log):
+    """Constant covariances are those of LeggedNoises(slip=, rate=); slip is independent in each step."""
     rate, slip = LASTS**0.5 * RATE, (0.01 * LASTS) ** 0.5 * RATE
     rows, options = with_last_rows(log, 10), {"dt": 0.01, "kind": kind, "ensemble_size": 16}
     velocities = []

@@ -179,7 +179,7 @@ def test_two_files_of_a_boat(tmp_path):
 
 
 def test_a_pose_alone(tmp_path, capsys):
-    """A heading beside x and y is read; a filter of one sensor has its distances without a name."""
+    """A heading next to x and y is read; a filter of one sensor has its distances without a name."""
     time = np.arange(0, 10, 0.1)
     circle = np.c_[time, np.sin(time), 1 - np.cos(time), (time + np.pi) % (2 * np.pi) - np.pi]
     np.savetxt(

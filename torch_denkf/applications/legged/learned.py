@@ -131,7 +131,7 @@ class LearnedContacts(Sensor):
     def features(
         self, imu: Tensor, joints: Tensor, rates: Tensor, contact: Tensor, *, rows: int | None = None
     ) -> Tensor:
-        """Returns the network's inputs for each foot, ``[*B, F, 16 K]``; ``rows`` in the place of K."""
+        """Returns the network's inputs for each foot, ``[*B, F, 16 K]``; ``rows`` instead of K."""
         rows, kinematics = self.rows if rows is None else rows, self.kinematics
         like = kinematics.base
         sizes = 6, len(kinematics.joints), len(kinematics.joints), len(kinematics.feet)

@@ -160,7 +160,7 @@ def read_config(config: Mapping[str, Any] | str | Path) -> Config:
 
 
 def write_config(config: Config, path: Path, changed: Mapping[str, Any]) -> None:
-    """Writes the parameters as they were given, but for some, for robot_localization to read.
+    """Writes the parameters as they were given, except for some, for robot_localization to read.
 
     Raises:
         ImportError: without PyYAML.

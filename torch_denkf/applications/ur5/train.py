@@ -159,7 +159,7 @@ def _train_sensor(
 
 @torch.no_grad()
 def read_demos(model: UR5TableFilter, demos: TensorDict, seed: int = 0) -> TensorDict:
-    """Runs the sensor on whole demos ``[N, T]``: samples and encodings in the place of the pixels."""
+    """Runs the sensor on whole demos ``[N, T]``: samples and encodings instead of the pixels."""
     parts = []
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

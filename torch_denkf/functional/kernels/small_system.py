@@ -52,7 +52,7 @@ def on_gpu(tensor: Tensor) -> bool:
 
 
 def identity_of(matrix: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    """Returns the identity ``[N, N]`` beside matrices ``[*B, N, N]``; not to be written to."""
+    """Returns the identity ``[N, N]`` next to matrices ``[*B, N, N]``; not to be written to."""
     size, dtype, device = matrix.shape[-1], dtype or matrix.dtype, matrix.device
     return made_once(("identity", size, dtype, device), lambda: torch.eye(size, dtype=dtype, device=device))
 

@@ -89,7 +89,7 @@ class Space:
         raise NotImplementedError
 
     def normalise(self, point: Tensor) -> Tensor:
-        """Returns the nearest point to numbers ``[*, P]`` that are one but for rounding, or that a network gave."""
+        """Returns the nearest point to numbers ``[*, P]`` that are one up to rounding, or that a network gave."""
         return point
 
     def plus(self, point: Tensor, tangent: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ LONGEST = 3
 
 
 def readings(values, observed=True, longest=1):
-    """Reads by two members, half a unit beside the values; for n steps n times as much, as at a constant speed."""
+    """Reads by two members, half a unit off the values; for n steps n times as much, as at a constant speed."""
     values = torch.as_tensor(values)
     samples = values.unsqueeze(1) + torch.tensor([-0.5, 0.5])[None, :, None]
     spans = torch.stack([n * samples for n in range(1, LONGEST + 1)], 1)

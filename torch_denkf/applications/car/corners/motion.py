@@ -104,9 +104,9 @@ def corner_motion(
 ) -> CornerMotion:
     """Returns the most likely motion by Gauss-Newton, on the corners' places and disparities.
 
-    Each corner's place in space is known but for the noise of the earlier row. That noise goes through the motion into
-    what the later row should show, so that a far corner says much of the turn and little of the way. Students's t
-    weights a corner by what is left of it.
+    The position of each corner has the noise of the earlier row. The motion carries that noise into the prediction of
+    the later row, so that a far corner informs the rotation much and the translation little. Student's t weights each
+    corner by its residual.
 
     Args:
         before: corners (u, v, disparity) of the earlier row, ``[*B, N, 3]`` in pixels.

@@ -80,7 +80,7 @@ def train_car_filter(
     1. the sensor alone, by the CRPS of its samples against the true velocities;
     2. the filter on the frozen sensor's readings, by the CRPS of its belief. Some frames are lost on purpose, and
        windows begin at a wrong velocity, or the filter would learn to ignore its sensor;
-    3. both end to end, but for the noise model, which knows by now how wrong the sensor is on new drives;
+    3. both end to end, except for the noise model, which knows by now how wrong the sensor is on new drives;
     4. one number, the inflation, by the CRPS of the velocities times the path's error on the validation drives.
 
     A call that is repeated goes on where the last one ended, also after a kill, and leaves the same weights.
