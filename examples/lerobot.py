@@ -134,7 +134,7 @@ def make_filter(data: LeRobotReplay) -> DEnKF:
     # () learn other motions, too.
     motion = StochasticMLP(joints + (row["action"].shape[-1] if driven else 0), joints, (), output_gain=0.0)
     motion.requires_grad_(driven)
-    wind = (0.1 if driven else 0.3) * scale  # what moves joints in a step in addition to their commands, before training
+    wind = (0.1 if driven else 0.3) * scale  # process noise of the joints, before training
     wind = ConstantNoise(wind, trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return DEnKF(
         transition=LearnedTransition(motion, loc=loc, scale=scale, **commands),

@@ -256,7 +256,7 @@ def picture(data: TensorDict, pull: float, path: Path) -> None:
 def page(rows: list[dict], study: Study) -> str:
     """Returns the table."""
     lines = [
-        "# Which way is up",
+        "# Attitude from an inertial sensor",
         "",
         "Tilt is the angle between where up is and where it is thought to be; orientation is the angle of the whole "
         f"error, heading included. Root mean squares. Simulated: {study.runs} runs of {study.seconds:g} s, without "

@@ -138,7 +138,8 @@ def page(found: Sequence[dict], study: Study) -> str:
         subset = pick(own, condition="as it is")
         for sensors in dict.fromkeys(row["sensors"] for row in subset):
             lines.append(line(sensors, *(middle(pick(subset, sensors=sensors, method=method)) for method in METHODS)))
-        lines += ["", f"A sensor fails for {SECONDS:g} s, unannounced; the error in that time, compared with the error of the"]
+        fails = f"A sensor fails for {SECONDS:g} s, unannounced; the error in that time, compared with the error of the"
+        lines += ["", fails]
         lines += ["filter that never had the sensor, in the same time.", ""]
         lines += head("fault", "plain", "weights", "never had it", "plain, times", "weights, times", "worst training")
         failing = [row for row in own if "error_ratio" in row]

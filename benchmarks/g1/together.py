@@ -1,4 +1,4 @@
-"""Camera, encoders and commands of the arm together, each with errors that last: ``python -m benchmarks.g1.together``.
+"""Camera, encoders and commands of the arm together, each with coloured noise: ``python -m benchmarks.g1.together``.
 
 All filters run on what one camera sensor reads. Their motion is learned from true states, all else is taken from
 residuals: no filter is trained.

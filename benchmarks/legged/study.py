@@ -181,7 +181,7 @@ def still(robot: Robot) -> dict[str, float]:
 def page(frame: pd.DataFrame, study: Study) -> str:
     """Returns the table."""
     lines = [
-        "# How fast is the base",
+        "# Velocity of a legged base",
         "",
         "Velocity is the root mean square error of the base's velocity, all three axes together, in the base's axes; "
         "tilt that of where up is. Drift is how far the end of the path is off, over the path's length. NEES is the "

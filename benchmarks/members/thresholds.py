@@ -154,7 +154,7 @@ def main() -> None:
     }
     for name, task in others.items():
         tasks[name] = task.validate(8 if small else 512, None), task.validate
-    lines = ["# Which threshold?", "", *head("task", "members", "none", *study.thresholds)]
+    lines = ["# Threshold of significance", "", *head("task", "members", "none", *study.thresholds)]
     for name, (reference, score) in tasks.items():
         for members in (8,) if small else study.members:
             able = [one for one in study.thresholds if one**2 < members - 1]

@@ -29,7 +29,7 @@ SETTINGS = ("rate", "margin", "reference", "gate_margin")
 
 @dataclass(frozen=True)
 class Study:
-    """Faults that nobody announces, on the UR5 and on KITTI, with the weights that come with the package."""
+    """Unannounced faults on the UR5 and on KITTI, with the weights that come with the package."""
 
     root: Path | None = None  # KITTI's folder with sequences and poses; without it there is no task kitti-real
     out: Path = Path("runs/monitor")  # also holds demos, rendered drives and readings
@@ -96,7 +96,7 @@ def trials_of(study: Study, task: str) -> list[dict]:
 
 def choice_page(rows: Sequence[dict], study: Study) -> str:
     """Everything that was tried, and what is chosen."""
-    lines = ["# What is chosen, and on what", ""]
+    lines = ["# Chosen settings", ""]
     lines += head("trial", "setting", "score")
     for row in rows:
         said = ", ".join(f"{key} {row[key]:g}" for key in SETTINGS if key in row)
@@ -114,7 +114,7 @@ def choice_page(rows: Sequence[dict], study: Study) -> str:
 
 def page(rows: Sequence[dict], study: Study) -> str:
     """Returns two tables: alarms, and errors."""
-    lines = ["# Faults that nobody announces", ""]
+    lines = ["# Unannounced faults", ""]
     lines += head("task", "fault", "AUROC", "delay, steps", "found", "alarms in 1,000 sound steps", "error afterwards")
     for row in rows:
         if "auroc" in row:

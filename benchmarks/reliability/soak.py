@@ -1,4 +1,4 @@
-"""Runs that last: a million steps, kills, full disks, many workers."""
+"""Long runs: a million steps, kills, full disks, many workers."""
 
 from __future__ import annotations
 

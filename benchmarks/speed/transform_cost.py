@@ -158,7 +158,7 @@ def rows(seconds: float) -> list[Row]:
 def table(found: dict[str, Timings], command: str, elapsed: float) -> str:
     """Returns the Markdown page."""
     lines = [
-        "# What DEnKFTransform costs",
+        "# Cost of DEnKFTransform",
         "",
         "One environment, E = 32, one thread, processor time, no image read; medians over rounds of all three kinds in",
         "turn. A step is `env.step_and_maybe_reset(env.rand_action(...))`. Filter: `DEnKFTransform(filter)`; packaged:",

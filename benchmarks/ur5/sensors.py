@@ -146,7 +146,7 @@ CELLS = (128, 64)
 
 
 def keypoint_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
-    """Returns a better one: places of features together with a coarse view, coordinate channels, J6 by twice its angle."""
+    """Returns a better network: keypoints and a coarse view, coordinate channels, J6 by twice its angle."""
     head = {"num_cells": CELLS, "layer": "dropout", "rate": 0.05}
     return camera_sensor(facts, keypoint_trunk(), samples, *_moments(facts), **head)
 

@@ -1,4 +1,4 @@
-"""A robot on wheels: a gyro at 100 Hz, wheels at 20 Hz, GPS at 1 Hz, and two errors that last."""
+"""A robot on wheels: a gyro at 100 Hz, wheels at 20 Hz, GPS at 1 Hz, and two biases."""
 
 from __future__ import annotations
 

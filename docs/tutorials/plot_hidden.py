@@ -182,4 +182,4 @@ plt.show()
 # %%
 # From here
 # ---------
-# * :doc:`/how_to/hidden`: labels, what to do without them, and errors that last while the camera sees.
+# * :doc:`/how_to/hidden`: labels, what to do without them, and coloured noise while the camera sees.

@@ -1,5 +1,5 @@
 r"""
-Look back: where was the robot?
+Smoothing: where was the robot?
 ===============================
 
 A robot drives through a hall. It counts the turns of its wheels, so it knows how far it drives and how much it turns in

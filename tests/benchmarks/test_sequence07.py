@@ -64,7 +64,7 @@ def test_intervals_hold_what_they_claim_of_errors_that_are_drawn():
 
 @pytest.mark.parametrize("kind", ["EKF", pytest.param("DEnKF", marks=pytest.mark.slow)])
 def test_relative_motions_are_as_far_off_as_a_filter_claims(kind):
-    """Drives that are what the filter takes them for, with errors that last: over 1, 10 and 100 rows."""
+    """Drives that are what the filter takes them for, with coloured noise: over 1, 10 and 100 rows."""
     data, poses = driven()
     options = {} if kind == "EKF" else {"members": 64, "localisation": "significance"}
     means = run(car_filter(kind, **options), prepared(data))["belief", "mean"]

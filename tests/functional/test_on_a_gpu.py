@@ -59,7 +59,7 @@ def test_division_by_a_matrix_that_is_not_symmetric(float64, as_on_a_gpu):
 @pytest.mark.parametrize("largest", [0.0, 1e-8, 1.0, 1e3, 1e6])
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float64, 6e-15), (torch.float32, 6e-7)])
 def test_square_root_without_eigenvalues(as_on_a_gpu, function, largest, dtype, error):
-    """Its error compared with eigenvalues in double precision: a few roundings, and what the matrix's own rounding makes."""
+    """The error against eigenvalues in double precision is a few roundings, plus that of the matrix itself."""
     gram = covariance(6, 4, rank=4)  # of four directions
     gram = gram * largest / torch.linalg.matrix_norm(gram, 2)[..., None, None]
     exact = function(gram)

@@ -85,7 +85,7 @@ class FusedFilter(Filter):
     Raises:
         ValueError: if there is no sensor, a delay is negative or beyond the lag, process noise is missing or given
             twice, an analysis inflates or relaxes where it must not or names a ``reading_space``, or a sensor has
-            errors that last and its readings live on a space.
+            coloured noise and its readings live on a space.
         TypeError: for particles, sensors that are no dict, an analysis instead of what makes it, or one that
             cannot correct earlier states.
 

@@ -53,7 +53,7 @@ def learn_noises(
 ) -> Learned:
     """Learns how large noises and drifts are, so that the fixes of a log are likely where they are hidden.
 
-    The likelihood of each next reading says little of errors that last. So the log is cut into segments of three
+    The likelihood of each next reading tells little about coloured noise. So the log is cut into segments of three
     windows, each from the filter's belief at that time; fixes of the middle window are hidden, and are to be likely for
     the smoother, with the fix's own noise and drift. A log without fixes is learned by the likelihood of its readings.
     White noise starts from how much readings differ from the line through their neighbours. In three stages all is

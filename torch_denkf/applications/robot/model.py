@@ -125,7 +125,7 @@ def robot_model(
     Args:
         config: a YAML file, or its content. Four parameters of a sensor are this library's own: ``odom0_delay``, in s;
             ``odom0_variances``, fifteen, where messages bring no covariance; ``odom0_drifts``, fifteen standard
-            deviations of errors that last (that of a forward speed is a share of it), and ``odom0_drift_time``, in s, a
+            deviations of coloured noise (that of a forward speed is a share of it), and ``odom0_drift_time``, in s, a
             number or fifteen.
         kind: the extended filter, or the unscented one, with ``alpha``, ``kappa`` and ``beta`` of the configuration.
         dtype: of all constants; float64, in which robot_localization calculates.

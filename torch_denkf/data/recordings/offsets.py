@@ -81,7 +81,7 @@ def clock_offsets(recording: Recording, *, most: float = 5.0) -> dict[str, Clock
         most: s, the largest delay between two streams.
 
     Returns:
-        By the names of the streams that have something in common: what to add to their times, relative to the fastest one
+        By stream name, for streams with a common quantity: offset to add to their times, relative to the fastest one
         that knows turns.
 
     Raises:
