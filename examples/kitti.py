@@ -112,7 +112,7 @@ def main() -> None:
         for name, path in (("DEnKF", belief), ("dead reckoning", reckoned)):
             error = kitti_endpoint_error(path[:, :3], truth[:, :3], window=window)
             print(f"  {name:<15}{error.translation.item():.3f}  {error.rotation.item():.3f}")
-        print(f"  the 90 % intervals hold {100 * holds[0]:.0f} % of v and {100 * holds[1]:.0f} % of theta_dot")
+        print(f"  90 % coverage: v {100 * holds[0]:.0f} %, theta_dot {100 * holds[1]:.0f} %")
         draw(seen, reckoned, args.out / f"{drive.drive}.png")
 
 

@@ -10,7 +10,7 @@ page for other robots. Needs pyarrow: ``pip install "torch_denkf[lerobot,plots]"
 
 Without --root it takes a minute of one core. Unseen episodes, no pictures in one second of four, mean absolute error of
 two joints: 0.024 rad for the filter, 0.096 for the last reading, 0.047 for the filter without a camera, 0.47 for the
-mean pose; the 90 % intervals hold 88 %. A Unitree G1's right arm takes four minutes with --updates 1000 300 200:
+mean pose; 90 % coverage is 88 %. A Unitree G1's right arm takes four minutes with --updates 1000 300 200:
 0.0096 rad, 0.0447, 0.0091 (its commands say it all), 0.1415; 84 %. A drawn crane of two joints, 20 episodes at 15 Hz
 with pictures two rows late, takes 1.5 minutes: 0.86 degrees, 2.92, 1.86, 27.6; 90 %.
 """
@@ -182,7 +182,7 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
     stage = Stage("filter", of_filter, readings.draw, updates[2], lr=4e-3)
     FilterTrainer(behind, [stage], out=out / "filter", **trainer).fit()
 
-    # One factor on all noise, with which the 90 % intervals hold 90 %.
+    # One factor on all noise, for a coverage of the 90 % intervals of 90 %.
     runs = readings.draw(torch.Generator().manual_seed(0), shortest)
 
     def from_level() -> float:
@@ -281,7 +281,7 @@ def believe(denkf: DEnKF, data: LeRobotReplay, episode: Episode) -> TensorDict:
 
 
 def report(seen: list[TensorDict], others: dict[str, list], mean: torch.Tensor, names: Sequence[str]) -> None:
-    """Prints mean absolute errors and what the intervals hold, joint by joint."""
+    """Prints mean absolute errors and coverage of the intervals, joint by joint."""
     rows = torch.cat([run.exclude("pixels") for run in seen])
     belief, truth = rows["belief", "mean"], rows["state"]
     ways = {"DEnKF": belief, **{name: torch.cat(runs) for name, runs in others.items()}, "mean pose": mean}

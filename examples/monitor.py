@@ -114,7 +114,7 @@ def main() -> None:
     quiet, plain, answered = watched.sequence(sound.clone()), watched.sequence(broken.clone()), gated.sequence(broken)
     alarm = plain["monitor", "alarm"][..., 0]
     delay = alarm[:, OFF:BACK].float().argmax(1)
-    print(f"False alarms on sound runs: in {1000 * quiet['monitor', 'alarm'].float().mean():.1f} of 1,000 steps.")
+    print(f"False alarms on fault-free runs: in {1000 * quiet['monitor', 'alarm'].float().mean():.1f} of 1,000 steps.")
     print(f"The GPS goes off: alarm {delay.float().median():.0f} steps after (median of {runs} carts).")
     for name, out in (("without a gate", plain), ("with a gate", answered)):
         during, after = error_of(out)[:, OFF:BACK].mean(), error_of(out)[:, BACK + 10 :].mean()

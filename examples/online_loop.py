@@ -114,7 +114,7 @@ def main() -> None:
                 print(f"{cart.time:4.1f} s  {text}   {' '.join(readings) or 'none'}")
     holds = (100 * inside / steps).tolist()
     print(
-        f"{steps} steps; the 90 % intervals hold {holds[0]:.0f} % of the positions and {holds[1]:.0f} % of the speeds"
+        f"{steps} steps; 90 % coverage: position {holds[0]:.0f} %, speed {holds[1]:.0f} %"
     )
 
 

@@ -253,7 +253,7 @@ def errors(model: FusedFilter, rollouts: TensorDict, *without: str) -> tuple[Ten
     mean, var = out["belief", "mean"][..., :4], out["belief", "var"][..., :4]  # behind them, the camera's bias
     error = (mean - out["state"]).square().mean((0, 1)).sqrt()
     holds = interval_coverage(mean, var, out["state"], level=0.9).mean()
-    return out, f"{error[:2].mean():.3f} rad, {error[2:].mean():.2f} rad/s, 90 % intervals hold {100 * holds:.0f} %"
+    return out, f"{error[:2].mean():.3f} rad, {error[2:].mean():.2f} rad/s, 90 % coverage {100 * holds:.0f} %"
 
 
 def make_actor() -> ProbabilisticActor:

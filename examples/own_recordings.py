@@ -9,8 +9,8 @@ rate of its own, here 10, 100 and 50 Hz, on one clock in s. The camera sees wher
 goes, with gaps. ``examples/kitti.py``, ``ur5.py`` and ``lerobot.py`` are the same page for other robots.
 
 Without --root it takes about a minute and a half of one core. Three unseen runs, 30 % of the frames missing: the filter
-is off by about 2 cm and 10 cm/s, the last readings by about 6 cm and 19 cm/s (root mean squared errors). The 90 %
-intervals hold 97 % of the positions and 88 % of the speeds.
+is off by about 2 cm and 10 cm/s, the last readings by about 6 cm and 19 cm/s (root mean squared errors). The
+coverage of the 90 % intervals is 97 % for the position and 88 % for the speed.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ def main() -> None:
         error = 100 * (states - truth).square().mean((0, 1)).sqrt()
         print(f"  {name:<15}{error[0]:.1f}  {error[1]:.1f}")
     holds = 100 * interval_coverage(belief, seen["belief", "var"], truth, level=0.9)
-    print(f"  the 90 % intervals hold {holds[0]:.0f} % of the positions and {holds[1]:.0f} % of the speeds")
+    print(f"  90 % coverage: position {holds[0]:.0f} %, speed {holds[1]:.0f} %")
     draw(seen[0], reading[0], args.out / f"{unseen.episodes[0].name}.png")
 
 

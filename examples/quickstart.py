@@ -222,9 +222,9 @@ def compare(rollouts: list[TensorDict], estimates: list[dict], window: int) -> s
     v, theta_dot = 100 * interval_coverage(belief["mean"], belief["var"], truth, level=0.9)[VELOCITIES]
     blind = 100 * (1 - torch.cat([r["observed"] for r in rollouts]).float().mean())
     lines.append(
-        f"\nThe sensor is blind in {blind:.0f} % of the steps. The DEnKF's 90 % intervals hold {v:.0f} % of v and "
+        f"\nThe sensor is blind in {blind:.0f} % of the steps. 90 % coverage of the DEnKF: v {v:.0f} %, "
     )
-    return "\n".join(lines) + f"{theta_dot:.0f} % of theta_dot."
+    return "\n".join(lines) + f"theta_dot {theta_dot:.0f} %."
 
 
 def draw(rollout: TensorDict, estimates: dict, dt: float, file: Path) -> None:

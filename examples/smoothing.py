@@ -88,7 +88,7 @@ def make_ukf() -> UKF:
 
 
 def show(name: str, mean: Tensor, var: Tensor, truth: Tensor) -> None:
-    """Errors of angle and rate, and how often the 90 % intervals hold the truth."""
+    """Returns errors of angle and rate, and the coverage of the 90 % intervals."""
     error = mean - truth
     angle, rate = error.square().flatten(0, 1).mean(0).sqrt().tolist()
     inside = 100 * (error.abs() < 1.645 * var.sqrt()).float().mean().item()
@@ -104,7 +104,7 @@ def main() -> None:
     recordings = record(runs, steps)
     truth = recordings["state"]
 
-    print(f"{'RMSE over recordings':34s} angle       rate          90 % intervals hold")
+    print(f"{'RMSE over recordings':34s} angle       rate          90 % coverage")
     smoothers = {
         "DEnKF, EnKS, 5 steps ahead": EnKS(make_denkf(), lag=5),
         "DEnKF, EnRTS, 5 steps ahead": EnRTS(make_denkf(), lag=5),

@@ -9,7 +9,7 @@ the same page for other robots. The full study, with every filter and disturbanc
 
 Without --root it takes about four minutes of one core. 40 unseen demos with pictures in 10 % of the steps, mean
 absolute error: joints about 5 degrees and place 2.8 cm for the filter, 10 degrees and 2.8 cm for the last reading. The
-sensor has learned from few demos at 64 px, and the 90 % intervals hold 76 %. This arm follows its commands well: the
+sensor has learned from few demos at 64 px, and the 90 % coverage is 76 %. This arm follows its commands well: the
 last command alone is off by 1.4 degrees. The study, with a larger sensor and more demos, reaches 1.5 degrees from
 pictures alone.
 """
@@ -139,7 +139,7 @@ def main() -> None:
     late = (rollout["action"] - truth[..., :7]).abs().mean() * UNITS[0]
     print(f"  {'last command':<15}{late:.2f}")
     print(
-        f"  the 90 % intervals hold {holds[:7].mean():.0f} % of the joints and {holds[7:].mean():.0f} % of the places"
+        f"  90 % coverage: joints {holds[:7].mean():.0f} %, positions {holds[7:].mean():.0f} %"
     )
     draw(seen[0], reading[0], args.out / f"{unseen.episodes[0].name}.png")
 

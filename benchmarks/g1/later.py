@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.g1.later --root G1``. It reads no pictures. The state is the joints of a row and of the row
 before; the motion, which also reads the row's commands, is fitted by least squares, and its noise by what it leaves. A
-factor on that noise is chosen on validation episodes, so that 90 % of the intervals of the later moment hold the truth.
+factor on that noise is chosen on validation episodes, for a 90 % coverage at the later moment.
 """
 
 from __future__ import annotations

@@ -155,7 +155,7 @@ def lagged(commands: Tensor) -> Tensor:
 
 
 def score(estimate: Estimate, data: TensorDict, at: Tensor) -> list[str]:
-    """Returns the mean absolute error in degrees, and what the 90 % intervals hold, at rows ``[N, T]``."""
+    """Returns the mean absolute error in degrees, and the coverage of the 90 % intervals, at rows ``[N, T]``."""
     mean, std = estimate
     error = (mean - data["state"])[at].abs()
     held = "" if std is None else f"{100 * (error < LEVEL * std[at]).float().mean():.0f} %"

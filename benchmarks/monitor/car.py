@@ -101,7 +101,7 @@ def gates_of(readings: Sequence[TensorDict], guard: CarGuard = CHOSEN) -> CarGat
 
 
 def path_scores(beliefs: TensorDict) -> dict[str, float]:
-    """End point error over 100 steps, and what the 90 % intervals hold, of draws ``[K, N]``."""
+    """Returns end-point error over 100 steps and 90 % coverage of draws ``[K, N]``."""
     window = min(100, beliefs.shape[1] - 1)
     ends = [
         float(kitti_endpoint_error(mean[:, :3].double(), truth[:, :3].double(), window=window).translation)

@@ -115,7 +115,7 @@ def choice_page(rows: Sequence[dict], study: Study) -> str:
 def page(rows: Sequence[dict], study: Study) -> str:
     """Returns two tables: alarms, and errors."""
     lines = ["# Unannounced faults", ""]
-    lines += head("task", "fault", "AUROC", "delay, steps", "found", "alarms in 1,000 sound steps", "error afterwards")
+    lines += head("task", "fault", "AUROC", "delay, steps", "found", "false alarms in 1,000 steps", "error afterwards")
     for row in rows:
         if "auroc" in row:
             cells = [f"{row[key]:.3g}" for key in ("auroc", "delay_steps", "found", "false_alarms_per_1000")]

@@ -55,7 +55,7 @@ def _around(make: Callable) -> Callable[[Filter], Filter]:
     return lambda filter: filter.with_modules(analysis=make(filter["analysis"]))
 
 
-#: What stands around the update; ``Visible`` reads the share of sound readings from the data.
+#: Wrappers of the update; ``Visible`` reads the share of good readings from the data.
 UPDATES: dict[str, Callable[[Filter], Filter]] = {
     "plain": lambda filter: filter,
     'gate, "student"': lambda filter: Gated(filter, 1),

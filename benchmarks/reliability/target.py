@@ -30,7 +30,7 @@ class Target:
         words: arguments, keys or files: a clear message has one of them as a word.
         act: does what a user would do with a wrong value of it, in an empty folder.
         wrong: its wrong values.
-        right: whether a result is right, as the sound part of the input tells; ``None`` where it must raise.
+        right: whether a result is right, judged by the undamaged part of the input; ``None`` where it must raise.
         rights: ``right`` for some of the values, by their names; or a function that returns it, given name and value.
         within: s in which it must be over.
         needs: makes what it starts from, in a process of its own; called once.

@@ -1,4 +1,4 @@
-"""The path from above, the error over the length of a segment, and what intervals hold."""
+"""Draws the path from above, the error over the length of a segment, and the coverage of intervals."""
 
 from __future__ import annotations
 

@@ -115,8 +115,8 @@ error = (mean - unseen["state"])[:, 20:]
 differences = unseen["reading"].diff(dim=1)[..., 0] / DT
 rmse = error.square().mean((0, 1)).sqrt()
 inside = (error.abs() <= 1.645 * std[:, 20:]).float().mean((0, 1))
-print(f"angle: RMSE {rmse[0]:.3f} rad;  its 90 % intervals hold {100 * inside[0]:.0f} % of the truth")
-print(f"speed: RMSE {rmse[1]:.3f} rad/s; its 90 % intervals hold {100 * inside[1]:.0f} % of the truth")
+print(f"angle: RMSE {rmse[0]:.3f} rad;  90 % coverage {100 * inside[0]:.0f} %")
+print(f"speed: RMSE {rmse[1]:.3f} rad/s; 90 % coverage {100 * inside[1]:.0f} %")
 crude = (differences - unseen["state"][:, 1:, 1])[:, 20:].square().mean().sqrt()
 print(f"differences of the readings: RMSE {crude:.3f} rad/s")
 assert rmse[1] < 0.3 * crude

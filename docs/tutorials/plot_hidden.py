@@ -151,7 +151,7 @@ for name, filter in filters.items():
     error = mean - test["state"][..., :2]
     for when, rows in (("seen", seen), ("hidden", hidden)):
         inside = (error.abs() < 1.645 * std)[rows].float().mean()
-        print(f"{name}, {when}: off by {error[rows].norm(dim=-1).mean():.1f} pixels, 90 % intervals hold {inside:.0%}")
+        print(f"{name}, {when}: off by {error[rows].norm(dim=-1).mean():.1f} pixels, 90 % coverage {inside:.0%}")
 
 # %%
 # One run

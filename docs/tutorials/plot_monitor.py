@@ -64,7 +64,7 @@ with torch.no_grad():
     sound, slipped = watched.sequence(swing(100)), watched.sequence(swing(100, slip=4.0))
 alarms = 1000 * sound["monitor", "alarm"].float().mean()
 delay = slipped["monitor", "alarm"][:, FROM:TO, 0].float().argmax(1).float()
-print(f"sound encoder: an alarm in {alarms:.1f} of 1,000 steps")
+print(f"encoder without faults: an alarm in {alarms:.1f} of 1,000 steps")
 print(f"slipped by 4 degrees: alarm {delay.median():.0f} steps later (median of 100 runs)")
 assert alarms < 4
 assert delay.median() <= 3

@@ -207,7 +207,7 @@ crude = (differences - late["state"][:, 1:, 1])[pairs].square().mean().sqrt()
 inside = ensemble_interval_coverage(late["belief", "ensemble"], late["state"], level=0.9)
 print(f"sensor alone, where it sees: angle {alone:.3f} rad, speed by differences {crude:.2f} rad/s")
 print(f"filter, hidden second too:   angle {error[0]:.3f} rad, speed {error[1]:.2f} rad/s")
-print(f"90 % intervals hold {inside[0]:.0%} of the angles and {inside[1]:.0%} of the speeds")
+print(f"90 % coverage: angles {inside[0]:.0%}, speeds {inside[1]:.0%}")
 assert alone < 0.15
 assert error[0] < 0.12
 assert error[1] < 0.7 * crude

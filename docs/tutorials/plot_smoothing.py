@@ -127,7 +127,7 @@ for name in ("belief", "smoothed"):
     inside = interval_coverage(
         out[name, "mean"][:, rows], out[name, "var"][:, rows], drives["state"][:, rows], level=0.9
     )
-    print(f"{name:8s} {error(name, rows):.2f} m off between markers; 90 % intervals hold {inside[:2].mean():.0%}")
+    print(f"{name:8s} {error(name, rows):.2f} m off between markers; 90 % coverage {inside[:2].mean():.0%}")
 assert error("smoothed", rows) < 0.6 * error("belief", rows)
 assert 0.8 < inside[:2].mean() < 0.98
 

@@ -172,7 +172,7 @@ for name, run in runs.items():
     rmse[name] = {part: state_errors(mean[:, rows], truth[:, rows]).rmse for part, rows in parts.items()}
     inside = interval_coverage(mean[:, settled], var[:, settled], truth[:, settled], level=0.9)
     errors = "; ".join(f"{part} {error[0]:.2f} m, {error[1]:.2f} m/s" for part, error in rmse[name].items())
-    print(f"{name:13s}: RMSE {errors}; 90 % intervals hold {inside[0]:.0%}, {inside[1]:.0%}")
+    print(f"{name:13s}: RMSE {errors}; 90 % coverage {inside[0]:.0%}, {inside[1]:.0%}")
 assert rmse["both"]["with pictures"][0] < 0.2 * rmse["encoder alone"]["with pictures"][0]
 assert (rmse["both"]["with pictures"] < 0.9 * rmse["camera alone"]["with pictures"]).all()
 assert rmse["both"]["without"][0] < 0.9 * rmse["camera alone"]["without"][0]

@@ -1,4 +1,4 @@
-"""Damaged drives in KITTI's layout: refused by file and line, or kept as far as they are sound, and counted."""
+"""Damaged drives in KITTI's layout: an error names file and line, or damaged rows are masked and counted."""
 
 import math
 import warnings

@@ -1,4 +1,4 @@
-"""Damaged recordings in LeRobot's layout: refused by file and entry, or kept as far as they are sound, and counted."""
+"""Damaged recordings in LeRobot's layout: an error names file and entry, or damaged rows are masked and counted."""
 
 import json
 from functools import partial
@@ -66,7 +66,7 @@ def test_one_stamp_that_is_wrong(root, value):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_states_that_are_not_finite(root, value):
-    """Rows hold the last sound numbers (the first row the next), and count neither as seen nor in a loss."""
+    """Damaged rows repeat the last valid values (the first row the next ones), and are masked."""
     right = open_all(root)
     states = joints(0, ROWS)
     bad = [0, 4, 5]

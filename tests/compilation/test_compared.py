@@ -89,7 +89,7 @@ def test_two_of_four_numbers_are_read(options):
     torch.testing.assert_close(mean, expected, rtol=1e-6, atol=1e-7)
 
 
-# -------------------------------------------------------------------------------------------- what is refused
+# -------------------------------------------------------------------------------------------- errors
 
 
 @pytest.mark.parametrize(

@@ -277,7 +277,7 @@ def test_the_next_start_sweeps(tmp_path):
 
 
 def test_a_sound_entry_of_another_process_is_not_taken_for_damaged(entry, monkeypatch):
-    """Found damaged, but replaced by a sound one before it could be removed."""
+    """A damaged entry is replaced by a valid one before it is removed."""
     from torch_denkf.data import cache
 
     calls = []

@@ -1,4 +1,4 @@
-"""Mixed precision is refused by name; process noise of zero, in an ensemble, in a replaced network."""
+"""Mixed precision raises; process noise of zero, in an ensemble, in a replaced network."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""An entry that a module both reads and writes is carried, or refused; a mask that nobody reads is refused."""
+"""An entry that a module both reads and writes is carried or raises; an unread mask raises."""
 
 import pytest
 import torch

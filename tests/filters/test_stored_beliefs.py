@@ -169,8 +169,8 @@ def test_the_action_before_drives_the_step_and_need_not_be_stored_twice():
 
 @every_filter
 @pytest.mark.parametrize("update_at_reset", [False, True])
-def test_a_reading_that_a_start_does_not_use_may_be_anything(name, update_at_reset):
-    """As in a transform. In the other row, and where the first frame is used, it is refused."""
+def test_nan_in_an_unused_reading_of_a_reset_is_allowed(name, update_at_reset):
+    """NaN raises only in rows that are not reset, or if the first frame is used."""
     filter = FILTERS[name]().with_options(update_at_reset=update_at_reset)
     row = policy_data(filter, anew=(0,))[0][:, 0]
     row["previous", "known"][1] = True

@@ -41,7 +41,7 @@ def sound(times: np.ndarray) -> np.ndarray:
 
 
 def filled(times: np.ndarray, good: np.ndarray, step: float) -> np.ndarray:
-    """Interpolates times that are not sound on straight lines between the others, and extrapolates beyond these.
+    """Interpolates invalid times on straight lines between the others, and extrapolates beyond these.
 
     Args:
         times: ``[N]``, of which one at least is sound.

@@ -77,9 +77,9 @@ class Contaminated(MixedUpdate):
         share: :math:`\epsilon` in [0, 1], ``[*B, 1]`` in an entry.
         width: w, by how much outliers are wider than R says, ``[*B, 1]`` in an entry.
         noise: W, instead of ``width``: standard deviations ``[O]``; in an entry variances ``[*B, O]``.
-        divergence: probability that the filter has diverged, 0.01 for example: a sound reading then is expected from a
+        divergence: probability that the filter has diverged, 0.01 for example: a good reading then is expected from a
             forecast of three times the standard deviations. One Gaussian for a mixture forgets the smaller peak; where
-            that was the true one, it may take many sound readings for outliers. It costs a third run.
+            that was the true one, it may take many good readings for outliers. It costs a third run.
         trainable: whether those that are numbers are parameters: the logit of the share, logarithms of the others.
 
     Raises:

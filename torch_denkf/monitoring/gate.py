@@ -35,7 +35,7 @@ class GateOptions(TypedDict, total=False):
             ``"huber"`` enlarge its variances, see :func:`~torch_denkf.monitoring.gating.disbelief`; ``"student"`` by
             default. ``"reject"`` may take surprising motions for faults, and the belief then runs away.
         window: observed steps whose normalised innovations squared are summed up; 3 by default.
-        rate: probability that the sum of a sound sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
+        rate: false-alarm rate, the probability that a fault-free sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
             acts.
         freedom: of Student's t; 4 by default.
         patience: after so many steps in a row at which a reading was rejected the gate opens: the forecast, and the

@@ -1,4 +1,4 @@
-"""Components of a belief over time, with the band that should hold the truth."""
+"""Components of a belief over time, with a credible band."""
 
 from __future__ import annotations
 

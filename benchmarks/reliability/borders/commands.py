@@ -242,7 +242,7 @@ POSES: dict[str, d.Change] = {
 
 
 def _rights(source: Source, file: str, options: dict[str, Any]) -> Callable[[str, Any], Any]:
-    """Tells whether a command says word for word what it says of sound files, and warns of nothing.
+    """Tells whether a command prints exactly its output for undamaged files, without warnings.
 
     Nothing depends on the last byte of a table or a description, which ends a line; of calib.txt, rows of other cameras
     may be damaged.

@@ -1,4 +1,4 @@
-"""Logs whose files are sound and whose numbers are not: times of another clock, fixes that repeat, numbers too large.
+"""Logs whose files are valid and whose values are not: times of another clock, fixes that repeat, numbers too large.
 
 What is wrong with them is a warning or an error, which names the file or sensor; warnings are raised here.
 """

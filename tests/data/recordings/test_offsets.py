@@ -34,7 +34,7 @@ def drive(seed, seconds=120.0, noise=0.05):
 
 
 def test_delays_that_are_known():
-    """Within .05 s, and 95 % of the intervals hold: of 40 at least 34, which 38 hold on average."""
+    """Errors are below .05 s, and the coverage of the 95 % intervals is at least 34 of 40 (38 expected)."""
     held = 0
     for seed in range(20):
         tables = drive(seed)

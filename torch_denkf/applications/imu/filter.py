@@ -62,7 +62,7 @@ class ImuSettings:
         gravity: in m/s^2.
         block: seconds of readings that make one step.
         latency: how old the readings are when they get their time stamp, in s; orientations are moved on by it.
-        heading_scale: factor on the standard deviation of the heading, so that the intervals hold.
+        heading_scale: factor on the standard deviation of the heading, which sets the coverage.
         heading_floor: least standard deviation of the heading, in degrees.
         tilt_scale: factor on the standard deviations of the inclination.
         tilt_floor: least standard deviation of the inclination about each axis, in degrees.

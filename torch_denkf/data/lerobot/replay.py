@@ -57,7 +57,7 @@ class LeRobotReplay(EpisodeReplay):
     ``pixels``            [n,3,H,W]    float32 in [0, 1], RGB; zeros where the frame is missing
     ``state``             [n,S]        float32, such as the joints' positions, in the recording's units
     ``action``            [n,A]        float32, where there are any
-    ``observed``          [n,1]        bool: the frame is there, and its row is sound
+    ``observed``          [n,1]        bool: the frame is there, and its row is valid
     ===================== ============ ===========================================================================
 
     Rows whose state or action is not finite, or whose time does not increase, keep their place and are not observed; a

@@ -78,7 +78,7 @@ class CornerMotion(NamedTuple):
         motion: points of SE3 ``[*B, 7]``: the pose of the later row, seen from the earlier one.
         cov: of its tangent ``[*B, 6, 6]``, as the weights of the corners say.
         log_likelihood: of the corners, mean over those that are seen, ``[*B]``.
-        weight: of each corner ``[*B, N]``, about 1 for sound ones, 0 where not seen.
+        weight: of each corner ``[*B, N]``, about 1 for inliers, 0 for missing ones.
         stereo: the error of each corner's disparity that is the same in both rows, ``[*B, N]`` in pixels.
         stereo_var: of it.
     """

@@ -25,7 +25,7 @@ class Times(NamedTuple):
         times: s, increasing, ``[N]``; where a stamp is wrong, a value between its neighbours.
         dt: s since the frame before, ``[N]``: the median in all rows but those after a gap. The first row has the
             median, too.
-        sound: whether the stamp of the file is right, bool ``[N]``.
+        sound: whether the stamp of the file is valid, bool ``[N]``.
         median: s, the frame time.
     """
 

@@ -72,7 +72,7 @@ def static_region(previous: np.ndarray, current: np.ndarray, *, noise: int = 0, 
 
 
 def picture_signs(previous: np.ndarray, current: np.ndarray, *, noise: int = 0) -> np.ndarray:
-    """Returns numbers that are small for two pictures of a sound camera, and large for those of one that fails.
+    """Returns signs of a fault that are small for two images of a working camera, and large for a failing one.
 
     An :class:`torch_denkf.monitoring.InnovationMonitor` watches them besides the innovations, and a
     :class:`torch_denkf.monitoring.SignGate` takes readings out by them; both take from clean data what is large.
