@@ -113,9 +113,7 @@ def main() -> None:
                 text = f"{true[0]:6.2f} m  {true[1]:5.2f} m/s     {position} m   {speed} m/s"
                 print(f"{cart.time:4.1f} s  {text}   {' '.join(readings) or 'none'}")
     holds = (100 * inside / steps).tolist()
-    print(
-        f"{steps} steps; 90 % coverage: position {holds[0]:.0f} %, speed {holds[1]:.0f} %"
-    )
+    print(f"{steps} steps; 90 % coverage: position {holds[0]:.0f} %, speed {holds[1]:.0f} %")
 
 
 if __name__ == "__main__":

@@ -221,9 +221,7 @@ def compare(rollouts: list[TensorDict], estimates: list[dict], window: int) -> s
     belief, truth = together["belief"], together["state"]
     v, theta_dot = 100 * interval_coverage(belief["mean"], belief["var"], truth, level=0.9)[VELOCITIES]
     blind = 100 * (1 - torch.cat([r["observed"] for r in rollouts]).float().mean())
-    lines.append(
-        f"\nThe sensor is blind in {blind:.0f} % of the steps. 90 % coverage of the DEnKF: v {v:.0f} %, "
-    )
+    lines.append(f"\nThe sensor is blind in {blind:.0f} % of the steps. 90 % coverage of the DEnKF: v {v:.0f} %, ")
     return "\n".join(lines) + f"theta_dot {theta_dot:.0f} %."
 
 

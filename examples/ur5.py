@@ -138,9 +138,7 @@ def main() -> None:
         print(f"  {name:<15}{error[:7].mean():.2f}  {error[7:].mean():.2f}")
     late = (rollout["action"] - truth[..., :7]).abs().mean() * UNITS[0]
     print(f"  {'last command':<15}{late:.2f}")
-    print(
-        f"  90 % coverage: joints {holds[:7].mean():.0f} %, positions {holds[7:].mean():.0f} %"
-    )
+    print(f"  90 % coverage: joints {holds[:7].mean():.0f} %, positions {holds[7:].mean():.0f} %")
     draw(seen[0], reading[0], args.out / f"{unseen.episodes[0].name}.png")
 
 

@@ -33,7 +33,7 @@ class GateOptions(TypedDict, total=False):
     Attributes:
         response: what happens to an outlier: ``"reject"`` takes it out, ``"student"`` and
             ``"huber"`` enlarge its variances, see :func:`~torch_denkf.monitoring.gating.disbelief`; ``"student"`` by
-            default. ``"reject"`` may take surprising motions for faults, and the belief then runs away.
+            default. ``"reject"`` may mistake large motions for faults, after which the belief diverges.
         window: observed steps whose normalised innovations squared are summed up; 3 by default.
         rate: false-alarm rate, the probability that a fault-free sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
             acts.

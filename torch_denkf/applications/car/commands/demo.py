@@ -110,9 +110,7 @@ class Demo(Command):
 def _table(scores: dict[str, float]) -> str:
     """Formats the errors and the coverage of a drive."""
     way = scores["way_m"]
-    lines = [
-        f"{'':16}{'end-point error':>18}{'mean error':>18}   after {way:.0f} m with a camera that failed 3 times"
-    ]
+    lines = [f"{'':16}{'end-point error':>18}{'mean error':>18}   after {way:.0f} m with a camera that failed 3 times"]
     for label, name in (("DEnKF", "filter"), ("dead reckoning", "reckoned")):
         end, mean = scores[f"{name}_end_m"], scores[f"{name}_mean_m"]
         lines.append(f"{label:16}{f'{end:.1f} m ({100 * end / way:.1f} %)':>18}{f'{mean:.1f} m':>18}")
