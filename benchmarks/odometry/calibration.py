@@ -1,19 +1,20 @@
-"""Tells how wrong the speed is for longer than a second, on drives with known poses.
+"""Tells how wrong speed and turn rate are for longer than a second, on drives with known poses.
 
 ``python -m benchmarks.odometry.calibration --root KITTI --out FOLDER``
 
 The shipped filter has learned from rendered drives alone. How wrong its speed is on real ones, by a factor that lasts,
-only real ones can say. Each drive is scored with what the others say; the filter that is left has what all say.
+and its turn rate, by an offset that lasts, only real ones can say. Each drive is scored with what the others say; the
+filter that is left has what all say.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
 
 import torch
+from torch import Tensor
 
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import head, line
@@ -30,7 +31,7 @@ NEAREST = 0.05  # of the true speed: a reading that is smaller, or negative, cou
 
 @dataclass(frozen=True)
 class Calibration:
-    """Options of the calibration of the speed's scale error: for each drive on the others, and on all."""
+    """Options of the calibration of the speed's scale error and the turn rate's bias, for each drive on the others."""
 
     root: Path  # folder with sequences and poses
     out: Path = Path("runs/calibrated")  # folder for the filter, calibrated on all drives
@@ -38,27 +39,29 @@ class Calibration:
     draws: int = 8  # of the filter's noise
 
 
-def lasting_square(car: CarFilter, root: Path, name: str) -> float:
-    """Returns the mean square of the log ratio of estimated to true speed, each averaged over one second."""
+def lasting_squares(car: CarFilter, root: Path, name: str) -> Tensor:
+    """Returns mean squares ``[2]`` of the speed's log scale error and the turn rate's error, averaged over one second."""
     drive = Drive(root, name, car.settings.size, True, two_view=car.settings.two_view)
     run = all_frames(read_spans(car.sensor, [each.read() for each in drive.spans(1)], car.settings.longest))
-    read, true = run["sensor", "ensemble"].mean(1)[1:, 0], run["state"][1:, VELOCITIES[0]]
-    moving = true > SLOW
-    error = (read / true)[moving].clamp_min(NEAREST).log()
-    count = len(error) // SECOND
-    return error[: count * SECOND].view(count, SECOND).mean(1).square().mean().item()
+    read, true = run["sensor", "ensemble"].mean(1)[1:], run["state"][1:, VELOCITIES]
+    moving = true[:, 0] > SLOW
+    factor = (read / true)[moving, 0].clamp_min(NEAREST).log()
+    errors = factor, (read - true)[:, 1]
+    seconds = [error[: len(error) // SECOND * SECOND].view(-1, SECOND).mean(1) for error in errors]
+    return torch.stack([means.square().mean() for means in seconds])
 
 
-def with_scale_std(checkpoint: str, std: float) -> CarFilter:
-    """Returns the filter with a standard deviation of its speed's scale error."""
+def with_bias_stds(checkpoint: str, factor: float, offset: float) -> CarFilter:
+    """Returns the filter with standard deviations of the speed's scale error and the turn rate's bias."""
     car = from_pretrained(checkpoint)
-    car["gain"].log_std.data[0] = torch.tensor(std).log()
+    car["gain"].log_std.data[0] = torch.tensor(factor).log()
+    car["gain"].offset_std[1] = offset
     return car
 
 
-def root_mean(squares: Mapping[str, float]) -> float:
-    """Returns the root of the mean over drives, with equal weights."""
-    return fmean(squares.values()) ** 0.5
+def root_mean(squares: Iterable[Tensor]) -> list[float]:
+    """Returns root mean squares over drives, with equal weights."""
+    return torch.stack(list(squares)).mean(0).sqrt().tolist()
 
 
 def main() -> None:
@@ -66,19 +69,19 @@ def main() -> None:
     study = parse(Calibration)
     torch.set_num_threads(1)
     car, names = from_pretrained(study.checkpoint), list_kitti_drives(study.root)
-    squares = {name: lasting_square(car, study.root, name) for name in names}
+    squares = {name: lasting_squares(car, study.root, name) for name in names}
     made_by = command("odometry.calibration")
     print(
-        f"`{made_by}`. Each drive is scored with the standard deviation of the other drives. "
+        f"`{made_by}`. Each drive is scored with the standard deviations of the other drives. "
         "Drives shorter than 100 m have no devkit error.\n"
     )
-    columns = "drive", "scale std by the other drives", "m/m", "devkit, %"
+    columns = "drive", "std of the others: scale", "turn rate (mrad/s)", "m/m", "devkit, %"
     coverage = "coverage of v (%)", "coverage of the turn rate (%)"
     print("\n".join(head(*columns, *coverage, "sensor: m/m", "devkit, %")))
     for name in names:
-        std = root_mean({other: square for other, square in squares.items() if other != name})
+        factor, offset = root_mean(square for other, square in squares.items() if other != name)
         options = {"draws": study.draws, "progress": False}
-        rows, _ = evaluate_car_filter(with_scale_std(study.checkpoint, std), study.root, [name], **options)
+        rows, _ = evaluate_car_filter(with_bias_stds(study.checkpoint, factor, offset), study.root, [name], **options)
         found = {row["method"]: row for row in rows}
         errors = [
             text
@@ -89,11 +92,11 @@ def main() -> None:
             )
         ]
         held = [f"{100 * found['filter'][f'coverage90_{key}']:.0f}" for key in ("v", "theta_dot")]
-        print(line(name, f"{std:.3f}", *errors[:2], *held, *errors[2:]), flush=True)
-    std = root_mean(squares)
-    record = {"command": made_by, "drives": names, "doubt": std}
-    save_pretrained(with_scale_std(study.checkpoint, std), study.out, training={"calibration": record})
-    print(f"by all drives: {std:.3f}; {study.out}")
+        print(line(name, f"{factor:.3f}", f"{1e3 * offset:.1f}", *errors[:2], *held, *errors[2:]), flush=True)
+    factor, offset = root_mean(squares.values())
+    record = {"command": made_by, "drives": names, "doubt": factor, "offset": offset}
+    save_pretrained(with_bias_stds(study.checkpoint, factor, offset), study.out, training={"calibration": record})
+    print(f"by all drives: {factor:.3f}, {1e3 * offset:.1f} mrad/s; {study.out}")
 
 
 if __name__ == "__main__":

@@ -35,8 +35,8 @@ class GateOptions(TypedDict, total=False):
             ``"huber"`` enlarge its variances, see :func:`~torch_denkf.monitoring.gating.disbelief`; ``"student"`` by
             default. ``"reject"`` may mistake large motions for faults, after which the belief diverges.
         window: observed steps whose normalised innovations squared are summed up; 3 by default.
-        rate: false-alarm rate, the probability that a fault-free sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
-            acts.
+        rate: false-alarm rate, the probability that a fault-free sensor exceeds its limit; 1e-3 by default. 0 turns
+            the gate off.
         freedom: of Student's t; 4 by default.
         patience: after so many steps in a row at which a reading was rejected the gate opens: the forecast, and the
             past states that are carried next to it, are spread until they reach the reading, and the window is emptied.
