@@ -145,7 +145,7 @@ print(json.dumps(found))
 """
 
 
-def test_what_an_import_costs():
+def test_import_time():
     done = subprocess.run([sys.executable, "-c", IMPORTS], capture_output=True, text=True, check=True)
     found = json.loads(done.stdout)
     assert found["functional"] == found["plots"] == []

@@ -132,7 +132,7 @@ def test_every_name_is_that_of_its_parameter(name):
 
 @every_sub_model
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_it_writes_what_it_says_and_nothing_else(name, batch):
+def test_writes_its_out_keys_only(name, batch):
     module, td = make(name, batch)
     before = td.copy()
     out = module(td)

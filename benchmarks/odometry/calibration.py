@@ -40,7 +40,7 @@ class Calibration:
 
 
 def lasting_squares(car: CarFilter, root: Path, name: str) -> Tensor:
-    """Returns mean squares ``[2]`` of the speed's log scale error and the turn rate's error, averaged over one second."""
+    """Returns mean squares ``[2]`` of one-second means: the log scale error of the speed, the turn rate error."""
     drive = Drive(root, name, car.settings.size, True, two_view=car.settings.two_view)
     run = all_frames(read_spans(car.sensor, [each.read() for each in drive.spans(1)], car.settings.longest))
     read, true = run["sensor", "ensemble"].mean(1)[1:], run["state"][1:, VELOCITIES]

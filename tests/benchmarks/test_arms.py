@@ -20,7 +20,7 @@ def physics_at(name, seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_reacher_knows_where_finger_and_target_are(seed):
+def test_reacher_positions_of_finger_and_target(seed):
     arm, emitted, physics = physics_at("reacher", seed)
     angles, velocity = arm.split(arm.state(emitted))
     at = {name: torch.tensor(physics.named.data.geom_xpos[name, :2]).float() for name in ("finger", "target")}

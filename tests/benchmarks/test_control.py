@@ -26,7 +26,7 @@ def test_the_exact_filter_holds_the_truth():
     assert errors[:, -1].mean().item() == pytest.approx(1, abs=5 * (2 / 1000) ** 0.5)
 
 
-def test_what_is_seen_is_the_last_reading_and_the_last_action():
+def test_policy_input_is_last_reading_and_last_action():
     env = env_of("pendulum", "last reading", count=50)
     data = env.rollout(20)
     seen, reading, observed, action = (data[key] for key in ("seen", "observation", "observed", "action"))

@@ -80,7 +80,7 @@ def test_gains_are_those_of_clean_unseen_drives():
     torch.testing.assert_close(log_gains(fold, base), torch.tensor([0.03, -0.04]), rtol=1e-4, atol=0)
 
 
-def test_every_filter_predicts_what_a_sensor_with_a_gain_reads():
+def test_filters_predict_readings_of_a_sensor_with_gain():
     sensor = SENSORS["flow"](facts := Statistics(torch.zeros(2), torch.ones(2), torch.zeros(2), torch.ones(2), 0.1))
     for name in ("denkf", "dekf", "bkf", "dpf_m_lrn"):
         recipe = FILTERS[name](sensor, facts)

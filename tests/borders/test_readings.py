@@ -159,7 +159,7 @@ def test_a_step_is_exact_up_to_the_limit():
     torch.testing.assert_close(kf.step(belief)["belief", "mean"], torch.full((3, 2), 6e17))
 
 
-def test_gradients_do_not_meet_what_was_rejected():
+def test_gradients_exclude_rejected_readings():
     """Also those of the sensor that would have read it: they are those of a masked frame."""
     expected, spoiled, _ = frames_of("sensor", 3, 12)
     gradients = []

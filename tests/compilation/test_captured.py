@@ -109,7 +109,7 @@ def test_every_filter_recorded_is_eager(float64, reruns, name):
     assert_same(*outs, atol=1e-11)
 
 
-def test_weights_that_an_optimiser_changes_and_weights_that_move_are_read_anew(float64, reruns):
+def test_changed_and_moved_weights_are_read_again(float64, reruns):
     eager, graph = pair()
     frames = noisy_frames(eager, 2, 4)
     for change in (
@@ -169,7 +169,7 @@ def test_running_means_count_each_sequence_once(float64, reruns):
     assert_same(*found)
 
 
-def test_what_waits_for_the_device_runs_eagerly_with_a_warning(float64, reruns, monkeypatch):
+def test_device_synchronisation_runs_eagerly_with_a_warning(float64, reruns, monkeypatch):
     monkeypatch.setattr(reruns, "waiting", ("somewhere.py:7",))
     eager, graph = pair()
     frames = noisy_frames(eager, 2, 3)

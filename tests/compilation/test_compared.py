@@ -188,7 +188,7 @@ def test_rounding_is_measured(make, monkeypatch):
         assert filter.step(row.copy())["belief", "mean"].isfinite().all()
 
 
-def test_nothing_is_compiled_twice_for_it_and_it_is_done_once(monkeypatch):
+def test_comparison_runs_once_without_recompilation(monkeypatch):
     """Frames that are zero, expanded, or laid out otherwise: what takes their place is laid out so, too."""
     filter, counting = kalman(), compiler(right)
     filter.compile(backend=counting)
@@ -203,7 +203,7 @@ def test_nothing_is_compiled_twice_for_it_and_it_is_done_once(monkeypatch):
     assert counting.graphs == 1
 
 
-def test_it_draws_no_number_of_the_users():
+def test_comparison_leaves_the_random_state():
     filter, states = toy_denkf(), []
     row = filter.initialise(toy_frames((2,), masks=0, resets=False))
     for chunk in (0, 1):
@@ -216,7 +216,7 @@ def test_it_draws_no_number_of_the_users():
 NAMES = {"names": ["x"], "outputs": ["y"], "frames": [], "what": "thing", "cure": ""}
 
 
-def test_what_has_no_value_in_both_is_equal_and_in_one_is_not():
+def test_nan_in_both_is_equal_and_in_one_is_not():
     nan = torch.tensor([1.0, torch.nan, torch.inf])
     check_same_numbers(lambda x: 1 * x, lambda x: x, (nan,), **NAMES)
     with pytest.raises(RuntimeError, match="'y' is up to inf off"):

@@ -81,7 +81,7 @@ def test_writing_to_an_opened_entry_changes_no_file(entry):
     check_entry(entry)
 
 
-def test_workers_get_what_was_written_to_the_file(entry):
+def test_workers_read_the_written_file(entry):
     opened = cached(entry, never)
     opened["pixels"][0] = 7
     with get_context("fork").Pool(1) as pool:
@@ -176,7 +176,7 @@ WAYS = {
 
 
 @pytest.mark.parametrize("how", WAYS)
-def test_a_damaged_entry_is_made_anew_with_one_line(entry, how, caplog):
+def test_damaged_entry_is_rebuilt_with_one_message(entry, how, caplog):
     name, damage = WAYS[how]
     damage(entry / name)
     assert is_entry(entry) == (how not in ("no manifest", "a pipe for a manifest"))
@@ -207,7 +207,7 @@ def test_every_byte_counts_for_the_whole_check(entry, capsys):
     assert Cache.main(["check", *words]) == 0
 
 
-def test_nothing_that_was_planted_is_executed(entry, tmp_path):
+def test_planted_code_is_not_executed(entry, tmp_path):
     """tensordict's own format may hold pickles; an entry of the cache that holds one is none."""
 
     class Trap:

@@ -61,7 +61,7 @@ def test_a_noise_that_is_no_covariance_is_named(source, name, which, kind, what,
 
 @pytest.mark.parametrize("kind", ["vector", "matrix"])
 @pytest.mark.parametrize("name", GAUSSIAN)
-def test_a_reading_without_noise_is_believed(name, kind):
+def test_noise_free_reading_is_reproduced(name, kind):
     """A variance of zero is one: the limit of small ones."""
     zero = torch.zeros(2) if kind == "vector" else torch.zeros(2, 2)
     means = []
@@ -102,7 +102,7 @@ def test_the_noise_of_an_initial_belief_is_not_read(first):
 
 
 @pytest.mark.parametrize("name", SAMPLED)
-def test_an_infinite_variance_is_that_of_a_component_that_says_nothing(name):
+def test_infinite_variance_equals_a_missing_component(name):
     found = []
     for r in ([0.5, torch.inf], [0.5, 0.3]):
         torch.manual_seed(0)

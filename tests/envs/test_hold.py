@@ -40,7 +40,7 @@ def test_episodes_that_end_apart():
     assert data["held"][began].eq(0).all()
 
 
-def test_a_reset_forgets_what_was_held():
+def test_reset_clears_the_held_reading():
     for reading, seen, held in ((NAN, False, 0.0), (5.0, True, 5.0)):
         frame = TensorDict({"observation": torch.tensor([reading]), "observed": torch.tensor([seen])})
         assert HoldReading()._reset(TensorDict({"held": torch.tensor([2.0])}), frame)["held"].item() == held

@@ -135,7 +135,7 @@ def test_specs(name, batch):
 
 
 @every_filter
-def test_rows_that_reset_start_anew_and_the_others_go_on(name):
+def test_partial_resets(name):
     env = filtered(name, batch_size=[2], max_steps=[3, 5])
     rollout = env.rollout(12, break_when_any_done=False)
     done = rollout["next", "done"].squeeze(-1)[:, :-1]
@@ -183,7 +183,7 @@ def test_compiled_is_eager(float64, name):
 
 @every_filter
 @pytest.mark.parametrize("width", [1, 2])
-def test_what_is_not_observed_may_be_anything(float64, name, width):
+def test_missing_readings_may_have_any_value(float64, name, width):
     filter, frames = with_noise(name, 3, 6, width=width)
     expected = filter.sequence(frames.copy())
     frames["observation"] = torch.where(frames["observed"], frames["observation"], torch.nan).requires_grad_()

@@ -172,7 +172,7 @@ def test_a_gate_that_never_acts_changes_no_perturbation(space):
 
 
 @pytest.mark.parametrize("hidden", [[False, True], [False, False]])
-def test_a_hidden_prediction_has_no_part_in_perturbed_readings(hidden):
+def test_masked_prediction_does_not_affect_perturbed_observations(hidden):
     """A prediction of NaN where nothing is read, such as the bearing of a landmark that nobody sees."""
     forecast, seen = torch.randn(E, S, requires_grad=True), ~torch.tensor(hidden)
     data = TensorDict({"reading": torch.ones(2), "observed": seen})
@@ -187,7 +187,7 @@ def test_a_hidden_prediction_has_no_part_in_perturbed_readings(hidden):
     assert out[3].isfinite().all()
 
 
-def test_noise_of_some_dimensions_before_and_behind_the_motion():
+def test_process_noise_of_some_dimensions_before_and_after_the_motion():
     f, _ = system()
     ensemble = torch.randn(5, E, S)
     td = TensorDict({("belief", "ensemble"): ensemble}, [5])
@@ -313,7 +313,7 @@ class Still(nn.Module):
         return td.set(("forecast", "ensemble"), td["belief", "ensemble"])
 
 
-def test_random_draws_stay_what_they_were():
+def test_random_draws_are_unchanged():
     td = TensorDict({("belief", "ensemble"): torch.randn(E, S), ("noise", "self"): torch.randn(E, S)})
     noise = ConstantNoise(Q, in_key=("belief", "ensemble"))
     noisy = NoisyTransition(LearnedTransition(nn.Linear(S, S)), noise, draws="random")

@@ -51,7 +51,7 @@ class OwnForward(NoisyLinear):
         return tensordict.set(FORECAST, 3.0 * tensordict[FORECAST])
 
 
-def test_a_forward_of_its_own_is_what_runs_and_it_finds_its_noise():
+def test_custom_forward_runs_with_its_noise():
     filter, (F, Q, *_) = linear_denkf(), linear_system()
     root = torch.linalg.cholesky(Q)
     filter = filter.with_modules(transition=OwnForward(F, root))

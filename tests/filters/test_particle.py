@@ -51,7 +51,7 @@ def test_missing_frames_are_pure_prediction(float64, scheme, learned):
 
 
 @pytest.mark.parametrize("scheme", ["systematic", "soft", "transport"])
-def test_resampling_heeds_a_mask_of_another_name(float64, scheme):
+def test_resampling_uses_a_mask_of_another_name(float64, scheme):
     frames = TensorDict({"observation": torch.randn(3, 8, 2)}, [3, 8])
     frames["observed"] = torch.rand(3, 8, 1) < 0.6
     frames["observed"][:, 3:5], frames["observed"][:, 2] = False, True
@@ -72,7 +72,7 @@ def test_resampling_heeds_a_mask_of_another_name(float64, scheme):
 
 
 @pytest.mark.parametrize("scheme", ["systematic", "soft", "transport"])
-def test_where_gradients_go(float64, scheme):
+def test_gradient_flow(float64, scheme):
     filter = toy_filter(scheme)
     frames = filter.draw_noise(toy_frames((2, 6), resets=False, masks=0))
     frames["measurement"].requires_grad_()

@@ -15,7 +15,7 @@ from torch_denkf.running import reads_of, writes
 
 
 @every_filter
-def test_what_is_read_and_written_is_carried(name):
+def test_entries_read_and_written_are_carried(name):
     filter = FILTERS[name]()
     modules = [module for _, module in filter.structure.modules]
     needed, optional = reads_of(modules)
@@ -48,7 +48,7 @@ class Count(SubModel):
         return count + 1
 
 
-def test_a_module_of_a_users_own_that_reads_what_it_writes_raises():
+def test_custom_module_that_reads_its_output_raises():
     with pytest.raises(ValueError, match=r"'count' \(Count\) writes 'count', which the filter also reads from outside"):
         camera(("count", Count()))
     tally = TensorDictModule(lambda count: count + 1, ["count"], ["count"])

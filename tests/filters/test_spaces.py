@@ -225,7 +225,7 @@ def test_a_turned_world_turns_the_belief_and_nothing_else(kind, turn):
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "lagged", "gated EKF"])
-def test_a_reading_that_is_missing_is_one_that_is_hidden(kind):
+def test_missing_reading_equals_masked_reading(kind):
     filter = FixedLag(make("EKF"), 2) if kind == "lagged" else make(kind.split()[-1])
     filter = Gated(filter, response="student", window=1, rate=1e-2) if kind == "gated EKF" else filter
     start = filter.initialise(with_noise(filter, log(steps=3))[:, 1].clone())
@@ -236,7 +236,7 @@ def test_a_reading_that_is_missing_is_one_that_is_hidden(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradients_are_finite_also_behind_masks_and_half_a_turn_away(kind):
+def test_gradients_are_finite_under_masks_and_at_half_a_turn(kind):
     filter, data = make(kind), log()
     data["pose"][0, 6] = SO3().plus(data["pose"][0, 5], torch.tensor([torch.pi, 0.0, 0.0]))
     data["start"].requires_grad_()
@@ -252,7 +252,7 @@ def test_gradients_are_finite_also_behind_masks_and_half_a_turn_away(kind):
 # -------------------------------------------------------------------------------------------------------- what is told
 
 
-def test_what_does_not_fit_raises():
+def test_mismatched_spaces_raise():
     with pytest.raises(TypeError, match=r"space is a Space, such as SO3\(\)"):
         AroundState([0.1] * 3, space="SO3")
     with pytest.raises(ValueError, match=r"tangent has shape \[4\]; a tangent of SO3\(\) is \[\*, 3\]"):

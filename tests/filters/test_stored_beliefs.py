@@ -43,7 +43,7 @@ def begins_at(*times, size=(2, 9)):
 @pytest.mark.parametrize("name", RESUMED)
 @pytest.mark.parametrize(("begin", "stored"), [(1, "belief_keys"), (5, "belief_keys"), (4, "carry_keys")])
 @pytest.mark.parametrize("marked", [False, True])
-def test_a_sequence_goes_on_from_the_middle(name, begin, stored, marked):
+def test_sequence_resumes_from_the_middle(name, begin, stored, marked):
     """From all that was believed; or from what is carried, of which what was smoothed follows."""
     filter = RESUMED[name]()
     frames = filter.draw_noise(readings(2, 9))
@@ -57,7 +57,7 @@ def test_a_sequence_goes_on_from_the_middle(name, begin, stored, marked):
     assert not torch.equal(whole["belief", "mean"][:, -1], whole["belief", "mean"][:, 0])
 
 
-def test_an_iterated_smoother_goes_on_too():
+def test_iterated_smoother_resumes():
     plain = linear_denkf()
     parts = [plain["transition"], None, plain["observation"], plain["noise"]]
     filter = IEnKS(*parts, initial=plain.initial, observation_key="observation", process_noise=[0.0, 0.0])
@@ -77,7 +77,7 @@ def test_an_iterated_smoother_goes_on_too():
         torch.testing.assert_close(alone[key][:, 0], own.to(alone[key].dtype), rtol=0, atol=1e-12)
 
 
-def test_beliefs_count_where_marks_say_so_and_where_all_that_is_carried_is_stored():
+def test_stored_beliefs_are_used_at_marks_if_complete():
     filter, frames = linear_denkf(), readings(2, 9)
     frames["is_init"] = torch.zeros(2, 9, 1, dtype=torch.bool)
     frames["is_init"][1, 5] = True
@@ -183,7 +183,7 @@ def test_nan_in_an_unused_reading_of_a_reset_is_allowed(name, update_at_reset):
         torch.testing.assert_close(filter(first)["belief", "mean"], filter(row.copy())["belief", "mean"])
 
 
-def test_a_start_that_is_made_of_the_reading_uses_it():
+def test_initial_belief_from_the_reading_propagates_nan():
     start = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, observation_key="observation")
     broken = TensorDict({"observation": torch.zeros(2, 3, 2)}, [2, 3])
     broken["observation"][1, 0] = torch.nan

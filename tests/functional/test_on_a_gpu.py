@@ -39,7 +39,7 @@ def test_inverse_and_its_gradient(float64, as_on_a_gpu, size):
 
 
 @pytest.mark.parametrize("size", [2, LARGEST + 1])
-def test_what_is_not_positive_definite_is_nan_and_nothing_else(as_on_a_gpu, size):
+def test_indefinite_matrices_give_nan_in_their_row_only(as_on_a_gpu, size):
     matrix = torch.stack([torch.eye(size), -torch.eye(size), torch.zeros(size, size), torch.eye(size) * torch.nan])
     for value in as_on_a_gpu(inverse_of, matrix):
         assert value[0].isfinite().all()
@@ -111,7 +111,7 @@ def test_a_gpu_takes_no_tiles_of_a_cache(monkeypatch, as_on_a_gpu):
 
 @pytest.mark.parametrize("size", [2, LARGEST + 1])
 @pytest.mark.parametrize("place", [0, -1])
-def test_a_reading_of_infinite_noise_says_nothing(float64, as_on_a_gpu, size, place):
+def test_infinite_noise_equals_a_missing_reading(float64, as_on_a_gpu, size, place):
     forecast, noise = torch.randn(3, 16, size + 1, requires_grad=True), torch.ones(3, size)
     noise[:, place] = torch.inf
     given = forecast, 2 * forecast[..., :size], torch.randn(3, 16, size), noise

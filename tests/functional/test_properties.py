@@ -81,7 +81,7 @@ def test_an_analysis_in_other_units(seed, batch, members, states, readings, sche
 
 @FIXED
 @given(SEEDS, BATCHES, MEMBERS, DIMS, st.integers(2, 6), SCHEMES, SPACES, st.sampled_from([math.nan, math.inf, 1e300]))
-def test_what_is_not_observed_is_as_if_it_were_not_there(seed, batch, members, states, readings, scheme, space, junk):
+def test_missing_observation_equals_a_smaller_observation(seed, batch, members, states, readings, scheme, space, junk):
     problem = Problem(seed, batch, members, states, readings)
     seen = problem.draw.mask(readings)
     seen[0] = True

@@ -156,7 +156,7 @@ PATTERNS = {
 @pytest.mark.parametrize("joint", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_late_readings_give_what_they_give_in_order(float64, kind, joint, pattern):
+def test_late_readings_equal_ordered_readings(float64, kind, joint, pattern):
     frames, late = readings(), PATTERNS[pattern]
     key = {} if pattern == "three steps late" else {"late_key": "late"}
     out = fused(kind, joint=joint, delay=DELAY, **key).sequence(arriving(frames, late))
@@ -181,7 +181,7 @@ def test_late_readings_of_an_ensemble_whose_motion_is_known(float64, joint, patt
 
 
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
-def test_what_belongs_to_the_time_before_an_episode_is_not_observed(float64, kind):
+def test_readings_from_before_the_episode_are_ignored(float64, kind):
     frames = readings()
     members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
     frames["is_init"][:, 6] = True
@@ -207,7 +207,7 @@ def moved_and_read(steps, late, reading, *, mean, cov, noise):
 
 @pytest.mark.parametrize("update_at_reset", [False, True])
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
-def test_a_late_reading_is_of_the_step_it_says_or_of_none(float64, kind, update_at_reset):
+def test_late_reading_belongs_to_its_stated_step_or_none(float64, kind, update_at_reset):
     """Draws every step of the episode; not one before, not one to come, not one beyond the lag."""
     members, (F, Q, _, _) = torch.randn(7, 2), linear_system()
     if kind == "Kalman":
@@ -274,7 +274,7 @@ def inflated(frames, factor, *, noise=1.0, mean=None, cov=None):
     return means, covs, moved
 
 
-def test_inflation_spreads_the_present_and_the_past_follows_where_a_lag_is_put_around(float64):
+def test_inflation_acts_on_the_present_and_clones_follow(float64):
     """The smoother of Rauch, Tung and Striebel, by hand: it takes the inflated belief of the present for the belief."""
     frames, lag, F = readings(), 3, linear_system()[0]
     out = FixedLag(fused("Kalman", analysis=SPREAD["Kalman"]), lag).sequence(frames.copy())
@@ -303,7 +303,7 @@ def test_an_ensemble_with_a_lag_inflates_its_present_alone(float64):
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_inflation_that_would_spread_the_past_raises(joint):
+def test_inflation_of_clones_raises(joint):
     members = torch.randn(7, 2)
     for kind, analysis in SPREAD.items():
         with pytest.raises(ValueError, match=r"inflation or relaxation of .* let Refiltering make them again"):
@@ -368,7 +368,7 @@ def test_angles_side_by_side(float64):
     assert (means[0][-1, 0] > 3.1).all(), "further, not back through zero"
 
 
-def test_of_sampled_angles_side_by_side_the_mean_is_that_of_directions(float64):
+def test_mean_of_sampled_angles_is_circular(float64):
     samples = torch.tensor([torch.pi - 0.1, 0.3 - torch.pi, 0.1 - torch.pi]).unsqueeze(-1)  # by 0.1 beyond pi
     numbers = torch.tensor([[1.0], [2.0], [6.0]])
     td = TensorDict({"a": numbers, "b": samples, "qa": torch.ones(1), "qb": torch.ones(1)})
@@ -454,7 +454,7 @@ def test_errors_that_last_are_those_of_a_kalman_filter_that_holds_them(float64, 
 
 
 @pytest.mark.parametrize("noise", [False, True])
-def test_what_an_error_and_a_linear_motion_learn(float64, noise):
+def test_gradients_of_bias_and_linear_motion(float64, noise):
     """F, B and Q of the user's own transition, and size and time of the error: gradients by finite differences."""
     F, Q, H, R = linear_system()
     error = FadingBias([0.8, 0.6], 6.0)

@@ -74,7 +74,7 @@ def test_small_angles_are_plain_numbers(kind):
 
 
 @pytest.mark.parametrize("kind", TRANSITIONS)
-def test_late_readings_give_nearly_what_filtering_again_gives(kind):
+def test_late_readings_nearly_equal_refiltering(kind):
     """Steps that were made before a reading came are linear in what it says; the error is a product of angles."""
     data = arriving(log(), LATE)
     out = orientations(kind, late_key="late").sequence(data.clone())

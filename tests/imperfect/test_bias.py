@@ -134,7 +134,7 @@ def test_each_component_gets_its_biases():
     torch.testing.assert_close(read["forecast", "observation"], torch.tensor([[1.02, 2.31]]))
 
 
-def test_what_cannot_be_raises():
+def test_invalid_arguments_raise():
     with pytest.raises(ValueError, match="time, in steps"):
         FadingBias([1.0], time=0.0)
     with pytest.raises(ValueError, match="2 components of the reading, and there are 1"):
@@ -261,7 +261,7 @@ def residuals(runs, steps, *, std=(2.0, 0.5), time=(10.0, 3.0), white=(0.5, 1.0)
 
 
 @pytest.mark.parametrize("gaps", [False, True])
-def test_residuals_tell_size_and_time(gaps):
+def test_size_and_time_constant_from_residuals(gaps):
     """400 runs of 100 steps hold N T / (2 time) = 2,000 and 6,700 draws of the biases apart from each other: their
 
     variances are known to sqrt(2 / 2000) = 3 %, standard deviations to 1.6 %, and times, a ratio of two such, to about
@@ -278,7 +278,7 @@ def test_residuals_tell_size_and_time(gaps):
     assert white.tolist() == pytest.approx([0.5, 1.0], rel=0.06)
 
 
-def test_errors_of_a_whole_run_beside_those_that_fade():
+def test_constant_and_fading_biases_together():
     """400 draws of a run's error: its standard deviation is known to 3.5 %; the others as above."""
     values = residuals(400, 100) + torch.tensor(np.random.default_rng(1).normal(size=(400, 1, 2)) * [1.5, 1.0])
     values[0] = torch.nan  # a run of which nothing is known

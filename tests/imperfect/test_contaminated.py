@@ -110,7 +110,7 @@ def test_a_forecast_that_has_diverged_is_a_third_part_of_the_mixture(name, readi
     assert [value.item() for value in found] == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_past_diverges_with_the_present(float64):
+def test_clones_diverge_with_the_present(float64):
     """The smoother's past and the present, as one state of both."""
     torch.manual_seed(0)
     members, past = torch.randn(12, 2), torch.randn(12, 3, 2)
@@ -357,7 +357,7 @@ def test_share_and_width_come_from_entries_and_from_heads(name):
         assert_close(number(td[row].clone())["belief", "mean"], by_entry["belief", "mean"][row], rtol=0, atol=1e-6)
 
 
-def test_what_cannot_be_raises():
+def test_invalid_arguments_raise():
     inner = EnsembleAnalysis("etkf")
     for options in (
         {"share": -0.1},
@@ -386,7 +386,7 @@ def test_what_cannot_be_raises():
 
 
 @pytest.mark.parametrize("name", ["etkf", "Kalman", "particles"])
-def test_a_head_learns_from_what_is_seen(name):
+def test_head_is_trained_by_observed_readings(name):
     """Its frame may be NaN behind the mask: the gradient is that of the other rows."""
     inner = "particles" if name == "particles" else SEVERAL[name]()
     td = several(samples=False).set("light", torch.tensor([[0.1], [torch.nan], [0.5]]).double())

@@ -304,7 +304,7 @@ def test_in_an_environment(make, update_at_reset, apart):
     assert silent["next", *COUNT].equal((1 + apart) * missing.long())
 
 
-def test_a_filter_that_reads_another_mask_is_told():
+def test_filter_with_another_mask_raises():
     env = TransformedEnv(toy_base_env(), RejectReadings({"observation": "seen"}))
     with pytest.warns(UserWarning, match="RejectReadings marks where 'observation' is missing in 'seen', which no mod"):
         env.append_transform(DEnKFTransform(toy_filter())).rollout(2)
@@ -348,7 +348,7 @@ def test_bad_readings_raise(rows, others, message, apart):
     assert out[COUNT].sum() == 0
 
 
-def test_of_several_bad_numbers_one_that_no_mask_hides_raises():
+def test_unmasked_invalid_value_among_masked_ones_raises():
     seen = torch.tensor([[False, True]])
     td = of("x", [NAN, INF], seen=seen)
     with pytest.raises(ValueError, match=r"^'x' is inf at \[0, 1\]"):

@@ -235,7 +235,7 @@ def test_masks_are_heeded(name):
         assert_close(out["info", "log_likelihood"][2], torch.logaddexp(own + math.log(0.7), other + math.log(0.3)))
 
 
-def test_a_head_says_what_it_was_told_to_start_from():
+def test_head_outputs_its_initial_value():
     head = Visibility(4, start=0.7, floor=0.01)
     encoding = torch.randn(5, 4)
     assert_close(
@@ -252,7 +252,7 @@ def test_a_head_says_what_it_was_told_to_start_from():
             Visibility(4, **wrong)
 
 
-def test_what_cannot_be_raises():
+def test_invalid_arguments_raise():
     inner = EnsembleAnalysis("etkf")
     with pytest.raises(ValueError, match="broad"):
         Visible(inner, broad=1.0)

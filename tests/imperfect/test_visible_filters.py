@@ -154,7 +154,7 @@ def late(kind, r=1.0, *, analysis=None, delay=2):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("delay", [0, 2])
-def test_late_readings_of_which_it_is_certain(float64, kind, delay):
+def test_late_readings_with_certain_visibility(float64, kind, delay):
     td = frames(2, 9).rename_key_("observation", "late").rename_key_("observed", "late_observed")
     td["own"], td["own_observed"] = torch.randn(2, 9, 2), torch.rand(2, 9, 1) < 0.5
     told, masked = certain(td, "late_observed")
@@ -165,7 +165,7 @@ def test_late_readings_of_which_it_is_certain(float64, kind, delay):
         assert_close(out[key], expected[key], rtol=0, atol=1e-9)
 
 
-def test_a_past_and_the_present_have_the_moments_of_one_mixture(float64):
+def test_clones_and_present_share_one_mixture(float64):
     """The ensemble smoother's members of both, side by side; the present is the filter's own."""
     torch.manual_seed(0)
     members, analysis = torch.randn(12, 3), EnsembleAnalysis("etkf", observation_key="reading")
@@ -187,12 +187,12 @@ def test_a_past_and_the_present_have_the_moments_of_one_mixture(float64):
 
 @BOTH
 @pytest.mark.parametrize(("make", "smoother"), [(linear_denkf, EnRTS), (linear_kalman, RTSSmoother)])
-def test_smoothers_run_behind_it(float64, make, smoother, share):
+def test_smoothers_with_visibility(float64, make, smoother, share):
     out = smoother(WRAPPED[share](make()))(frames(2, 8))
     assert_close(out["smoothed", "mean"][:, -1], out["belief", "mean"][:, -1])
 
 
-def test_a_gate_does_not_go_around_it_for_particles():
+def test_gate_around_visibility_of_particles_raises():
     with pytest.raises(TypeError, match="no analysis that a gate goes around"):
         Gated(heeds(bootstrap(50)), 2)
 

@@ -47,7 +47,7 @@ def test_gradients_go_through_wrapped_angles():
     torch.testing.assert_close(estimated.grad, torch.tensor([[2.0, 2 * (6 - 2 * math.pi)]]).double())
 
 
-def test_errors_say_what_to_do():
+def test_invalid_input_raises():
     assert_raises(ValueError, "for ensembles pass the mean", state_errors, torch.zeros(4, 8, 3), torch.zeros(4, 3))
     with pytest.raises(ValueError, match="point has shape"):
         state_errors(torch.zeros(4, 3), torch.zeros(4, 3), space=Circle())

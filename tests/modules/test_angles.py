@@ -69,7 +69,7 @@ def test_ensemble_analysis(scheme, samples, batch):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_ensemble_analysis_of_what_is_observed(scheme):
+def test_ensemble_analysis_of_observed_components(scheme):
     here, there = ensembles((3,), True)
     for td in (here, there):
         td["observed"] = torch.tensor([[True, True], [False, True], [False, False]])

@@ -69,7 +69,7 @@ UPDATES = {
 
 
 @pytest.mark.parametrize("name", UPDATES)
-def test_what_goes_around_passes_on_all_that_the_update_declares(name):
+def test_wrapper_passes_on_all_declarations(name):
     inside = UPDATES[name]()
     declared = {key for key in vars(Update) if not key.startswith("_")} - OWN
     assert {"reading_keys", "observed_key", "space", "reading_dims", "with_mask", "info_prefix"} <= declared
@@ -109,7 +109,7 @@ def test_entries_that_are_aligned_go_through_the_wrapper_all_the_same():
 
 
 @pytest.mark.parametrize("name", ["lagged", "visible, lagged"])
-def test_a_lag_goes_inside_of_what_goes_around(name):
+def test_lag_is_applied_inside_wrappers(name):
     """The past is corrected by what the wrapper makes of the reading."""
     plain = EnsembleAnalysis("etkf") if name == "lagged" else Visible(EnsembleAnalysis("etkf"))
     around = lagged(ScaledInnovation(plain, 0.5))

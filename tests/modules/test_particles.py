@@ -126,7 +126,7 @@ def test_noise_model_reads_the_weighted_mean(weights, name, space):
     assert model.module.layers[0].weight.grad.abs().sum() > 0
 
 
-def test_noise_model_reads_what_it_may():
+def test_noise_model_inputs():
     class Lit(SubModel):
         def __init__(self):
             super().__init__(torch.nn.Identity(), [("belief", "mean")], [("forecast", "q")], optional_keys=["light"])

@@ -143,7 +143,7 @@ def test_a_pose_that_is_known_exactly(dtype):
         directional_check(loss, [velocity.layers[0].weight], rtol=1e-4)
 
 
-def test_points_are_drawn_anew_for_the_analysis(float64):
+def test_sigma_points_are_redrawn_for_the_analysis(float64):
     # With the forecast's points, process noise would not reach the innovation's covariance: S would be R.
     td = TensorDict({"belief": {"mean": torch.zeros(1), "cov": torch.zeros(1, 1)}})
     td["sensor"] = {"ensemble": torch.ones(1), "noise": torch.ones(1)}

@@ -61,7 +61,7 @@ def test_gaps_are_as_if_the_labels_were_not_there(name, how):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_whatever_stands_in_a_gap_has_no_value_and_no_gradient(name):
+def test_gaps_have_no_loss_and_no_gradient(name):
     filter, frames, _, loss = case(name)
     _, labelled = gaps()
     first = sum(loss(hidden(frames, labelled, "mask")).values())

@@ -129,7 +129,7 @@ def test_a_filter_of_one_sensor_with_keys_of_its_own(kind, score):
     torch.testing.assert_close(loss(drive)["loss_sensor"], off(drive).abs().mean())
 
 
-def test_a_frame_that_is_missing_is_named_with_what_is_there():
+def test_missing_entry_is_named_with_the_available_ones():
     loss = SensorLoss(fused("ensemble", lidar=True))
     loss.set_keys(sensor="lidar")
     with pytest.raises(KeyError, match=r"SensorLoss reads 'scan', which is missing. There is .*scans"):

@@ -146,7 +146,7 @@ def test_the_transition_from_true_states_by_hand(score):
     torch.testing.assert_close(loss(frames.reshape(14))["loss_transition"], value, **CLOSE)
 
 
-def test_what_starts_and_what_is_padding_does_not_count():
+def test_resets_and_padding_are_not_scored():
     filter = toy_denkf(layer="none")
     frames, _ = problem(filter)
     loss = TransitionLoss(filter, score="mse", reduction="none")

@@ -102,7 +102,7 @@ OPTIONS = {
 
 @pytest.mark.parametrize("options", OPTIONS)
 @pytest.mark.parametrize("name", LOSSES)
-def test_angles_and_numbers_are_scored_as_they_were(name, options):
+def test_angles_and_numbers_equal_the_plain_scores(name, options):
     # Headings on both sides of the cut, and members within half a turn of the truth.
     space = Product(Circle(), Euclidean(2))
     data = for_kind(name, beliefs(space, torch.tensor([math.pi - 0.05, 1.0, -2.0])))
@@ -120,7 +120,7 @@ def test_angles_and_numbers_are_scored_as_they_were(name, options):
 
 @pytest.mark.parametrize("space", [SO3(), SE2(), SE3(), SE23()], ids=repr)
 @pytest.mark.parametrize("name", LOSSES)
-def test_near_a_point_they_are_those_of_numbers(name, space):
+def test_losses_near_a_point_equal_euclidean_losses(name, space):
     small, size = 1e-4, space.tangent_dim
     numbers = for_kind(name, beliefs(Euclidean(size), torch.zeros(size), spread=1.0))
     center = space.exp(torch.randn(size))

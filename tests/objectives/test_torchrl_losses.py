@@ -225,7 +225,7 @@ def sac(filter, *, inside, **options):
     return actor, head, options
 
 
-def test_sac_on_what_the_filter_believes_now(float64):
+def test_sac_on_recomputed_beliefs(float64):
     """Both losses written out, with the beliefs of each step by hand; what was stored must not matter."""
     filter, frames = filter_and_frames()
     data = collected(filter, frames)

@@ -86,7 +86,7 @@ def test_each_component_is_shaded_by_its_own_sensors_mask():
         plot_bands(run, observed={1: "imu"})
 
 
-def test_angles_stay_beside_the_mean():
+def test_angles_are_unwrapped_around_the_mean():
     rng = torch.Generator().manual_seed(0)
     theta = torch.linspace(0, 9, 30)
     wrap = wrap_angles

@@ -72,7 +72,7 @@ def test_a_wrap_is_drawn_as_a_wrap():
     assert min(turns[2:4]) > 1, "yaw and heading do"
 
 
-def test_the_ensembles_band_is_made_of_its_members_angles():
+def test_band_of_an_ensemble_uses_its_members_angles():
     run = turning_run()
     axes = plot_bands(run, space=SPACE, dims=[2])[0]
     _, low, high = band(axes)

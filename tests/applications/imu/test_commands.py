@@ -27,7 +27,7 @@ def log_of(request, tmp_path):
     return file, truth
 
 
-def test_it_writes_orientations_and_a_picture(log, tmp_path, capsys):
+def test_command_writes_orientations_and_a_picture(log, tmp_path, capsys):
     pytest.importorskip("matplotlib")
     file, truth = log
     assert main(["orient", "--log", str(file), "--out", str(tmp_path / "out")]) == 0

@@ -131,7 +131,7 @@ def reference(rows, s):
 
 @torch.no_grad()
 @pytest.mark.parametrize("axes", [9, 6])
-def test_it_is_the_error_state_kalman_filter(axes):
+def test_equals_the_error_state_kalman_filter(axes):
     _, log = body_log()
     if axes == 6:
         del log["magnetometer"]
@@ -198,7 +198,7 @@ def test_a_log_that_is_not_one():
 
 
 @pytest.mark.slow
-def test_compiled_it_believes_the_same():
+def test_compiled_equals_eager():
     """The first compiled step is compared with the eager one, and raises if it differs."""
     _, log = body_log(100)
     model = from_pretrained("imu").double()

@@ -43,7 +43,7 @@ def test_the_sensors_read_how_their_place_moves():
     assert (change - world[2:]).square().mean().sqrt() < 0.03 * change.square().mean().sqrt()
 
 
-def test_feet_that_stand_press_the_floor_and_carry_the_robot(log):
+def test_contact_forces_carry_the_robot(log):
     weight = quadruped_env().model.body_mass.sum() * 9.81
     assert log["force"].sum(-1).mean() == pytest.approx(weight, rel=0.1)
     assert ((log["force"] > 150) <= log["contact"]).all()

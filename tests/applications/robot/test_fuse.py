@@ -133,7 +133,7 @@ def test_noises_that_are_learned_are_those_of_the_log(tmp_path):
         learn_noises(model, rows[:5], steps=1, shown=False)
 
 
-def test_what_was_learned_is_kept_when_it_is_interrupted(tmp_path, monkeypatch):
+def test_interrupted_learning_keeps_its_result(tmp_path, monkeypatch):
     log, model = planar(tmp_path, 20.0)
     rows, calls = rows_of_log(log, model), []
 

@@ -76,7 +76,7 @@ def test_minimum_jerk():
     assert tau[speed.argmax()] == pytest.approx(0.5, abs=1e-3)
 
 
-def test_a_path_is_straight_in_space_and_ends_where_it_should(scene):
+def test_path_is_straight_and_ends_at_the_target(scene):
     start = np.append(inverse_kinematics(scene, np.array([-0.1, 0.1, 0.3]), tool_down(0.2, 0.2), READY), 0.8)
     waypoints = [
         Waypoint(np.array([0.1, -0.1, 0.1]), tool_down(-0.5, 0.1), 0.8, 60),

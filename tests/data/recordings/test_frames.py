@@ -27,7 +27,7 @@ def write_varying(av, file, times):
         container.mux(stream.encode())
 
 
-def test_no_frame_is_lost_where_the_rate_varies(tmp_path):
+def test_variable_frame_rate_loses_no_frame(tmp_path):
     av = pytest.importorskip("av")
     times = np.array([0.0, 0.5, 1.0, *(1.5 + np.arange(40) / 200)])
     write_varying(av, tmp_path / "run.mkv", times)
@@ -38,7 +38,7 @@ def test_no_frame_is_lost_where_the_rate_varies(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["run.mkv", "run.avi"])
-def test_a_video_that_lost_its_end_is_told(tmp_path, name):
+def test_truncated_video_is_reported(tmp_path, name):
     file = tmp_path / name
     write_video(file, 12)
     with warnings.catch_warnings():
@@ -54,7 +54,7 @@ def test_a_video_that_lost_its_end_is_told(tmp_path, name):
         assert (left["pixels"].numpy() == np.stack([grey(k).transpose(2, 0, 1) for k in shown])).all()
 
 
-def test_pictures_behind_a_damaged_one_keep_their_times(tmp_path):
+def test_images_after_a_damaged_one_keep_their_times(tmp_path):
     write_images(tmp_path / "run", [f"{k}.png" for k in range(4)])
     (tmp_path / "run" / "1.png").write_bytes(b"nothing")
     images = Images(tmp_path / "run", times=[0.0, 1.0, 3.0, 7.0])

@@ -82,7 +82,7 @@ def late_files(folder, seed=0):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("span", ["common", "all"])
-def test_a_reading_stands_in_the_row_after_it_arrived(tmp_path, seed, span):
+def test_reading_is_in_the_row_after_its_arrival(tmp_path, seed, span):
     recording, taken, arrived = late_files(tmp_path, seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -105,7 +105,7 @@ def test_a_fix_that_is_repeated_counts_once(tmp_path):
     assert (replay(state=state, gps=Table(file, ["gps"], repeats="keep")) == kept).all()
 
 
-def test_what_is_no_repeat(tmp_path):
+def test_values_that_are_no_repeats(tmp_path):
     """A robot that stands, an encoder's ticks, a temperature, commands that are held."""
     random, count = np.random.default_rng(0), 400
     speed = random.normal(size=count)

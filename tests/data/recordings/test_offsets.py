@@ -48,7 +48,7 @@ def test_delays_that_are_known():
     assert held >= 34
 
 
-def test_scales_tell_units():
+def test_units_from_scales():
     tables = drive(0)
     scales = {(delay.late, delay.early): delay.scale for delay in delays_between(tables, most=2.0)}
     assert scales["gps", "wheels"] == pytest.approx(1 / 3.6, rel=0.05)

@@ -66,7 +66,7 @@ def test_the_pose_matrix_is_kittis():
     np.testing.assert_allclose(rotation[:, 2], [-math.sin(0.4), 0, math.cos(0.4)])  # forward, and left of it
 
 
-def test_dead_reckoning_undoes_the_differences():
+def test_dead_reckoning_integrates_the_differences():
     rng = np.random.default_rng(0)
     velocities = torch.tensor(np.stack([rng.uniform(-3, 15, 200), rng.uniform(-0.3, 0.7, 200)], -1))
     path = dead_reckoning(velocities, torch.tensor([3.0, -2.0, 1.0]).double(), 0.103)

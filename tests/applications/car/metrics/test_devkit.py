@@ -46,7 +46,7 @@ def test_the_definition_written_out():
         torch.testing.assert_close(error.length_rotation[k], rows[:, 2].mean(), equal_nan=True, atol=1e-7, rtol=1e-7)
 
 
-def test_errors_say_what_to_do():
+def test_invalid_input_raises():
     path = straight(90)
     with pytest.raises(ValueError, match=r"the shortest path is 89\.0 m long; leave such paths out"):
         kitti_devkit_error(path, path)

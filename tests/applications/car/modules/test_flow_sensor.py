@@ -172,7 +172,7 @@ def test_unobserved_nan_rows_poison_nothing(columns):
     torch.testing.assert_close(out[[0, 2]], sensor(alone)["sensor", "ensemble"])
 
 
-def test_corners_tell_turn_and_pitch_where_there_are_any(float64):
+def test_corners_determine_turn_and_pitch(float64):
     sensor = only_the_road(make(two_view_key="two_view"))
     trunk = sensor.module["trunk"]
     silence(trunk.corner_gate)

@@ -113,7 +113,7 @@ IMAGES = {
 
 
 @pytest.mark.parametrize("what", [*ARGUMENTS, *IMAGES])
-def test_bad_input_says_what_to_do(what, checkpoint, drive):
+def test_invalid_input_raises(what, checkpoint, drive):
     options, match = ARGUMENTS.get(what, ({}, IMAGES.get(what, (None, None))[1]))
     images = frames_of(drive) if what in ARGUMENTS else IMAGES[what][0](frames_of(drive))
     with pytest.raises(ValueError, match=match):

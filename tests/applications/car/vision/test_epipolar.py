@@ -80,7 +80,7 @@ def test_images_of_a_turn_give_the_turn(disturb):
     assert motion[-1] > 0.5
 
 
-def test_what_hides_the_scene_gives_no_corners():
+def test_occlusion_gives_no_corners():
     """A box that stands still fills most of a turning view: its corners do not turn."""
     image = texture()[:, :414]
     other = turned(image, 0.04)

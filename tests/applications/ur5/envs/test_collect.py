@@ -99,7 +99,7 @@ def test_pictures_are_of_their_steps(tmp_path, domain):
     assert (data[:]["pixels"].numpy()[:4] == demos_of(tmp_path)[0].pixels.astype(np.float32) / 255).all()
 
 
-def test_an_interrupted_run_goes_on(unbroken, tmp_path):
+def test_interrupted_run_resumes(unbroken, tmp_path):
     """``tests/deployment`` shows that workers end with a killed parent, and that a second process must wait."""
     made = []
 
