@@ -95,7 +95,7 @@ def test_in_time_is_for_constant_matrices():
         linear_system().compile(mode="in time", dynamic=True)
 
 
-def test_in_time_reports_readings_as_a_step_does():
+def test_in_time_names_readings_of_another_dtype():
     for strategy in ({"chunk": 0}, {"mode": "in time"}):
         with pytest.raises(TypeError, match=r"got .*'observation' in torch.float64. Convert the data"):
             linear_system().compile(**strategy).sequence(TensorDict({"observation": torch.zeros(3, 2).double()}, [3]))

@@ -50,7 +50,7 @@ def test_two_savers_at_a_time(tmp_path):
         lambda config: config.update(checksum=3),
     ],
 )
-def test_changed_description_is_reported(tmp_path, change):
+def test_changed_description_raises(tmp_path, change):
     save(tmp_path, 2)
     config = json.loads((tmp_path / "config.json").read_text())
     change(config)

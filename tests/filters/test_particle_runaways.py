@@ -110,7 +110,7 @@ def test_gradients_stay_finite(resampling):
     assert gradient != 0
 
 
-def test_losing_all_particles_warns():
+def test_losing_all_particles_raises():
     filter = cubic_filter(8)
     readings, observed, _ = drive()
     frame = filter.initialise(frames(readings, observed)[0])

@@ -91,7 +91,7 @@ def test_two_filters_of_one_environment(float64, way):
             torch.testing.assert_close(again[key], out[key], rtol=0, atol=1e-12)
 
 
-def test_belief_overwritten_by_another_filter_raises():
+def test_belief_of_another_filter_warns():
     one, two = random_walk(), random_walk()
     row = TensorDict({"observation": torch.ones(1)}, [])
     row = one(row.set(("previous", *MEAN), torch.zeros(1)).set(("previous", "belief", "cov"), torch.eye(1)))

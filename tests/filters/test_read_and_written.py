@@ -48,7 +48,7 @@ class Count(SubModel):
         return count + 1
 
 
-def test_custom_module_that_reads_its_output_raises():
+def test_custom_module_that_reads_and_writes_an_entry_raises():
     with pytest.raises(ValueError, match=r"'count' \(Count\) writes 'count', which the filter also reads from outside"):
         camera(("count", Count()))
     tally = TensorDictModule(lambda count: count + 1, ["count"], ["count"])

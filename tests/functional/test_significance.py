@@ -163,7 +163,7 @@ def test_the_local_module_weighs_as_its_formula(cases):
         LocalEnsembleAnalysis(near, localisation="significance", threshold=torch.ones(5))
 
 
-def test_chunked_significance_equals_unchunked(float64, monkeypatch):
+def test_tiled_significance_equals_untiled(float64, monkeypatch):
     """More readings than members solve in ensemble space, so many states in tiles; with significance neither."""
     forecast, reading = torch.randn(5, 40), torch.randn(6)
     given = forecast, forecast[:, :6], reading, torch.ones(6)

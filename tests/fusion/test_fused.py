@@ -274,7 +274,7 @@ def inflated(frames, factor, *, noise=1.0, mean=None, cov=None):
     return means, covs, moved
 
 
-def test_inflation_acts_on_the_present_and_clones_follow(float64):
+def test_lagged_belief_follows_the_inflated_present(float64):
     """The smoother of Rauch, Tung and Striebel, by hand: it takes the inflated belief of the present for the belief."""
     frames, lag, F = readings(), 3, linear_system()[0]
     out = FixedLag(fused("Kalman", analysis=SPREAD["Kalman"]), lag).sequence(frames.copy())
@@ -454,7 +454,7 @@ def test_errors_that_last_are_those_of_a_kalman_filter_that_holds_them(float64, 
 
 
 @pytest.mark.parametrize("noise", [False, True])
-def test_gradients_of_bias_and_linear_motion(float64, noise):
+def test_gradients_of_coloured_noise_and_linear_motion(float64, noise):
     """F, B and Q of the user's own transition, and size and time of the error: gradients by finite differences."""
     F, Q, H, R = linear_system()
     error = FadingBias([0.8, 0.6], 6.0)

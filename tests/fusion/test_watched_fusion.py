@@ -155,7 +155,7 @@ def test_two_analyses_in_one_place_have_gates_of_their_own(float64):
     assert_close(out["belief", "mean"], expected["belief", "mean"])
 
 
-def test_package_keeps_the_memory_layout_of_the_example():
+def test_package_inputs_are_made_contiguous():
     signature = {"inputs": [("x", [2, 3], "torch.float32")], "outputs": ["y"], "carry": []}
     step = PackagedStep(lambda x: (torch.tensor(x.stride()),), signature)
     assert step({"x": torch.ones(3, 2).mT})["y"].tolist() == [3, 1]

@@ -48,7 +48,7 @@ def test_a_share_of_one_and_of_zero(dtype):
         assert_close(mixed, expected, rtol=0, atol=30 * torch.finfo(dtype).eps)
 
 
-def test_later_entries_do_not_change_earlier_ones():
+def test_further_components_do_not_change_the_first():
     after, before = updated(7, 9)
     share = torch.tensor([[0.4], [0.7]], dtype=torch.float64)
     assert_close(

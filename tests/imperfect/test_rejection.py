@@ -304,7 +304,7 @@ def test_in_an_environment(make, update_at_reset, apart):
     assert silent["next", *COUNT].equal((1 + apart) * missing.long())
 
 
-def test_filter_with_another_mask_raises():
+def test_filter_with_another_mask_warns():
     env = TransformedEnv(toy_base_env(), RejectReadings({"observation": "seen"}))
     with pytest.warns(UserWarning, match="RejectReadings marks where 'observation' is missing in 'seen', which no mod"):
         env.append_transform(DEnKFTransform(toy_filter())).rollout(2)

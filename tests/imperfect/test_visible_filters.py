@@ -192,7 +192,7 @@ def test_smoothers_with_visibility(float64, make, smoother, share):
     assert_close(out["smoothed", "mean"][:, -1], out["belief", "mean"][:, -1])
 
 
-def test_gate_around_visibility_of_particles_raises():
+def test_gate_around_visibility_raises_for_particles():
     with pytest.raises(TypeError, match="no analysis that a gate goes around"):
         Gated(heeds(bootstrap(50)), 2)
 

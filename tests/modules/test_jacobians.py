@@ -237,7 +237,7 @@ def test_unknown_jacobians_in_a_chain_are_differentiated():
 
 
 @pytest.mark.parametrize("kind", ["compute", "hook", "wrapper", "mixin"])
-def test_overriding_compute_disables_the_jacobian(float64, kind):
+def test_overriding_a_computation_replaces_its_jacobian(float64, kind):
     """Oracle: the factor."""
 
     class Doubled(Select):

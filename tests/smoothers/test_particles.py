@@ -45,7 +45,7 @@ def test_many_particles_are_the_exact_smoother(float64, lag):
     assert_close(out["smoothed", "log_weight"].exp().sum(-1), torch.ones(2, 7))
 
 
-def test_ancestors_of_many_particles_equal_the_lagged_smoother(float64):
+def test_ancestors_of_many_particles_equal_the_exact_smoother(float64):
     frames, size = drive(2, 7), 2000
     mean, cov = joint_beliefs(frames, 2)
     with torch.no_grad():

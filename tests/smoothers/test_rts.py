@@ -74,7 +74,7 @@ def test_update_at_reset_is_smoothed(float64, name):
 
 
 @pytest.mark.parametrize("name", ["EKF", "UKF", "BackpropKF"])
-def test_smoothed_loss_trains_the_filter(float64, name):
+def test_gradients_through_the_smoother(float64, name):
     filter, frames = learned_filter(name), learned_frames(3, 5)
     for smoother in (RTSSmoother(filter), FixedLag(filter, 2)):
         directional_check(

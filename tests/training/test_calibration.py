@@ -49,7 +49,7 @@ def test_coverage_of_each_dimension_in_any_batch(batch):
             assert result == last
 
 
-def test_rejected_readings_are_not_calibrated():
+def test_rejected_readings_are_not_held():
     values, seen = torch.tensor([[1.0], [9.0], [2.0]]), torch.ones(3, 1, dtype=torch.bool)
     held = hold_last(values, seen, torch.zeros(1), lambda step, last: (values[step] - last).abs() < 5)
     assert held.flatten().tolist() == [1.0, 1.0, 2.0]

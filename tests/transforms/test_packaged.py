@@ -84,7 +84,7 @@ def packaged_env(filter, step, batch_size=(), **options):
     return TransformedEnv(base_env(seed=0, batch_size=batch_size), DEnKFTransform(filter, packaged=step, **options))
 
 
-def test_failures_are_reported(packages, tmp_path):
+def test_mismatched_packages_raise(packages, tmp_path):
     filter, path, _, _ = packages["[3]"]
     step = load_step(path)
     with pytest.raises(KeyError, match="log_likelihood"):
