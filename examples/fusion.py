@@ -3,7 +3,7 @@
     python examples/fusion.py
 
 The wheel reads the speed 50 times a second, the laser the position ten times a second, and the GPS the position once a
-second, 0.3 s late. The program compares every set of sensors, heeds and ignores the delay, filters steps of irregular
+second, 0.3 s late. The program compares every set of sensors, uses and ignores the delay, filters steps of irregular
 length, and learns when not to believe the laser. No data set. It takes a minute. The page behind this one is
 ``docs/how_to/several_sensors.md``; measured errors on a robot's arm and on a car are in ``docs/results/fusion.md``.
 """

@@ -257,7 +257,7 @@ def main() -> None:
     mean, seen, readings, alone = data.statistics["state", "mean"], [], [], []
     for episode in unseen.episodes[:5]:
         seen.append(believe(denkf, unseen, episode))
-        # The same sensor without a filter: its last reading is held where there is none. The same filter, blind.
+        # The same sensor without a filter: its last reading is held if there is none. The same filter, blind.
         reading = seen[-1]["sensor", "ensemble"].mean(-2)
         readings.append(hold_last(reading, seen[-1]["observed"], mean))
         alone.append(believe(denkf, blind, episode)["belief", "mean"])

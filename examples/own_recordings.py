@@ -53,7 +53,7 @@ from torch_denkf.modules import (
 from torch_denkf.plots import plot_bands
 from torch_denkf.training import hold_last
 
-RATE = 20.0  # rows a second of the data set
+RATE = 20.0  # rows per second of the data set
 
 
 def make_recordings(root: Path, runs: int, seconds: float) -> None:

@@ -3,8 +3,8 @@
     python examples/ur5.py                  # demos that are collected here: MuJoCo, an expert that picks and pushes
     python examples/ur5.py --root DEMOS     # a folder that `denkf collect-ur5` filled,
 
-The camera sends a picture every seventh step, about. The sensor reads joints and place from it; the filter learns how
-commands move the arm, and goes on between pictures. ``examples/kitti.py``, ``lerobot.py`` and ``own_recordings.py`` are
+The camera sends an image about every seventh step. The sensor reads joints and position from it; the filter learns how
+commands move the arm, and predicts between images. ``examples/kitti.py``, ``lerobot.py`` and ``own_recordings.py`` are
 the same page for other robots. The full study, with every filter and disturbance, is ``python -m benchmarks.ur5``.
 
 Without --root it takes about four minutes of one core. 40 unseen demos with pictures in 10 % of the steps, mean

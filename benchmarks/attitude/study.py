@@ -30,7 +30,7 @@ STEADY = slice(50, 1168)  # rows of iCub's log that are scored; studies of its v
 PULLS = (0.1, 0.2, 0.5, 1.0)  # 1/s; Mahony's integral gain is a twentieth of it
 #: In rad, of one reading: the accelerometer's direction is off while the body is pushed, for many rows in the same way.
 UP_NOISES = (0.3, 0.5, 1.0, 2.0)
-#: In m/s, of one of ten readings a second that the body rests: a velocity lasts for many of them, too.
+#: In m/s, of one of ten readings per second that the body rests: a velocity lasts for many of them, too.
 REST_NOISES = (1.0, 2.0, 3.0, 5.0)
 #: rad/s/sqrt(Hz): the data sheet's; of iCub set by us, because the times of its rows jitter by milliseconds.
 GYRO_NOISES = {"simulated": Sensors().gyro_noise, "iCub": 5e-3}
@@ -264,7 +264,7 @@ def page(rows: list[dict], study: Study) -> str:
         f"filter's covariance, over its expectation: above 1 a filter is too sure. The {LEVEL:.0%} intervals are those "
         "of the tilt about x and about y.",
     ]
-    titles = ("filter", "setting", "tilt, deg", "largest, deg", "orientation, deg", "NEES", "coverage", "ms a step")
+    titles = ("filter", "setting", "tilt, deg", "largest, deg", "orientation, deg", "NEES", "coverage", "ms per step")
     for data, reads in dict.fromkeys((row["data"], row["reads"]) for row in rows):
         lines += ["", f"## {data}: {reads}", "", *head(*titles)]
         for row in rows:

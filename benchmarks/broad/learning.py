@@ -62,7 +62,7 @@ class Learning:
 
     data: Path = Path("../shared/data/broad")  # folder with .npz files of BROAD
     out: Path | None = None  # numbers.json
-    start: Path | None = None  # numbers.json of the same folds to go on from, else the library's defaults
+    start: Path | None = None  # numbers.json of the same folds to continue from, else the library's defaults
     generations: int = 22  # of the evolution strategy
     seed: int = 0
     smoke: bool = False  # one simulated trial, one generation

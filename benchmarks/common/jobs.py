@@ -24,7 +24,7 @@ def once(file: Path, rows: Callable[[], list[dict]]) -> None:
 
 
 def same_settings(out: Path, settings: dict) -> None:
-    """Leaves settings in ``out/settings.json``; a study that goes on there needs the same.
+    """Leaves settings in ``out/settings.json``; a study that continues there needs the same.
 
     Raises:
         SystemExit: if others are there; names them.

@@ -22,7 +22,7 @@ def draw_frontier(
     time: str = "ms_per_step",
     limit: float | None = None,
 ) -> None:
-    """Draws error against milliseconds a step: one line a filter, a dot for each of its numbers of members.
+    """Draws error against milliseconds per step: one line a filter, a dot for each of its numbers of members.
 
     Args:
         rows: with ``"filter"``, ``"members"``, the error and the time; the number is written next to the first and the
@@ -49,7 +49,7 @@ def draw_frontier(
             axis.annotate(str(own[end]["members"]), points[end], (4, 4), textcoords="offset points", fontsize=8)
     errors = [row[error] for row in kept]
     wide = max(errors) > 2 * min(errors)  # less shows hardly a label on a logarithmic scale
-    axis.set(xscale="log", yscale="log" if wide else "linear", xlabel="ms a step, one thread", ylabel=label)
+    axis.set(xscale="log", yscale="log" if wide else "linear", xlabel="ms per step, one thread", ylabel=label)
     for scale in (axis.xaxis, axis.yaxis) if wide else (axis.xaxis,):
         scale.set_major_formatter("{x:g}")
         scale.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "235" else "")

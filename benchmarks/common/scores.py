@@ -33,7 +33,7 @@ def belief_crps(out: TensorDict, dims: Sequence[int], unit: Tensor, floor: float
 
 @torch.no_grad()
 def cost(model: Filter, run: Callable[[], object], steps: int) -> dict[str, float]:
-    """Parameters behind the sensor, and milliseconds a step of a run without it: the least of three runs."""
+    """Parameters behind the sensor, and milliseconds per step of a run without it: the least of three runs."""
     parameters = {id(p): p.numel() for name, p in model.named_parameters() if not name.startswith("module.sensor.")}
     seconds = []
     for _ in range(3):

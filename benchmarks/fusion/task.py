@@ -35,7 +35,7 @@ class Task:
         train: windows ``[N, T]`` on which noise and weights are trained.
         test: recordings ``[N, T]``.
         parts: what is trained: the modules of the noise.
-        build: makes a filter of these, from the network of its weights and whether it heeds delays.
+        build: makes a filter of these, from the network of its weights and whether it uses delays.
         heeds: whether the usual filter does.
         loss: of a filter's output, to be trained on.
         error: of a belief against the truth, ``[N, T, D]``, in ``unit``.

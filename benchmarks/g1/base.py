@@ -59,7 +59,7 @@ class TrainedSensor:
         return HandPlace(data, rows_of(data, self.roles.sensor), data.storage[:]["state"][:, list(ARM)])
 
     def pool(self, numbers: list[int], most: int | None = None) -> FramePool:
-        """Returns frames of episodes that have a new picture, at most about so many."""
+        """Returns frames of episodes that have a new picture, at most about this many."""
         data, rows = self.recordings.data, rows_of(self.recordings.data, numbers)
         rows = rows[data.storage[:]["observed"].squeeze(-1)[rows]]
         rows = rows[:: max(len(rows) // most, 1)] if most else rows

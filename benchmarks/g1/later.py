@@ -26,7 +26,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.fusion import BeliefAhead, FusedFilter, FusedSensor
 from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, LinearTransition, MomentPrior, Select
 
-RATE, LEVEL = 30, 1.6449  # rows a second; of a normal distribution, the 90 % interval
+RATE, LEVEL = 30, 1.6449  # rows per second; of a normal distribution, the 90 % interval
 ENCODER = 0.1 * torch.pi / 180  # noise of the encoders, a standard deviation in rad
 FIRST = 15  # rows after which a filter is scored: it has forgotten its start
 FACTORS = (1.0, 1.2, 1.4, 1.7, 2.0)  # on the standard deviations of the motion's noise

@@ -31,7 +31,7 @@ from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import ConstantNoise, LearnedTransition, MappedNoise, MomentPrior, Select
 from torch_denkf.training import hold_last
 
-RATE = 30  # rows a second
+RATE = 30  # rows per second
 ENCODER = math.radians(0.1)  # standard deviation of an encoder's reading, rad
 COMMANDS = 8  # of the last rows, that the joints follow
 SURPRISE = 2.0  # factor on what the motion missed in training: of 1, 1.5, 2 and 3, on the validation episodes

@@ -26,7 +26,7 @@ class Gpu:
 
     out: Path | None = None  # folder for gpu.jsonl, gpu.json and gpu.md
     parts: some_of(PARTS) = tuple(PARTS)  # type: ignore[valid-type]  # which parts, in this order
-    ways: some_of(WAYS) = ("eager", "graph")  # type: ignore[valid-type]  # "compiled": a minute a row
+    ways: some_of(WAYS) = ("eager", "graph")  # type: ignore[valid-type]  # "compiled": a minute per row
     device: Literal["cuda", "cpu"] = "cuda"
     seconds: float = 0.3  # for which a case is timed
     limit: float = 360.0  # seconds in all
@@ -112,7 +112,7 @@ def about(device: str) -> dict[str, str]:
 def page_of(rows: list[dict[str, Any]], about: dict[str, str], smoke: bool) -> str:
     """Returns the Markdown page."""
     versions = ", ".join(f"{name} {value}" for name, value in about.items() if name not in ("device", "date"))
-    text = ["# On a GPU", "", f"{about['device']}; {versions}; {about['date']}. Medians, in ms a call."]
+    text = ["# On a GPU", "", f"{about['device']}; {versions}; {about['date']}. Medians, in ms per call."]
     for part in dict.fromkeys(row["part"] for row in rows):
         text += ["", f"## {part.capitalize()}", ""]
         text += head("what", "state", "batch", "steps", "gradients", "way", "ms", "steps/s", "first call, s", "note")

@@ -165,7 +165,7 @@ class Laboratory:
         return agent
 
     def trained(self, arm: str, batches: int) -> PPO:
-        """Returns a policy that was trained with what an arm reads; goes on where it was stopped."""
+        """Returns a policy that was trained with what an arm reads; resumes where it stopped."""
         agent, file, first = self.agent(arm, batches), self.study.out / f"{arm}.pt", 0
         parts = {"loss": agent.loss, "optimiser": agent.optimiser, "schedule": agent.schedule}
         if file.exists():

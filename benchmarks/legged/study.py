@@ -43,7 +43,7 @@ SCORES = {
     "drift": ("drift, %", 1),
     "nees": ("NEES", 2),
     "held": ("coverage", 2),
-    "ms": ("ms a step", 0),
+    "ms": ("ms per step", 0),
 }
 HEADS = ("joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)")
 SHOWN = list(DATA["quadruped"])[1]  # in the picture

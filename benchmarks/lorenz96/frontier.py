@@ -1,4 +1,4 @@
-"""Error against milliseconds a step on Lorenz-96: ensemble filters of many sizes, EKF, UKF, particle filter.
+"""Error against milliseconds per step on Lorenz-96: ensemble filters of many sizes, EKF, UKF, particle filter.
 
 The standard set-up of :mod:`benchmarks.lorenz96.schemes`: 40 variables, all observed with unit variance, no model
 noise. All filters know the equations and R. Each filter, at each size, gets one setting on validation records: an
@@ -124,7 +124,7 @@ def _rows(*arguments) -> list[dict]:
 
 @dataclass
 class Frontier:
-    """Error against milliseconds a step: ensemble filters of many sizes, EKF, UKF, particle filter."""
+    """Error against milliseconds per step: ensemble filters of many sizes, EKF, UKF, particle filter."""
 
     sizes: tuple[int, ...] = (8, 16, 32, 64, 128, 256, 512, 1024)  # members
     records: int = 4  # to choose by, and as many to test on
@@ -159,7 +159,7 @@ class Frontier:
 
     def _page(self, rows: list[dict], seconds: float) -> str:
         lines = [
-            "# Lorenz-96: error against milliseconds a step",
+            "# Lorenz-96: error against milliseconds per step",
             "",
             f"{VARIABLES} variables, all observed with R = 1, no model noise, steps of 0.05 time units; all "
             f"filters know the equations and R, and begin around the truth with a standard deviation of 1. The "
@@ -167,14 +167,14 @@ class Frontier:
             f"of {self.steps} steps without the first {self.burn_in}. The readings' own RMSE is 1. ms: processor "
             f"time, one record, one thread, the least of {RUNS} runs of {TIMED} steps, each step compiled.",
             "",
-            *head("filter", "members", "setting", "RMSE, validation", "RMSE", "ms a step", "ms, not compiled"),
+            *head("filter", "members", "setting", "RMSE, validation", "RMSE", "ms per step", "ms, not compiled"),
         ]
         for row in rows:
             numbers = (f"{row[k]:.3f}" for k in ("validation_rmse", "rmse", "ms_per_step", "eager_ms_per_step"))
             lines.append(line(row["filter"], row["members"], row["setting"], *numbers))
         lines += [
             "",
-            "![RMSE against milliseconds a step](frontier.png)",
+            "![RMSE against milliseconds per step](frontier.png)",
             "",
             *made_by("lorenz96", f", {seconds:.0f} s"),
         ]

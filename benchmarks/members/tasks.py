@@ -228,7 +228,7 @@ def resized(filter: Any, members: int, threshold: float | None) -> Any:
 
 
 def reacher(episodes: int = 10, steps: int = 400) -> Task:
-    """Returns joint velocities of the reacher by the filter that comes with the library, under random actions."""
+    """Returns joint velocities of the reacher by the pretrained filter, under random actions."""
     scores = []
     for seed in (1000, 2000):
         torch.manual_seed(seed)

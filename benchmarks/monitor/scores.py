@@ -46,7 +46,7 @@ def detection(runs: Sequence[Run]) -> dict[str, float]:
 
     Returns:
         ``auroc`` of the evidence for "in a fault" against "not"; ``delay_steps``, the median of the steps from a
-        fault's first to the first with an alarm, infinite where there is none; ``found``, the share of the faults that
+        fault's first to the first with an alarm, infinite if there is none; ``found``, the share of the faults that
         raise an alarm while they last.
     """
     scores, labels, delays = [], [], []

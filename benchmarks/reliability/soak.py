@@ -34,7 +34,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Soak:
-    """Runs parts of the soak; goes on where an earlier run was left. Leaves soak.json and soak.md."""
+    """Runs parts of the soak; continues where an earlier run was left. Leaves soak.json and soak.md."""
 
     parts: some_of(PARTS) = PARTS  # type: ignore[valid-type]
     """what to run"""

@@ -35,7 +35,7 @@ RESTART = [1e-4] * 6 + [0.01] * 3 + [0.05] * 3 + [0.01] * 3 + [0.05] + [0.003] *
 
 
 class CarMotion(Motion):
-    """The twist of the row before moves the pose, which so trails by a row, and goes on: a twist is a row's mean.
+    """The twist of the row before moves the pose, which so trails by a row, and continues: a twist is a row's mean.
 
     A share of the twist is kept, and a share of its last change comes again: a car sways, and speeds up for a while.
     The pose also moves by the slip, which is what corners do not show of each meter: the same corners are wrong for

@@ -178,7 +178,7 @@ def page(rows: Sequence[dict], count: int) -> str:
         f"the six components of the motion over 1, 10 and 100 rows; a reset every {EVERY} rows. Rows of ensembles are "
         f"means over {DRAWS} seeds, with their standard deviation.",
     ]
-    titles = ("filter", "translation, %", "rotation, deg/100 m", *(f"coverage, {step}" for step in STEPS), "ms a row")
+    titles = ("filter", "translation, %", "rotation, deg/100 m", *(f"coverage, {step}" for step in STEPS), "ms per row")
     for condition in CONDITIONS:
         lines += ["", f"## {condition.capitalize()}", "", *head(*titles)]
         for row in rows:

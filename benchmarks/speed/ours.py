@@ -87,7 +87,7 @@ def tensordict_loop(filter: Filter, batch: int) -> Callable[[], Tensor]:
 
 
 def sequence(filter: Filter, batch: int, *, samples: bool = True, backward: bool = False) -> Callable[[], Tensor]:
-    """Returns a whole sequence of STEPS steps a call, one frame more because the first is where it starts."""
+    """Returns a whole sequence of STEPS steps per call, one frame more because the first is where it starts."""
     frames = make_frames(batch, STEPS + 1, samples=samples)
     parameters = list(filter.parameters())
 

@@ -24,7 +24,7 @@ class Row:
     Attributes:
         name: what is compared, with its size.
         ratio: ours over theirs; below 1 ours is faster.
-        target: the ratio must not exceed it; ``None`` where there is none to meet.
+        target: the ratio must not exceed it; ``None`` if there is none to meet.
         least: nor be below this, where it is no ratio of times.
         aim: the ratio hoped for.
         ours_us: microseconds of processor time that ours takes, a step unless the name says otherwise.

@@ -144,7 +144,7 @@ def rows_of(name: str, timings: Timings) -> dict[str, Row]:
             TARGETS_MS[kind],
             ours_us=timings.micro(kind),
             theirs_us=timings.micro("without"),
-            note=f"not a ratio; {rates['without']} steps a second without, {rates[kind]} with",
+            note=f"not a ratio; {rates['without']} steps per second without, {rates[kind]} with",
         )
         for kind in ("filter", "packaged")
     }
@@ -165,7 +165,7 @@ def table(found: dict[str, Timings], command: str, elapsed: float) -> str:
         "`DEnKFTransform(filter, packaged=load_step(export_step(filter, example, path)))`.",
         "Quietest: between the fastest rounds of either kind, which other work disturbed least.",
         "",
-        *head("environment and filter", "step", "steps/s without", "with", "added, ms a step", *LAST),
+        *head("environment and filter", "step", "steps/s without", "with", "added, ms per step", *LAST),
     ]
     for name, timings in found.items():
         for kind, row in rows_of(name, timings).items():

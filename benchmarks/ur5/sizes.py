@@ -1,4 +1,4 @@
-"""Trained filters with other members: their errors against milliseconds a step, and how many they need."""
+"""Trained filters with other members: their errors against milliseconds per step, and how many they need."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ THRESHOLDS = (1.0, 1.5, 2.0, 3.0)
 
 
 def frontier(study: Study) -> list[Path]:
-    """Draws error against milliseconds a step of what the table left in ``--out``: frontier.csv, frontier.png.
+    """Draws error against milliseconds per step of what the table left in ``--out``: frontier.csv, frontier.png.
 
     Nothing is trained again. An update that a filter was not trained with gets its own inflation, chosen as training
     chooses it, with the table's number of members.

@@ -45,9 +45,9 @@ score_row = partial(scores.score_row, names=NAMES, unit=unit_of(STATE), circular
 class Study(Collections):
     """A UR5 that one camera watches: joints, gripper and end effector, with every filter that is registered.
 
-    collect: demos into --root. table: collect what is missing, train, test. pictures: plots of what a table left in
-    --out. frontier: error against milliseconds a step of the filters that a table left there. members: DEnKFs that are
-    trained with few members, by localisation. An interrupted run resumes. See the README.
+    collect: demos into --root. table: collect what is missing, train, test. pictures: plots of a finished table in
+    --out. frontier: error against milliseconds per step of its filters. members: DEnKFs trained with few members, by
+    localisation. An interrupted run resumes. See the README.
     """
 
     command: Positional[Literal["collect", "table", "pictures", "frontier", "members"]] = "table"

@@ -97,7 +97,7 @@ assert found[-1] > 0.95
 # :class:`~torch_denkf.monitoring.Gated` sums up the NIS of the last three readings before it lets the latest one
 # correct the belief. With ``response="reject"`` a reading above the limit is left out. ``"student"`` and ``"huber"``
 # enlarge its variance instead. That is right for single outliers. But a sensor that stays wrong draws the belief over,
-# a little in each step.  A gate that rejects goes on from the motion alone, and its uncertainty grows. ``patience``
+# a little in each step.  A gate that rejects continues from the motion alone, and its uncertainty grows. ``patience``
 # says for how many readings. Here the encoder slips by 10 degrees. A slip of 4 would get in: after 25 steps without a
 # reading the forecast is so uncertain that a reading 4 degrees off fits it.
 

@@ -138,7 +138,7 @@ print(f"{free.name}: {free.stat().st_size / 1e3:.0f} kB")
 # On the robot
 # ------------
 # From here on nothing of the training is needed: ``load_step`` imports torch alone. A step takes a dictionary of
-# tensors and returns one. ``inputs`` says what it needs, and ``carry`` names what goes on to the next step. Names of
+# tensors and returns one. ``inputs`` says what it needs, and ``carry`` names what continues to the next step. Names of
 # nested entries have dots.
 
 step = load_step(free)

@@ -114,7 +114,7 @@ def test_slices_that_may_be_shorter_stay_flat():
     for _ in range(20):
         sample = data.sample()
         assert sample.batch_dims == 1
-        # Each begins where it is marked, and goes on by one step.
+        # Each begins where it is marked, and continues by one step.
         begins = sample["is_init"].squeeze(-1)
         assert begins[0]
         assert (sample["step"].diff(dim=0).squeeze(-1)[~begins[1:]] == 1).all()

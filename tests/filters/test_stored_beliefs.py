@@ -1,4 +1,4 @@
-"""Sequences that go on from stored beliefs: of a run, with a past, or of a policy. Oracles: the run, single steps."""
+"""Sequences that continue from stored beliefs of a run, a lag window or a policy. Oracles: the run, single steps."""
 
 import pytest
 import torch
@@ -151,7 +151,7 @@ def test_within_a_slice_the_belief_is_the_filters_own(name):
     parts = [filter.sequence(part.copy()) for part in (data[:, :4], data[:, 4:])]
     data["is_init"] = begins_at(0, 4, size=(2, 7))
     close(filter.sequence(data.copy()), torch.cat(parts, 1), filter.out_keys)
-    close(filter(data[:, 4].copy()), parts[1][:, 0], filter.out_keys)  # a step goes on, too
+    close(filter(data[:, 4].copy()), parts[1][:, 0], filter.out_keys)  # a step continues, too
     assert filter.stepped(data).all()
     assert not filter.stepped(data.exclude("previous"))[:, [0, 4]].any()
 

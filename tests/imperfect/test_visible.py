@@ -1,4 +1,4 @@
-"""Updates that heed whether a sensor sees: against a fine grid, closed forms, and the analysis alone."""
+"""Updates that use whether a sensor sees: against a fine grid, closed forms, and the analysis alone."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Filters that heed whether a sensor sees: every way to run one is the same, and certain knowledge is a mask."""
+"""Filters that use whether a sensor sees: every way to run one is the same, and certain knowledge is a mask."""
 
 from functools import partial
 
@@ -46,7 +46,7 @@ CERTAIN = [name for name in MAKERS if name != "particles"]  # these resample whe
 
 
 def heeds(filter):
-    """Returns the filter, whose update heeds p from the data."""
+    """Returns the filter, whose update uses p from the data."""
     return filter.with_modules(analysis=Visible(filter["analysis"], visible_key="visible"))
 
 

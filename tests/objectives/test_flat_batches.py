@@ -140,7 +140,7 @@ def test_an_episode_that_is_done_needs_a_mark_after_it():
     assert_raises(rows, r"is done, and the next begins, at 6")
 
 
-# ------------------------------------------------------------------------------------- what breaks, and what goes on
+# ------------------------------------------------------------------------------------- what breaks, and what continues
 
 
 def rows_of(count=12):

@@ -175,7 +175,7 @@ def collected(kind, policy, *, envs):
 
 @pytest.mark.parametrize("kind", [Collector, pytest.param(MultiSyncCollector, marks=pytest.mark.slow)])
 def test_collectors_keep_it(kind):
-    """The second batch goes on in the middle of episodes."""
+    """The second batch continues in the middle of episodes."""
     policy = make_policy(toy_denkf())
     make = partial(world, max_steps=5)
     for data in collected(kind, policy, envs=make if kind is Collector else [make, make]):

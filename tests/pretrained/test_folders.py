@@ -58,7 +58,7 @@ def test_each_comes_with_its_checksum_and_a_card(name):
 
 @pytest.mark.parametrize("name", available())
 def test_settings_are_those_of_the_description(name, tmp_path):
-    """Loads all filters that come with the library, and one whose builder is the user's."""
+    """Loads all pretrained filters, and one whose builder is the user's."""
     described = json.loads((weights()[name] / "config.json").read_text())["settings"]
     settings = from_pretrained(name).settings
     found = asdict(settings) if is_dataclass(settings) else dict(settings)

@@ -215,7 +215,7 @@ class Captured:
         self.graphs: dict[tuple, list[Graph] | None] = {}
 
     def __call__(self, *inputs: Any) -> Any:
-        """Replays a graph that no pending backward pass needs; records one where there is none."""
+        """Replays a graph that no pending backward pass needs; records one if there is none."""
         values = list(tensors(inputs))
         state = [value for part in self.modules for value in _own_tensors(part)]
         gradients = torch.is_grad_enabled() and any(value.requires_grad for value in (*values, *state))

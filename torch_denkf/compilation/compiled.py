@@ -30,8 +30,8 @@ _LOG = logging.getLogger("torch_denkf")
 #: Seconds of silence of a first call.
 PATIENCE = 2.0
 
-#: Where an episode goes on, among the names of what a chunk takes. It is compared like a frame's mask: where the first
-#: call resets all rows, nothing of the transition would show.
+#: Name of the mask of continuing episodes, among the inputs of a chunk. It is compared like an observed mask: a first
+#: call that resets all rows would not test the transition.
 _GOES_ON = ("start", "goes on")
 
 

@@ -210,7 +210,7 @@ class StepsInTime(NamedTuple):
         return last, {key: out[key] for key in keep}
 
     def _elements(self, inputs: Entries, time: int, resets: Tensor | None, begin: Sequence[Tensor] | None):
-        """Returns A, b, C, eta, J and where nothing goes on, ``[*B, T, ...]``."""
+        """Returns A, b, C, eta, J and where nothing continues, ``[*B, T, ...]``."""
         move, q, matrix, r = self.motion.matrix, self.motion.noise, self.update.matrix, self.update.noise
         reading = inputs[self.update.in_keys[2]]
         if reading.ndim > time + 2:
@@ -245,7 +245,7 @@ class StepsInTime(NamedTuple):
 
 
 def _one_step_more(before: Sequence[Tensor], behind: Sequence[Tensor]) -> _Elements:
-    """Joins steps of a Kalman filter; nothing of what was before a reset, NaN neither, goes on behind it."""
+    """Joins steps of a Kalman filter; nothing of what was before a reset, NaN neither, continues behind it."""
     (move, mean, cov, told, known, ends), (own_move, own_mean, own_cov, own_told, own_known, own_ends) = before, behind
     inverse = torch.linalg.inv(torch.eye(move.shape[-1], dtype=move.dtype, device=move.device) + cov @ own_known)
     on, back = own_move @ inverse, move.mT @ inverse.mT

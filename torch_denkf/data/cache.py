@@ -44,7 +44,7 @@ def stamp(file: Path) -> tuple[int, int]:
 
 
 def cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
-    """Opens a cache entry; where there is none, or a damaged one, reads its content again and stores it.
+    """Opens a cache entry; if there is none, or a damaged one, reads its content again and stores it.
 
     Args:
         entry: folder of the entry.

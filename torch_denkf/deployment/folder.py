@@ -44,7 +44,7 @@ def save_folder(
 
     Args:
         model: the model.
-        folder: made where it is not there; a model in it is replaced, whole or not at all, also by a process that is
+        folder: made if it does not exist; a model in it is replaced, whole or not at all, also by a process that is
             killed.
         builder: name of the function that builds such a model from the settings.
         settings: plain values.

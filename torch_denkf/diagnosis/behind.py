@@ -1,4 +1,4 @@
-"""Raises where another transform of an environment writes over the belief that a filter goes on with."""
+"""Raises where another transform of an environment writes over the belief that a filter continues with."""
 
 from __future__ import annotations
 

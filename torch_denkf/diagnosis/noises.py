@@ -93,7 +93,7 @@ class WrongNoise(Once):
         )
 
     def _warn_of_nan(self, filter: Filter, record: Record) -> None:
-        """Names the cause of the first NaN of a sequence, which goes on to its end."""
+        """Names the cause of the first NaN of a sequence, which continues to its end."""
         structure, dims = filter.structure, len(record.batch_size)
         made = [record.written.get(kind.key(name)) for kind in structure.kinds for name in ("mean", "var")]
         wrong = [value.isnan().any(-1) for value in made if value is not None and not value.is_cuda]

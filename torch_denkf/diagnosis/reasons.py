@@ -43,7 +43,7 @@ class NoiseEntry(NamedTuple):
 
     Attributes:
         key: of the variances ``[*B, O]`` or the covariance ``[*B, O, O]``.
-        mask: of the observed mask that hides it; ``None`` where there is none.
+        mask: of the observed mask that hides it; ``None`` if there is none.
     """
 
     key: NestedKey

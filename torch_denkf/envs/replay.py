@@ -47,10 +47,10 @@ class ReplayEnv(RowsEnv):
     ``"_reset"`` marks. Rewards are zero.
 
     Elements take the episodes in turn: with a batch of three, the first reset shows the first three, and each element
-    that ends goes on with the next one that none has had. ``set_seed`` restarts this turn and the random starts.
+    that ends continues with the next one that none has had. ``set_seed`` restarts this turn and the random starts.
     Each worker of a SerialEnv or ParallelEnv has a turn of its own: give each its ``episodes``.
 
-    **Actions.** A replay goes on as it was recorded, whatever is commanded.
+    **Actions.** A replay continues as it was recorded, whatever is commanded.
 
     Where the data set has an ``action``, the environment's has its shape. The recorded one is emitted as
     ``("recorded", "action")``: that which was sent in this row and led to the next. ``env.rollout(n)`` without policy

@@ -139,9 +139,8 @@ class Steps(NamedTuple):
 
         Args:
             carry: the belief before the first step.
-            inputs: what each step reads in addition to the carry, ``[*B, T, ...]``, with what the frames' modules
-                wrote. What stands under ``("previous", ...)`` is where the step begins in rows that :data:`FROM_STORED`
-                marks.
+            inputs: inputs of each step in addition to the carry, ``[*B, T, ...]``, with outputs of the frames' modules.
+                Rows that :data:`FROM_STORED` marks start from the belief stored under ``("previous", ...)``.
             call: of one step ``[*B]``.
             resets: rows that are reset at each step, ``[*B, T, 1]``; ``[*B, 1, 1]`` where the first step alone has
                 some; ``None`` for none.

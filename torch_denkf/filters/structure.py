@@ -49,7 +49,7 @@ class Structure(NamedTuple):
         optional: keys that are used where they are there.
         controls: keys that drive the transition.
         required_controls: those of them that must be there.
-        carry: keys of the belief that go on from step to step.
+        carry: keys of the belief that continue from step to step.
         carried: the same, each with the kind of belief that knows what finite means there; ``None`` for all others.
         belief: keys of the belief; the carry, and what follows from it.
         forecast_of: the forecast of each carried entry, as far as the transition writes one.

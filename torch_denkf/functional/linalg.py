@@ -18,7 +18,7 @@ from torch_denkf.functional.kernels.small_system import (
 
 
 def cholesky(matrix: Tensor) -> Tensor:
-    """Returns the lower Cholesky factor L of a symmetric positive definite matrix, NaN where there is none.
+    """Returns the lower Cholesky factor L of a symmetric positive definite matrix, NaN if there is none.
 
     ``torch.linalg.cholesky`` raises and so waits for the device; ``torch.linalg.cholesky_ex`` returns a
     half-finished factor. Here a failure shows: that matrix of the batch, and only that, becomes NaN.

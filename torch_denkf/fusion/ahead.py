@@ -25,7 +25,7 @@ class BeliefAhead(Checked, TensorDictModuleBase):
 
     Between a reading and the action that follows from it a robot needs time, and moves on by the actions that were sent
     before. The belief of now is forecast through these, one step of the filter after the other, with its process noise:
-    the spread is that of the later moment. It stands under ``"ahead"``, e.g. ``("ahead", "belief", "mean")``.
+    the spread is that of the later moment. It is stored under ``"ahead"``, e.g. ``("ahead", "belief", "mean")``.
 
     * In a loop, call it on what :meth:`Filter.step` returned; on what :meth:`Filter.sequence` returned, it looks ahead
       from each element.

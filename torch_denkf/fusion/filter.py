@@ -52,7 +52,7 @@ class FusedFilter(Filter):
     :class:`~torch_denkf.smoothers.FixedLag` does; a mean and a covariance as one joint Gaussian, which for linear
     systems gives what readings in their order give. With process noise and few members, the sample covariances of an
     ensemble make a difference between late and in order, which falls with more members; with :class:`Refiltering` there
-    is none. Where there is a delay, the belief of L steps ago stands under ``("smoothed", ...)``. A reading that
+    is none. Where there is a delay, the belief of L steps ago is stored under ``("smoothed", ...)``. A reading that
     belongs to the time before the episode is not observed.
 
     An analysis' inflation and relaxation spread the belief of the present, once in each update that observes anything.
@@ -60,7 +60,7 @@ class FusedFilter(Filter):
     raise, and so they do with the lag of a mean and a covariance. :class:`Refiltering` and
     :class:`~torch_denkf.smoothers.FixedLag` take them.
 
-    Diagnostics of the sensors stand under ``("info", NAME, ...)``, their sums under ``("info", "nis")`` and
+    Diagnostics of the sensors are stored under ``("info", NAME, ...)``, their sums under ``("info", "nis")`` and
     ``("info", "log_likelihood")``; with one sensor, or a joint update, ``("info", ...)``.
 
     Args:
@@ -77,7 +77,7 @@ class FusedFilter(Filter):
             for a mean and a covariance an observation model in front of them, as
             :class:`~torch_denkf.modules.EKFAnalysis`.
         weights: a network that says how much each reading counts, :class:`~torch_denkf.fusion.SensorAttention`; the
-            weights ``[*B, 1]`` stand under ``("weight", NAME)``. ``None``: readings count as their noise says.
+            weights ``[*B, 1]`` are stored under ``("weight", NAME)``. ``None``: readings count as their noise says.
         lag: L; by default the largest delay.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
             ``check_finite`` and ``prefix`` of :class:`Filter`.

@@ -94,7 +94,7 @@ class FadingBias(nn.Module):
 
         Args:
             residuals: reading minus what it should have been, ``[N, T, K]``, N runs of T steps, on data that the sensor
-                was not trained on; NaN where there is none. Their mean is not taken off.
+                was not trained on; NaN if there is none. Their mean is not taken off.
             trainable: see the class.
             per_run: whether the errors also have a part that is the same for a whole run, as those of a learned sensor
                 in new surroundings have. There are then 2 K biases, K that last 100 times as long as a run and K that

@@ -41,7 +41,7 @@ class RejectReadings(Checked, Transform):
     of the tensordict that it is given, and leaves the tensors alone: ``reject(td.copy())`` keeps the NaN in ``td``.
 
     In a loop, call it on the frame before that is merged: ``filter.step(belief.update(reject(frame)))``. A tensordict
-    that goes on from step to step, also that of a policy, keeps the mask of the step before. It is not taken for the
+    that continues from step to step, also that of a policy, keeps the mask of the step before. It is not taken for the
     mask of a new reading, unless the tensordict was cloned in between or the call is compiled.
 
     Args:
@@ -52,7 +52,7 @@ class RejectReadings(Checked, Transform):
             float16 have the largest number of their dtype as their limit, integers have none.
         by_component: readings ``[*B, O]``, or samples ``[*B, E, O]``, whose components are rejected one by one; their
             mask becomes ``[*B, O]``. Other readings are rejected as a whole, and keep the width of their mask,
-            ``[*B, 1]`` where there is none: a sensor network needs all of its input.
+            ``[*B, 1]`` if there is none: a sensor network needs all of its input.
         noises: for a reading the entry with its variances ``[*B, O]`` or its covariance ``[*B, O, O]``. Those of a
             reading that is rejected for them become one, and the identity.
         spaces: for a reading the space in which it is a point ``[*B, P]``. Its parts, such as the pose, are rejected as

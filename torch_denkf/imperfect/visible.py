@@ -1,4 +1,4 @@
-r"""A sensor that says whether it sees, and updates that heed it.
+r"""A sensor that says whether it sees, and updates that use it.
 
 A camera that looks at a pillar still reads something. :class:`Visibility` is a head next to a sensor: it writes the
 probability p that this reading is about the state at all. :class:`Visible` goes around an analysis: the density of a

@@ -109,7 +109,7 @@ def register_location_and_scale(
 
 
 def as_standard_deviations(name: str, value: Any) -> Tensor:
-    """Returns standard deviations ``[N]``, zero where there is none.
+    """Returns standard deviations ``[N]``, zero if there is none.
 
     Raises:
         ValueError: if they have another shape, or one is negative or not finite.

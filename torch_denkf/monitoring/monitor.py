@@ -75,8 +75,8 @@ class InnovationMonitor(SubModel):
     Each is compared with its own distribution. A real filter's innovations are distributed more widely than in theory:
     members are few, models wrong and errors slow. :meth:`calibrate` takes the distributions from clean data.
 
-    The monitor keeps nothing on itself. Its state lies under ``(monitor_prefix, sensor, ...)`` and goes on from step to
-    step where :class:`~torch_denkf.monitoring.Monitored` puts the monitor into a filter. A step at which a sensor is
+    The monitor is stateless: its state is under ``(monitor_prefix, sensor, ...)`` and is carried from step to step
+    where :class:`~torch_denkf.monitoring.Monitored` puts the monitor into a filter. A step at which a sensor is
     not observed leaves its entries as they are.
 
     ============================== ========= ===========================================================================

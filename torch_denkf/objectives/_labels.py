@@ -67,7 +67,7 @@ class Reading(NamedTuple):
         samples: its key.
         observed: its mask.
         noise: its R.
-        model: module that predicts it, with an ``observe()`` method; ``None`` where there is none.
+        model: module that predicts it, with an ``observe()`` method; ``None`` if there is none.
     """
 
     samples: NestedKey = ("sensor", "ensemble")
@@ -103,7 +103,7 @@ class Labels(NamedTuple):
     """True values, as far as they are known and count.
 
     Attributes:
-        values: ``[*B, N]``; zero where there is no label. Points ``[*B, P]`` of a space, neutral where there is none.
+        values: ``[*B, N]``; zero where there is no label. Points ``[*B, P]`` of a space, neutral if there is none.
         mask: ``[*B, N]``, True where there is one. N are the tangents' components of a space.
         dims: of the N components those that count.
         scale: ``[N]``, finite, by which errors are divided; ``None`` for one.
@@ -279,7 +279,7 @@ class Targets:
         return Labels(points if flat else on.normalise(points), mask & counting, dims, space=space)
 
     def _known(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None) -> Tensor:
-        """Returns labels ``[*B, N]`` in the places of their components, ``[*B, size]``, NaN where there is none.
+        """Returns labels ``[*B, N]`` in the places of their components, ``[*B, size]``, NaN if there is none.
 
         They are of the leading N components; or of ``dims``, in their order, where that is N components of which the
         last are beyond the first N.

@@ -32,7 +32,7 @@ BELIEFS = (
 
 
 class OfBelief(Term):
-    """A term of a belief, a forecast or a smoothed belief, which stands under the ``key`` of this name."""
+    """A term of a belief, a forecast or a smoothed belief, which is stored under the ``key`` of this name."""
 
     def __init__(self, name: str, key: str, weight: float = 1.0):
         self.name, self.key = name, key

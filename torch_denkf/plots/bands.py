@@ -76,7 +76,7 @@ def plot_bands(
             the ensemble where its members have equal weights and are enough for ``level``.
         space: whose points the states are; ``None`` for plain numbers. Components are then those of tangents, with
             angles, and roll, pitch and yaw of a quaternion, in degrees, between -180 and 180: a line that leaves at one
-            end goes on at the other. ``readings`` of angles are in rad.
+            end continues at the other. ``readings`` of angles are in rad.
         legend: whether to add one above the first Axes.
         ax: as many Axes as components; ``None`` makes a figure.
 

@@ -24,7 +24,7 @@ class Smoother(Checked, TensorDictModuleBase):
     It writes all that the filter writes, and ``("smoothed", "mean")`` and ``("smoothed", "var")`` ``[*B, T, S]``, with
     ``("smoothed", "cov")`` or ``("smoothed", "ensemble")`` where there is one. At a time t that is the belief of the
     state *of t*, given the readings up to t + lag. (:class:`FixedLag` writes at t the belief of t - lag.) Nothing
-    flows back over the border of an episode or a slice: those that :meth:`Filter.sequence` heeds. The gradient flows
+    flows back over the border of an episode or a slice: those that :meth:`Filter.sequence` uses. The gradient flows
     through filter and smoother.
 
     A subclass writes :meth:`_smooth`, and :meth:`_extended` where the filter must say more than it does by itself.

@@ -35,7 +35,7 @@ class FixedLag(Filter):
 
     It is a :class:`~torch_denkf.filters.Filter` itself: steps, sequences, masks, resets, policies, transforms, replay
     buffers and compiled steps work as with any other, and the gradient goes through it. The past is part of what it
-    carries. Its modules are the filter's own, not copies. To smooth recordings, where what is later is there already,
+    carries. Its modules are the filter's own, not copies. To smooth recordings, where what is later is set already,
     use :class:`EnKS`, :class:`EnRTS`, :class:`RTSSmoother` or :class:`ParticleSmoother`.
 
     Args:

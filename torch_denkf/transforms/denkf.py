@@ -276,7 +276,7 @@ class DEnKFTransform(Checked, Transform):
 
         Raises:
             ValueError: if the environment emits an entry of such a name already, or resets groups of agents alone; or
-                if a transform behind this one writes over the belief that the filter goes on with.
+                if a transform behind this one writes over the belief that the filter continues with.
         """
         keys = [key for key in self._keep if key not in self._dropped_keys]
         check_no_group_resets(self.parent.reset_keys, self.out_keys)

@@ -42,7 +42,7 @@ def read_codes(
         sequences: rows of each.
         see: maps rows ``[n]`` of the data to ``"pixels"``, maybe of a failing camera, and other entries to keep.
         file: with ``"code"`` ``[N, T, F]``, these entries, and ``[N, T, 1]`` each: ``"observed"``, whether a picture is
-            new and not black, ``"arrived"``, whether one came, and ``"valid"``, whether the sequence goes on.
+            new and not black, ``"arrived"``, whether one came, and ``"valid"``, whether the sequence continues.
     """
     if not file.exists():
         check, parts = BlackIsMissing(), []

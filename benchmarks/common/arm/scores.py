@@ -107,7 +107,7 @@ def filter_rows(recipe: ArmRecipe, model: Filter, readings: dict[str, TensorDict
 
 
 def cost_of(recipe: ArmRecipe, model: Filter, readings: TensorDict) -> dict[str, float]:
-    """Parameters behind the sensor, and milliseconds a step of one sequence there."""
+    """Parameters behind the sensor, and milliseconds per step of one sequence there."""
     row = readings[:1, :TIMED]
     return cost(model, lambda: run_filter(recipe, model, row), row.shape[1])
 
@@ -154,7 +154,7 @@ def fit(
     every: int,
     **settings,
 ) -> Filter:
-    """Trains a filter, or goes on; then its inflation is chosen for the coverage. ``every`` updates are validated."""
+    """Trains a filter, or continues; then its inflation is chosen for the coverage. ``every`` updates are validated."""
     fit_filter(
         recipe,
         model,

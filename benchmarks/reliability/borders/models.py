@@ -1,4 +1,4 @@
-"""Files of models: checkpoints, and trainings that go on from them; trained filters in folders; packaged steps."""
+"""Files of models: checkpoints, and trainings that continue from them; trained filters in folders; packaged steps."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class Work:
     """Something that writes to a folder.
 
     Args:
-        do: does it, or goes on with it.
+        do: does it, or continues with it.
         result: all that it leaves.
         words: one of them is in the message where it cannot write; none where disks are not tried.
         killed: whether it is killed, too.

@@ -137,7 +137,7 @@ class Reference:
 
 
 def _goes_on(end: TensorDictBase, start: TensorDictBase) -> bool:
-    """Tells whether a batch goes on where another ended: in the same episodes, which collectors number."""
+    """Tells whether a batch continues where another ended: in the same episodes, which collectors number."""
     episodes = [each.get(("collector", "traj_ids"), None) for each in (end, start)]
     if any(episode is None for episode in episodes):
         return True

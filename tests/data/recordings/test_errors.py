@@ -120,7 +120,7 @@ def test_streams_and_clocks(tmp_path):
     fails(TypeError, "name is that of the recording, got Table", name=table, state=table)
     with pytest.raises(TypeError, match="a list of them; got Table"):
         RecordingReplay([table])
-    fails(ValueError, "10 rows a second from 0 to 200000000 s are more than 1e\\+08; .*unit=", clock=10.0,
+    fails(ValueError, "10 rows per second from 0 to 200000000 s are more than 1e\\+08; .*unit=", clock=10.0,
           state=Table(write_csv(tmp_path / "ms.csv", time=[0, 1e8, 2e8], x=[1, 2, 3])))  # fmt: skip
     fails(ValueError, "an entry 'imu_observed' of its own", imu_observed=table)
     fails(ValueError, r"one camera, got \['left', 'right'\]", left=Video("a.mp4"), right=Video("b.mp4"))

@@ -169,7 +169,7 @@ class LeggedEnv(EnvBase):
         data, total = self.data, np.zeros(6)
         for _ in range(self.substeps):
             self._simulate()
-            # The simulator goes on with the turn at the end of its step, and with the force at its beginning.
+            # The simulator continues with the turn at the end of its step, and with the force at its beginning.
             total[:3] += self.to_sensor @ data.qvel[3:6]
             total[3:] += data.sensordata[self.force_at : self.force_at + 3]
         force = self._forces()

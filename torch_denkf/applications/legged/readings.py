@@ -115,7 +115,7 @@ class FeetInBody(SubModel):
 class FeetRates(SubModel):
     r"""Observes standing feet's velocities in sensor axes, :math:`-R^\top v - (\omega - b) \times R^\top (f_i - p)`.
 
-    It is told by the joints' rates, and says the base's velocity at once.
+    It follows from the joints' rates, and says the base's velocity at once.
 
     Args:
         space: of the states, :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.

@@ -103,7 +103,7 @@ class LeRobotReplay(EpisodeReplay):
 
     Attributes:
         episodes: of this split, with the recording's own ``number``.
-        fps: rows a second.
+        fps: rows per second.
         names: of the state's numbers that are kept, such as the joints; None where the recording names none.
         lag: as it was passed.
         repeats_masked: rows of this split that are not observed because their picture is a repeat.

@@ -92,7 +92,7 @@ def recording_from_rows(
         ) from error
     if not count:
         raise ValueError("there are no rows for a recording")
-    check_number("fps", fps, above=0, cure="It is the number of rows a second")
+    check_number("fps", fps, above=0, cure="It is the number of rows per second")
     stretches = [slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK)]
     whole = size is None and isinstance(rows, TensorDictBase)
     image = _images(rows, pixels_key) if whole else None

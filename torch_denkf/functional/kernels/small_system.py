@@ -136,7 +136,7 @@ class WrittenOut:
         self.lower = lower
 
     def factor(self) -> Tensor:
-        """Returns L, ``[*B, N, N]``, all NaN where there is none."""
+        """Returns L, ``[*B, N, N]``, all NaN if there is none."""
         last = self.lower[-1][-1]  # NaN where any pivot is not positive
         zero = torch.where(last > 0, torch.zeros_like(last), last)
         rows = [torch.cat([*row, *[zero] * (len(self.lower) - len(row))], -1) for row in self.lower]

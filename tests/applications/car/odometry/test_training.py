@@ -1,4 +1,4 @@
-"""A training leaves a filter that predicts better than before; a broken one goes on to the same weights."""
+"""A training leaves a filter that predicts better than before; a broken one continues to the same weights."""
 
 import csv
 import shutil

@@ -31,7 +31,7 @@ _NAMES = {
 
 @dataclass
 class Demo(Command):
-    """Track a car by one camera that fails, with a filter that comes with the library: a picture and an animation."""
+    """Track a car by one camera that fails, with a pretrained filter: a picture and an animation."""
 
     out: Path = Path("runs/demo")  # folder for demo.png and demo.gif
     root: Path | None = None  # folder in KITTI's layout; without it a drive is rendered

@@ -48,7 +48,7 @@ def draw(file: Path, out: Path, level: float = 0.9) -> list[Path]:
 
     Args:
         file: ``path.csv``.
-        out: folder that gets ``path.png`` and ``bands.png``; made where it is not there.
+        out: folder that gets ``path.png`` and ``bands.png``; made if it does not exist.
         level: probability of the bands and ellipses.
 
     Returns:

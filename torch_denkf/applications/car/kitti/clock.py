@@ -45,7 +45,7 @@ def read_times(file: Path, rows: int) -> Times:
         rows: how many frames need a time.
 
     Returns:
-        The times of the first ``rows`` frames. Their median is over all rows of the file, 0.103 s where there is none.
+        The times of the first ``rows`` frames. Their median is over all rows of the file, 0.103 s if there is none.
 
     Raises:
         ValueError: naming file and line, if the file has fewer rows, if a row is no finite number, if more than a

@@ -50,7 +50,7 @@ def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
 
 
 def after_gap(drive: TensorDictBase) -> Tensor | None:
-    """Masks rows that come after a gap in time, bool ``[N]``; ``None`` where there is none."""
+    """Masks rows that come after a gap in time, bool ``[N]``; ``None`` if there is none."""
     dt = drive.get("dt", None)
     if dt is None or not dt.numel():
         return None
