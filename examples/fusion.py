@@ -4,7 +4,7 @@
 
 The wheel reads the speed 50 times a second, the laser the position ten times a second, and the GPS the position once a
 second, 0.3 s late. The program compares every set of sensors, uses and ignores the delay, filters steps of irregular
-length, and learns when not to believe the laser. No data set. It takes a minute. The page behind this one is
+length, and learns when to ignore the laser. No data set. It takes a minute. The page behind this one is
 ``docs/how_to/several_sensors.md``; measured errors on a robot's arm and on a car are in ``docs/results/fusion.md``.
 """
 
@@ -130,7 +130,7 @@ def main() -> None:
     blocked = failing["blocked"]
     print("\nThe laser fails for a while; error of the position then, m:")
     weighted = run(make(weights=weights), failing)
-    print(f"  believed             {error(run(fused, failing), blocked):.3f}")
+    print(f"  no weights           {error(run(fused, failing), blocked):.3f}")
     print(f"  learned weights      {error(weighted, blocked):.3f}")
     print(f"  never had a laser    {error(run(fused, failing, 'laser'), blocked):.3f}")
     seen = failing["laser_observed"].squeeze(-1)

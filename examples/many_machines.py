@@ -1,4 +1,4 @@
-"""Many machines on one page: workers collect, ranks learn a filter and a policy on what it believes.
+"""Many machines on one page: workers collect, ranks learn a filter and a policy on its belief.
 
     python examples/many_machines.py                                             # all in this process
     pip install "torch_denkf[ray]" && python examples/many_machines.py --collectors 2

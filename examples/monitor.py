@@ -3,7 +3,7 @@
     python examples/monitor.py              # leaves runs/monitor.png
     python examples/monitor.py --out there.png
 
-A filter believes its sensors as much as it was told. The program watches the innovations, raises an alarm, and lets a
+A filter trusts its sensors by their noise covariance. The program watches the innovations, raises an alarm, and lets a
 gate answer: with both, the error while the GPS is off is a fraction of what it is without. It also says which bias it
 could not have noticed. It takes ten seconds; the page behind this one is ``docs/how_to/monitor.md``.
 """
@@ -107,7 +107,7 @@ def main() -> None:
     smallest = monitor.detectable_bias()["gps"]
     print(f"A bias of the innovations below {smallest:.1f} standard deviations passes unnoticed in a second.")
 
-    # The same filter, whose analysis does not believe what three steps speak against.
+    # The same filter, whose analysis gates readings by the innovations of three steps.
     gated = Gated(make_cart(), 1, response="reject", window=3, rate=1e-4, patience=60).calibrate(clean)
 
     sound, broken = record(runs, steps, off=False), record(runs, steps, off=True)

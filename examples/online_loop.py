@@ -93,7 +93,7 @@ def main() -> None:
     denkf, cart = make_filter(), Cart()
     sensors = ["encoder", "radar"]
     inside, steps, shown = torch.zeros(2), 0, 0.0
-    print("time    true position, speed    believed position, 90 %     speed, 90 %             readings")
+    print("time    true position, speed    estimated position, 90 %    speed, 90 %             readings")
     with torch.no_grad():  # otherwise a graph grows with every step
         belief = denkf.initialise({})
         while cart.time < (2.0 if args.smoke else args.seconds):

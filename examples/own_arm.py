@@ -2,8 +2,8 @@
 
     python examples/own_arm.py             # pictures, filter and policy in runs/own-arm
 
-``Reach`` and ``XML`` stand for your arm: two joints, a camera of 60 x 60 pixels at 20 Hz, encoders at 5 Hz. 30 % of both
-are missing, and no sensor reads speeds. A scripted controller demonstrates. The filter learns
+``Reach`` and ``XML`` stand for your arm: two joints, a camera of 60 x 60 pixels at 20 Hz, encoders at 5 Hz. 30 % of
+both are missing, and no sensor reads speeds. A scripted controller demonstrates. The filter learns
 motion and camera from that, and what the camera is worth from demonstrations that it did not learn from. Then PPO
 learns to reach a goal, from the belief of the moment when its action runs, 0.1 s later. Needs OpenGL, no screen
 (``MUJOCO_GL=egl``). docs/how_to/own_arm.md has the numbers.

@@ -130,7 +130,7 @@ def main() -> None:
     print(f"  the rate now is known to {now[..., 1].square().mean().sqrt():.3f} rad/s,")
     print(f"  that of 10 steps ago to  {then[..., 1].square().mean().sqrt():.3f} rad/s")
 
-    # A loss may score what is believed in hindsight: here it finds the length, which starts twice too large.
+    # A loss may score the smoothed belief: here it finds the length, which starts twice too large.
     swing = Swing(length=2.0)
     denkf = make_denkf(swing, members=30)
     loss = DEnKFLoss(denkf, state=0.0, transition=0.0, smoothed=1.0, smoother=partial(EnRTS, lag=10))

@@ -59,7 +59,7 @@ def test_the_wheel_holds_the_package_alone(wheel, tmp_path):
 
 
 def check_trained_filters(wheel, folder):
-    """They are small, and believe in a fresh process, from the wheel's own files, what they believe here."""
+    """Pretrained filters are small, and give the same belief from the wheel in a fresh process."""
     weights = [each for each in wheel.infolist() if "/weights/" in each.filename]
     assert sum(each.file_size for each in weights) <= 1.5e6
     names = torch_denkf.available()

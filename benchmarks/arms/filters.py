@@ -68,7 +68,7 @@ class ArmTransition(m.Transition):
         mean, std = self.faster(state, action)
         after = (velocity + mean + std * torch.randn_like(std)).clamp(-self.fastest, self.fastest)
         ways = self.arm.dt * velocity.abs()
-        # Without the creep an arm at rest would be believed for ever.
+        # Without the creep the variance of an arm at rest would vanish.
         drift = (DRIFT**2 * ways + self.arm.creep**2).sqrt() * torch.randn_like(ways)
         turned = angles + self.arm.dt * torch.lerp(velocity, after, self.lead) + drift
         moved = self.arm.join(turned, after)

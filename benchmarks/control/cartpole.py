@@ -115,7 +115,7 @@ class Push(m.SubModel):
     a push on the cart the pole gets. The track ends where it ends: there the cart stops, which is such a push, too.
     """
 
-    MOST = 20.0  # m/s, rad/s: more is not believed
+    MOST = 20.0  # m/s, rad/s: upper bound of the speeds
 
     def __init__(self):
         network = nn.Sequential(nn.Linear(5, 32), nn.Tanh(), nn.Linear(32, 4))

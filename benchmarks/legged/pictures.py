@@ -1,4 +1,4 @@
-"""The velocity of a robot on slippery ground, as two filters believe it; and a walk with what is believed of it."""
+"""Draws the velocity of a robot on slippery ground by two filters; and a walk with the estimated velocity."""
 
 from __future__ import annotations
 

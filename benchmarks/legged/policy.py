@@ -1,4 +1,4 @@
-"""A policy that was trained with the base's true velocity, and walks on what is believed of it.
+"""A policy that was trained with the base's true velocity, and runs on the filter's estimate.
 
 python -m benchmarks.legged.policy --out runs/walk
 """
@@ -243,7 +243,7 @@ def tested(laboratory: Laboratory, policies: dict[str, TensorDictModuleBase]) ->
 
 
 def film(laboratory: Laboratory, policy: PPO, every: int = 8) -> None:
-    """A robot on slippery ground with the command, the true velocity, and what is believed of it."""
+    """Draws a robot on slippery ground with the command, the true and the estimated velocity."""
     alone = Laboratory(replace(laboratory.study, robots=1))
     env = alone.env("belief", list(GROUNDS)[1], laboratory.study.seed + 600)
     robot, frames, rows = env.base_env.robots[0], [], count()

@@ -160,7 +160,7 @@ def believed_spans(spans: Sequence[TensorDict], seen: Callable[[TensorDict], Ten
 
     Args:
         spans: what the sensor reads of them, ``[N]`` each.
-        seen: of readings, ``[N, 1]``: whether they are to be believed.
+        seen: of readings, ``[N, 1]``: their observed mask.
     """
     values = {name: torch.stack([each["sensor", name] for each in spans], 1) for name in ("ensemble", "encoding")}
     values["observed"] = torch.stack([seen(each) for each in spans], 1)

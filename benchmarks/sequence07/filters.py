@@ -150,7 +150,7 @@ def speed_before(data: TensorDict) -> Tensor:
 
 
 def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | None = None) -> TensorDict:
-    """Returns readings with the noises that a filter is to believe.
+    """Returns readings with the noise covariances of the filter.
 
     Args:
         readings: ``[*B, T]``.

@@ -79,7 +79,7 @@ def kitti(root: Path, out: Path, *, smoke: bool = False) -> Task:
         trained = from_pretrained("car-odometry")
         assert isinstance(trained, CarFilter)
         car = car_filter(replace(trained.settings, ensemble_size=members))
-        # What each member believes of its calibration are quantiles, as many as members.
+        # The members' calibrations are quantiles, one per member.
         car.load_state_dict({k: v for k, v in trained.state_dict().items() if "quantiles" not in k}, strict=False)
         return car.eval()
 

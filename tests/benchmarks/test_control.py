@@ -19,7 +19,7 @@ def env_of(task, arm, count=4, cell=(0.2, 0.3), seed=0):
 
 
 def test_the_exact_filter_holds_the_truth():
-    """Its errors have the variances that it believes: chi-square of all of them, two a step."""
+    """The squared normalised errors are chi-square distributed, with two degrees of freedom per step."""
     env = make_env(TASKS["hike"], ARMS["Kalman"], 500, (0.4, 0.0), 0, hike.exact_filter(0.4))
     data = env.rollout(hike.STEPS)["next"]
     errors = (data["belief", "mean"] - data["state"]).square() / data["belief", "var"]

@@ -1,4 +1,4 @@
-"""The forms that a GPU takes, run on a processor: each filter believes the same, and has the same gradients."""
+"""The forms that a GPU takes, run on a processor: beliefs and gradients are equal."""
 
 import pytest
 import torch

@@ -277,7 +277,7 @@ def test_all_features_at_once(float64, way):
 
 
 def test_the_oracle_answers_to_each_feature():
-    """Each feature but names and storage changes what is believed: a feature that did nothing would be no test."""
+    """Each feature except names and storage changes the belief, so that the other tests are not vacuous."""
     plain = oracle((), frames_for(()))
     for feature in ("gate", "late reading", "black picture", "learned weights", "inflation", "reject"):
         other = oracle((feature,), frames_for((feature,)))

@@ -44,7 +44,7 @@ def begins_at(*times, size=(2, 9)):
 @pytest.mark.parametrize(("begin", "stored"), [(1, "belief_keys"), (5, "belief_keys"), (4, "carry_keys")])
 @pytest.mark.parametrize("marked", [False, True])
 def test_sequence_resumes_from_the_middle(name, begin, stored, marked):
-    """From all that was believed; or from what is carried, of which what was smoothed follows."""
+    """Resumes from the whole belief, or from the carry, from which the smoothed entries follow."""
     filter = RESUMED[name]()
     frames = filter.draw_noise(readings(2, 9))
     whole = filter.sequence(frames.copy())

@@ -205,14 +205,14 @@ def filtered(filter, batch):
 
 
 def with_other_beliefs(data):
-    """As if the policy had believed something else while it collected."""
+    """Changes the beliefs stored at collection."""
     out = data.clone()
     out["belief"].apply_(lambda value: value.fill_(50.0))
     return out
 
 
 def sac(filter, *, inside, **options):
-    """SAC on what a filter believes; with the filter in the actor, or in front of it."""
+    """SAC on a filter's belief; with the filter in the actor, or in front of it."""
     head = nn.Sequential(nn.Linear(S, 2 * A), NormalParamExtractor())
     own = TensorDictModule(head, [MEAN], ["loc", "scale"])
     actor = ProbabilisticActor(

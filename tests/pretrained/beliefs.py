@@ -1,4 +1,4 @@
-"""Means and variances that each trained filter of the library believes after six steps of the same random readings."""
+"""Means and variances of each pretrained filter after six steps of the same random readings."""
 
 import json
 from pathlib import Path

@@ -91,7 +91,7 @@ class Monitored(Filter):
 
 
 class Gated(Filter):
-    """A filter whose analyses believe a reading as far as its last innovations deserve it.
+    """A filter that gates each reading by its last normalised innovations.
 
     Each analysis becomes a :class:`~torch_denkf.monitoring.GatedAnalysis`, in its place. The filter is a
     :class:`Filter` itself, like :class:`Monitored`, which goes around this one: ``Monitored(Gated(filter), monitor)``,

@@ -85,7 +85,7 @@ class WithBias(nn.Module):
     r"""The motion of a state that also holds the sensor's slow errors, which fade: :math:`b_t = \rho \circ b_{t-1}`.
 
     A sensor that reads a pose wrongly reads it wrongly in the next frame, too. A filter that takes its errors for white
-    noise believes them more with each frame; here they are part of the state, and the reading is state plus bias
+    noise becomes ever more certain of them; here they are part of the state, and the reading is state plus bias
     ("coloured measurement noise": Bryson & Henrikson 1968).
 
     Args:

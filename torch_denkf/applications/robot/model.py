@@ -118,7 +118,7 @@ def robot_model(
     """Makes the filter that a configuration of robot_localization describes.
 
     Messages of an odometry are two sensors, its pose and its twist, and those of an inertial sensor three; each is
-    believed by the covariance that stands in its row, and by its drifts. With ``two_d_mode`` each reads also zeros, of
+    weighted by the covariance in its row, and by its drifts. With ``two_d_mode`` each reads also zeros, of
     variance 1e-6, of what does not move in the plane. Poses of ``..._differential`` and ``..._relative`` sensors are
     those of the rows.
 

@@ -26,8 +26,8 @@ _BELIEVED = 0.99  # of a reading's distance: beyond, it is none that the noise e
 
 
 def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]:
-    """Says of each sensor how often it is believed, its bias, its delay, its noise and its drift, as a table."""
-    heads = ("sensor", "reads", "readings", "believed", "bias", "residual", "noise as given", "noise as learned")
+    """Returns a table of each sensor's share of accepted readings, bias, delay, noise and drift."""
+    heads = ("sensor", "reads", "readings", "accepted", "bias", "residual", "noise as given", "noise as learned")
     lines = [f"| {' | '.join(heads)} | drift | offset |", "|" + "---|" * (len(heads) + 2)]
     for sensor in model.config.sensors:
         for group in sensor.groups:

@@ -114,9 +114,9 @@ def test_neighbouring_frames_are_read_at_any_believed_speed(float64):
 
 
 def test_a_slow_camera_is_read_again_when_the_car_slows_down(float64):
-    """Keeps what the filter hardly knows within reach: else a speed that is believed too large stays for ever."""
+    """Keeps pairs in range under a large variance: else an overestimated speed would never be corrected."""
     frames = frames_of(torch.full((91, 2), 6.0) * torch.tensor([1.0, 0.0]), [0] + [0, 0, 3] * 30)
-    frames["state"] = torch.tensor([0.0, 0.0, 0.0, 9.0, 0.0]).expand(91, 5)  # believed; in truth 3 x 2 m/s
+    frames["state"] = torch.tensor([0.0, 0.0, 0.0, 9.0, 0.0]).expand(91, 5)  # estimate; the true speed is 3 x 2 m/s
     torch.manual_seed(0)
     out = pair_filter(64, reach=[10.0, torch.inf]).sequence(frames)
     read = out["forecast", "observed"].squeeze(-1)
