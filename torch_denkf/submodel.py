@@ -446,7 +446,7 @@ class Update(SubModel):
     def updates_ensemble(self) -> bool:
         """Tells whether it reads an ensemble, its predicted observations, the reading, its noise, and a mask.
 
-        Such an analysis can be given a past to correct (:meth:`move_past`).
+        Such an analysis can be given a lag window to correct (:meth:`move_past`).
         """
         keys = [unravel_key(key) for key in self.in_keys]
         read = [unravel_key(key) for key in (self.predicted_key, *self.reading_keys)]

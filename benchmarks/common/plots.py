@@ -1,4 +1,4 @@
-"""Shares the pictures of the studies. matplotlib draws without a window."""
+"""Plots that several studies share. matplotlib draws without a window."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def draw_frontier(
         for end in (0, -1) if len(own) > 1 else ():
             axis.annotate(str(own[end]["members"]), points[end], (4, 4), textcoords="offset points", fontsize=8)
     errors = [row[error] for row in kept]
-    wide = max(errors) > 2 * min(errors)  # less shows hardly a label on a logarithmic scale
+    wide = max(errors) > 2 * min(errors)  # a narrower range has hardly a label on a logarithmic scale
     axis.set(xscale="log", yscale="log" if wide else "linear", xlabel="ms per step, one thread", ylabel=label)
     for scale in (axis.xaxis, axis.yaxis) if wide else (axis.xaxis,):
         scale.set_major_formatter("{x:g}")

@@ -1,4 +1,4 @@
-"""Recorded steps. No processor records: a stand-in runs what it was asked to record, from the same memory."""
+"""Steps recorded in graphs; on a processor a stand-in reruns the function on the same memory."""
 
 import pickle
 from copy import deepcopy
@@ -13,7 +13,7 @@ from torch_denkf.compilation import CapturedSteps
 
 
 class Rerun:
-    """Stands for a recorder: a replay runs the function once more, on what is in its memory."""
+    """Stands for a CUDA graph: a replay runs the function again on the same memory."""
 
     waiting = ()
     recorded = 0

@@ -18,7 +18,7 @@ from torch_denkf.smoothers.past import LaggedAnalysis, lagged
 from torch_denkf.submodel import Call
 
 E, S, WIDTH = 6, 2, 2
-OWN = {"updates_ensemble", "aligned", "on_aligned"}  # of what goes around, a past and angles know nothing
+OWN = {"updates_ensemble", "aligned", "on_aligned"}  # of what goes around, a lag window and angles know nothing
 
 
 class ScaledInnovation(Around):
@@ -110,7 +110,7 @@ def test_entries_that_are_aligned_go_through_the_wrapper_all_the_same():
 
 @pytest.mark.parametrize("name", ["lagged", "visible, lagged"])
 def test_lag_is_applied_inside_wrappers(name):
-    """The past is corrected by what the wrapper makes of the reading."""
+    """The lag window is corrected by what the wrapper makes of the reading."""
     plain = EnsembleAnalysis("etkf") if name == "lagged" else Visible(EnsembleAnalysis("etkf"))
     around = lagged(ScaledInnovation(plain, 0.5))
     assert isinstance(around, ScaledInnovation)

@@ -93,7 +93,7 @@ def test_step_by_step_is_the_recording(float64, scheme):
 
 
 def test_rotation_applies_to_clones(float64):
-    """Without process noise the rotated smoother keeps the exact moments, which a past left behind would not."""
+    """Without process noise the rotated smoother keeps the exact moments, which a lag window left behind would not."""
     filter = linear_denkf("etkf")
     rotated = linear_denkf("etkf")
     rotated["analysis"].rotate = True
@@ -106,7 +106,7 @@ def test_rotation_applies_to_clones(float64):
 
 
 def test_several_analyses_correct_the_clones(float64):
-    """Two readings one after the other are the two at once, for the past as for the present."""
+    """Two readings one after the other are the two at once, for the lag window as for the present."""
     both = linear_denkf("etkf")
     first = parts_of_reading(0, "forecast", "mid", observed_key="observed0")
     second = parts_of_reading(1, "mid", "belief", observed_key="observed1")

@@ -1,4 +1,4 @@
-"""Gates and lags in either order: what the gate rejects corrects neither the belief nor the past."""
+"""Gates and lags in either order: what the gate rejects corrects neither the belief nor the lag window."""
 
 import pytest
 import torch
@@ -55,7 +55,7 @@ def test_rejected_equals_missing(float64, order, scheme):
 
 
 def test_down_weighted_reading_corrects_clones_less(float64):
-    """Student's t enlarges R: the past moves as with that R from the beginning."""
+    """Student's t enlarges R: the lag window moves as with that R from the beginning."""
     frames = off(readings())
     gated = ORDERS["gate outside"](linear_denkf()).gates[0]
     gated.response, gated.limits = "student", gated.limits / 1e3
@@ -142,7 +142,7 @@ def test_a_gate_opens_to_readings_of_an_ensemble_as_to_those_of_a_kalman_filter(
 
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
 def test_adapted_spread_with_observed_clones_raises(float64, kind):
-    """It is inflation; around a filter without a past it is that of readings in their order."""
+    """It is inflation; around a filter without a lag window it is that of readings in their order."""
     with pytest.raises(ValueError, match="Refiltering"):
         Gated(fused(kind, delay=3, members=torch.randn(7, 2)), adapt_inflation=0.1)
     if kind == "Kalman":

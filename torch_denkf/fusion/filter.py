@@ -56,8 +56,8 @@ class FusedFilter(Filter):
     belongs to the time before the episode is not observed.
 
     An analysis' inflation and relaxation spread the belief of the present, once in each update that observes anything.
-    A late reading would have to spread a belief of the past, of which the updates since did not know: with a delay both
-    raise, and so they do with the lag of a mean and a covariance. :class:`Refiltering` and
+    A late reading would have to inflate an earlier belief, which the updates since did not include: with a
+    delay both raise, and so they do with the lag of a mean and a covariance. :class:`Refiltering` and
     :class:`~torch_denkf.smoothers.FixedLag` take them.
 
     Diagnostics of the sensors are stored under ``("info", NAME, ...)``, their sums under ``("info", "nis")`` and

@@ -132,15 +132,15 @@ class StateObservation(Wrapper, Update):
 
     Args:
         observation: observes ensembles, e.g. :class:`Select`; it reads its first key, and writes its first.
-        ensemble_key: the states to observe, ``[*B, E, S]``; without ``past_key`` they hold the past themselves, the
-            latest first: ``[*B, E, (L + 1) S]``.
+        ensemble_key: the states to observe, ``[*B, E, S]``; without ``past_key`` they hold the lag window themselves,
+            the latest first: ``[*B, E, (L + 1) S]``.
         predicted_key: predicted observations, ``[*B, E, O]``.
         reading_keys: what is compared with them, and its noise.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         delay: by how many steps readings are late.
         late_key: optional entry that says it for each, ``[*B, 1]`` int64, 0 to L.
         past_key: the last L states, ``[*B, E, L, S]``.
-        state_dim: S, where there is a past: then the mask is written, too.
+        state_dim: S, where there is a lag window: then the mask is written, too.
         seen_key: the mask ``[*B, O]`` or ``[*B, 1]`` that is written: a reading that belongs to the time before the
             episode, or before the lag, is not observed.
         age_key: by how many steps the oldest state lay back one step ago, ``[*B, 1]``.

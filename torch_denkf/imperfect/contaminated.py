@@ -56,7 +56,7 @@ class Contaminated(MixedUpdate):
     mean and covariance    the mixture's, that of both means' distance included; on a space those of the tangents at the
                            forecast's mean. For a linear Gaussian system that is the exact posterior's
     ensemble               members with the mixture's mean and sample covariance, see
-                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a past that is corrected, too
+                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a lag window that is corrected, too
     particles              the exact posterior: each particle's likelihood is the mixture. The analysis runs three times
     =====================  =============================================================================================
 

@@ -110,7 +110,7 @@ class Visible(MixedUpdate):
     mean and covariance    the mixture's, q (1 - q) d dᵀ of the way d between both means included; on a space those of
                            the tangents at the forecast
     ensemble               members with the mixture's mean and sample covariance, see
-                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a past that is corrected, too
+                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a lag window that is corrected, too
     particles              the exact mixture: each particle's likelihood is one
     =====================  =============================================================================================
 

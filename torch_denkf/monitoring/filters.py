@@ -110,7 +110,7 @@ class Gated(Filter):
     Raises:
         TypeError: if the filter has no analysis that can be gated.
         ValueError: if the number of components is not known, an option is out of range, or ``adapt_inflation`` is asked
-            of a filter that observes states of the past, a :class:`FusedFilter` with a delay.
+            of a filter that observes states of the lag window, a :class:`FusedFilter` with a delay.
 
     Example:
         >>> import torch
@@ -190,7 +190,7 @@ class Gated(Filter):
 
 
 def _with_past(part: torch.nn.Module) -> bool:
-    """Returns True if a module observes states of the past, or present and past as one."""
+    """Returns True if a module observes states of the lag window, or present and past as one."""
     return isinstance(part, StateObservation) and part.state_dim is not None
 
 

@@ -39,14 +39,14 @@ class GateOptions(TypedDict, total=False):
             the gate off.
         freedom: of Student's t; 4 by default.
         patience: after so many steps in a row at which a reading was rejected the gate opens: the forecast, and the
-            past states that are carried next to it, are spread until they reach the reading, and the window is emptied.
-            Set more than the longest fault has readings; 50 by default.
+            states of the lag window that are carried next to it, are spread until they reach the reading, and the
+            window is emptied. Set more than the longest fault has readings; 50 by default.
         by_component: whether each component of the reading is judged by itself; for ensembles alone, False by default.
         adapt_noise: rate at which the reading's variances are adapted to its innovations, about the inverse of the
             steps that are remembered; 0 by default, for none.
         adapt_inflation: rate at which the forecast's spread is adapted to the innovations, never below its own;
-            likewise. It acts where a reading is used: the forecast alone, not the past. Innovations tell that something
-            is too small, not what: use one of the two.
+            likewise. It acts where a reading is used: the forecast alone, not the lag window. Innovations tell that
+            something is too small, not what: use one of the two.
         gate_prefix: prefix of the state, ``"gate"`` by default.
     """
 

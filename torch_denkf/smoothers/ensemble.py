@@ -82,10 +82,10 @@ class EnRTS(Smoother):
 
 
 class EnKS(Smoother):
-    """Ensemble Kalman smoother: each analysis corrects the members of the past L steps, too.
+    """Ensemble Kalman smoother: each analysis corrects the members of the lag window L steps, too.
 
-    It is :class:`FixedLag`, put into the order of a recording. Random rotations of the members turn the past as well,
-    so that pairs stay pairs. Where the lag is that of the whole sequence, memory grows with its square: take
+    It is :class:`FixedLag`, put into the order of a recording. Random rotations of the members turn the lag window as
+    well, so that pairs stay pairs. Where the lag is that of the whole sequence, memory grows with its square: take
     :class:`EnRTS` for long recordings. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, ``mean`` and ``var``,
     see :class:`Smoother`.
 
