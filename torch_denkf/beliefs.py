@@ -102,7 +102,7 @@ class Belief:
         return value.isfinite().all()
 
     def flaws(self, entries: Mapping[NestedKey, Tensor]) -> list[str]:
-        """Names what is wrong with a belief whose numbers are finite."""
+        """Names the defects of a belief whose values are finite."""
         return []
 
     def limited(self, held: Mapping[str, Tensor], ceiling: float) -> dict[str, Tensor]:

@@ -80,7 +80,7 @@ class CompiledSteps:
         return dict(zip(writes, values, strict=True))
 
     def scan(self, steps: Steps, carry, inputs, call: Call, resets, starts, cuts, keep) -> tuple[Entries, Entries]:
-        """Returns what :meth:`Steps.scan` does, in chunks; all noise is among the inputs."""
+        """Returns the result of :meth:`Steps.scan`, in chunks; all noise is among the inputs."""
         time, batch, count = len(call.batch_size), call.batch_size, len(cuts)
         keys, start_keys, length = tuple(inputs), tuple(starts), self._length(count)
         whole, named = count, {**inputs}
@@ -210,7 +210,7 @@ class BoundSteps(NamedTuple):
 
 @contextmanager
 def said_when_long(text: str) -> Iterator[None]:
-    """Logs what is done where it takes longer than :data:`PATIENCE` seconds."""
+    """Logs a task that takes longer than :data:`PATIENCE` seconds."""
     timer = Timer(PATIENCE, _LOG.warning, (text,))
     timer.daemon = True
     timer.start()
@@ -240,7 +240,7 @@ def _pieces(value: Tensor, time: int, length: int, whole: int, mark: bool) -> Se
 
 
 def filled(value: Tensor, time: int, count: int, fill: bool | None = None) -> Tensor:
-    """Continues a value ``[*B, T, ...]`` to ``count`` steps, with its last one where it is not said what with."""
+    """Pads a value ``[*B, T, ...]`` to ``count`` steps, by default with its last one."""
     lack = count - value.shape[time]
     if lack <= 0:
         return value

@@ -83,7 +83,7 @@ class _Kept:
 
 
 class _Gather(torch.autograd.Function):
-    """Its backward pass runs after those of all products that were given what it returns."""
+    """A node whose backward pass runs after those of all products of its output."""
 
     @staticmethod
     def forward(ctx, weight: Tensor, bias: Tensor, kept: _Kept) -> Tensor:

@@ -200,7 +200,7 @@ def place_beside(target: Path) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> int:
-    """Removes what killed processes left half written next to the files and folders in a folder.
+    """Removes incomplete files of killed processes next to the files and folders in a folder.
 
     Returns:
         How many places that were.

@@ -121,7 +121,7 @@ def _settle(folder: Path) -> None:
 
 
 def read_folder_config(folder: str | Path, builders: Mapping[str, object]) -> dict[str, Any]:
-    """Reads what :func:`save_folder` wrote next to the weights.
+    """Reads the description that :func:`save_folder` wrote next to the weights.
 
     Args:
         folder: with ``config.json``.

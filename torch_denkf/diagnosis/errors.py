@@ -14,7 +14,7 @@ __all__ = ["entry_of", "explained", "missing_entry"]
 
 
 def explained(module: SubModel, error: Exception, entries: Entries) -> Exception:
-    """Returns an error with what a sub-model read, and its constants, in the message; one of another kind as it is.
+    """Adds a sub-model's inputs and constants to an error's message; leaves other errors unchanged.
 
     Raises:
         TypeError: if entries and parameters differ in precision, or a mask is not boolean.

@@ -41,7 +41,7 @@ class WrongNoise(Once):
         self._known: tuple[Structure | None, list[NoiseEntry], list[NestedKey]] = (None, [], [])
 
     def __call__(self, filter: Filter, record: Record) -> None:
-        """Looks at what a run read and wrote.
+        """Checks the inputs and outputs of a run.
 
         Raises:
             ValueError: that names the entry and the row.

@@ -82,7 +82,7 @@ def no_covariance(noise: Tensor, mask: Tensor | None, batch_dims: int, *, strict
 
 
 def flaw_of(noise: Tensor, mask: Tensor | None = None) -> str:
-    """Describes what keeps one noise, ``[O]`` or ``[O, O]``, from being a covariance."""
+    """Describes why a noise, ``[O]`` or ``[O, O]``, is no covariance."""
     noise = noise.detach()
     variances = noise if noise.ndim == 1 else noise.diagonal()
     shown = torch.where(mask.expand(variances.shape), variances, torch.inf) if mask is not None else variances
@@ -116,7 +116,7 @@ def why_not_finite(structure: Structure, entries: Entries, written: Entries) -> 
 
 
 def cure_of(why: str) -> str:
-    """Returns what a covariance is, where that is the reason."""
+    """Returns the definition of a covariance, if that is the reason."""
     return f"{COVARIANCE} " if "no covariance" in why else ""
 
 
@@ -152,7 +152,7 @@ def _hides(mask: Tensor, value: Tensor) -> bool:
 
 
 def _shown(mask: Tensor, value: Tensor) -> Tensor:
-    """Marks what a mask shows of a value; of a covariance ``[*B, O, O]`` rows and columns."""
+    """Marks the observed part of a value; of a covariance ``[*B, O, O]`` rows and columns."""
     if value.ndim == mask.ndim:
         return mask
     square = value.shape[-1] == value.shape[-2]

@@ -131,7 +131,7 @@ def _end(following: TensorDictBase, size: int) -> Tensor | None:
 
 
 def _chain(tensordict: TensorDictBase, following: TensorDictBase, inner: Tensor) -> tuple[bool, Tensor]:
-    """Compares the next step's entries with what follows: whether that is possible, and breaks ``[N - 1]``.
+    """Compares the next step's entries with the following rows: whether that is possible, and breaks ``[N - 1]``.
 
     A transform of sampled data may change one entry and not its next one, and a robot may stand still. So one entry
     that moves and continues is enough, and a step in which all are the same.

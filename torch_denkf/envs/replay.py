@@ -22,7 +22,7 @@ _NOT_SHOWN = ("next", "done", "terminated", "truncated", "is_init", "action", "i
 
 
 class RecordedPolicy(TensorDictModuleBase):
-    """Commands what was commanded in the recording: copies ``("recorded", "action")`` to ``"action"``.
+    """Repeats the recorded commands: copies ``("recorded", "action")`` to ``"action"``.
 
     Examples:
         >>> now = TensorDict({"recorded": TensorDict({"action": torch.ones(3, 2)}, [3])}, [3])

@@ -47,7 +47,7 @@ class RowsEnv(Checked, EnvBase):
         raise NotImplementedError
 
     def _set_specs(self, row: Tensor, actions: int = 0, **specs: TensorSpec) -> None:
-        """Specs by what some rows show.
+        """Derives specs from some rows.
 
         Args:
             row: ``[*B]``, any.

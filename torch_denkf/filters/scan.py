@@ -37,7 +37,7 @@ class Steps(NamedTuple):
     update_at_reset: bool
 
     def run(self, modules: Iterable[Placed], entries: Entries, call: Call, partial: bool = False) -> Entries:
-        """Runs modules one after the other; each finds in ``entries`` what those before it wrote.
+        """Runs modules one after the other; each reads the outputs of those before it from ``entries``.
 
         Where the entries are ``partial``, some observations are missing: modules that read them are left out, and an
         update gets a mask instead.
@@ -171,7 +171,7 @@ class Steps(NamedTuple):
         return carry, {key: torch.stack([out[key] for out in outputs], time) for key in keep}
 
     def blank(self, written: Entries, fresh: Tensor) -> None:
-        """Sets to zero what a step writes and an initial belief does not have: innovations and the like.
+        """Sets step outputs that an initial belief lacks, such as innovations, to zero.
 
         Args:
             written: by a step, or by those of a sequence; changed.

@@ -357,7 +357,7 @@ class _SymmetricFunction(torch.autograd.Function):
 
 
 def product_of_known(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Returns H x, where what is NaN in x is so in those rows alone that have a coefficient for it.
+    """Returns H x; NaN in x affects only rows with a coefficient for it.
 
     Args:
         matrix: H, ``[O, S]``.

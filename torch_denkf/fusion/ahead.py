@@ -201,7 +201,7 @@ class BeliefAhead(Checked, TensorDictModuleBase):
             now.set(self.dt_key, self.dt * (wanted - k).clamp(0.0, 1.0))
 
     def _noise(self, now: TensorDictBase, size: torch.Size) -> TensorDictBase | None:
-        """Draws what one forecast takes."""
+        """Draws the noise of one forecast."""
         filter = self.filter
         if not filter.draws.places:
             return None

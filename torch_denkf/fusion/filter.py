@@ -189,7 +189,7 @@ def _check_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, jo
 
 
 def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:
-    """Returns L: what is given, or the largest delay."""
+    """Returns L: the given lag, or the largest delay."""
     for name, sensor in sensors.items():
         check_count(f"delay of {name!r}", sensor.delay, least=0)
         if sensor.late_key is not None and sensor.delay < 1:

@@ -84,7 +84,7 @@ class OfOwnErrors(Wrapper):
         return written, whole.index_add(-1, _places(self.own, begin, whole), matrix[..., begin:]), sides
 
     def _seen(self, entries: Entries) -> tuple[NestedKey, Tensor]:
-        """Returns the key and the value of what the sensor sees of the state."""
+        """Returns the key and the value of the state that the sensor observes."""
         key = unravel_key(self.in_keys[0])
         system, errors = self.required(entries, key).tensor_split([-self.total], -1)
         return key, torch.cat([system, errors[..., self.own]], -1)
@@ -209,7 +209,7 @@ class StateObservation(Wrapper, Update):
         return None if found is None else ({self.predicted_key: found[0][self._out_key]}, *found[1:])
 
     def seen(self, entries: Entries, call: Call) -> tuple[Tensor, Tensor | None]:
-        """Returns the predicted observations ``[*B, E, O]``, and the mask of what is observed, if there is one."""
+        """Returns the predicted observations ``[*B, E, O]``, and the observed mask, if there is one."""
         written = run_module(self, entries, call)
         mask = entries.get(self.observed_key) if self.state_dim is None else written[unravel_key(self.out_keys[1])]
         return written[self.predicted_key], mask

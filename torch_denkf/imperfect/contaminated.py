@@ -188,11 +188,11 @@ class Contaminated(MixedUpdate):
         return {**out, **both, (self.info_prefix, "outlier"): outlier}
 
     def _run(self, entries: Entries, call: Call) -> Entries:
-        """Returns what the analysis writes; an ensemble's predictions and reading are plain numbers already."""
+        """Returns the outputs of the analysis; an ensemble's predictions and reading are plain numbers already."""
         return (self.module.on_aligned if self.kind == "members" else self.module.on_entries)(entries, call)
 
     def _of_sound(self, entries: Entries, call: Call, seen: Tensor | None) -> Entries:
-        """Returns what the analysis writes with R, of the forecast and of the one that has diverged."""
+        """Returns the outputs of the analysis with R, of the forecast and of the one that has diverged."""
         out = self._run(entries, call)
         if not self.divergence:
             return out
@@ -252,7 +252,7 @@ class Contaminated(MixedUpdate):
 
 
 class _Quantity(nn.Module):
-    """Numbers that are given or trained, an entry, or what a module writes.
+    """Numbers that are given or trained, an entry, or the outputs of a module.
 
     Args:
         name: for messages, and of the place of the module's noise.

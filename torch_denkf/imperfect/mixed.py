@@ -39,7 +39,7 @@ class MixedUpdate(Around):
             probability: of the first before the reading is known, ``[*B, 1]``. With 1 the first belief comes out, and
                 with 0 the second, without rounding.
             share: that after the reading is known.
-            out: what the update wrote, the first belief.
+            out: the outputs of the update, the first belief.
             other: the second, under the keys of ``out``.
             seen: where anything is observed, ``[*B, 1]``; elsewhere the first belief comes out. ``None``: everywhere.
         """

@@ -277,7 +277,7 @@ def _fits(given: Sequence[int], due: Sequence[int]) -> bool:
 
 
 def _whole_parts(space: Space, points: Tensor, tangents: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Widens what is known of points ``[*, P]``, and of their noise ``[*, D]``, to whole parts of the space."""
+    """Widens the mask of points ``[*, P]``, and of their noise ``[*, D]``, to whole parts of the space."""
     parts: list[tuple[Tensor, Tensor]] = []
     for place in places_of(space):
         point, tangent = points[..., place.point], None if tangents is None else tangents[..., place.tangent]

@@ -37,7 +37,7 @@ __all__ = ["Visibility", "Visible"]
 
 
 class Visibility(Sensor):
-    r"""The probability that a reading is about the state at all, from what the sensor encodes.
+    r"""Predicts the probability that a reading is about the state at all, from the sensor's encoding.
 
     Labels teach it where there are some: the term ``visible`` of the losses, a binary cross entropy. Where there are
     none, the likelihood of the readings does, ``nll``, and so does each score of the belief.

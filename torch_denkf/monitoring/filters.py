@@ -23,7 +23,7 @@ __all__ = ["Gated", "Monitored"]
 
 
 class Monitored(Filter):
-    """A filter with a monitor behind its analyses: next to the belief it writes an alarm, and what speaks for it.
+    """A filter with a monitor behind its analyses, which writes an alarm and its evidence next to the belief.
 
     It is a :class:`Filter` itself: steps, sequences, masks, resets, policies, transforms, replay buffers and compiled
     steps work as with any other. The belief is that of the filter, bit for bit. The modules are the filter's own, not

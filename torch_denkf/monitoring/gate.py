@@ -273,7 +273,7 @@ class GatedAnalysis(Around):
         return {**out, **dict(zip((*self.state_keys, *self._further), own, strict=True))}
 
     def _analyse(self, entries: Entries, call: Call) -> Entries:
-        """Returns what the analysis writes; an ensemble's predictions and reading are plain numbers already."""
+        """Returns the outputs of the analysis; an ensemble's predictions and reading are plain numbers already."""
         return (self.module.on_aligned if self.of_ensemble else self.module.on_entries)(entries, call)
 
     def _with_noise(self, entries: Entries, call: Call) -> Entries:
@@ -323,8 +323,8 @@ class GatedAnalysis(Around):
         """Takes the distribution of the innovations, and of their windows, from clean data.
 
         Args:
-            clean: recordings ``[*B, T]``, time last, of ``(gate_prefix, "part_nis")``: what the filter wrote while the
-                gate did nothing.
+            clean: recordings ``[*B, T]``, time last, of ``(gate_prefix, "part_nis")``: the outputs of the filter while
+                the gate did nothing.
             margin: factor on the limits.
 
         Returns:

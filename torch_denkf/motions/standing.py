@@ -11,7 +11,7 @@ __all__ = ["attitude_of", "stands_still"]
 
 
 def attitude_of(acceleration: Tensor, magnetic: Tensor | None = None, *, declination: float = 0.0) -> Tensor:
-    """Returns the attitude at which an accelerometer, and a magnetometer, read what they do while a body stands still.
+    """Returns the attitude of a body at rest from its accelerometer, and its magnetometer.
 
     Args:
         acceleration: specific force in the body's axes ``[*B, 3]``, upwards where it stands still; in any unit.

@@ -206,7 +206,7 @@ def _unwrap(angle: Tensor) -> Tensor:
 
 
 def _turns(drawn: Sequence[Tensor | None], column: int) -> list[int]:
-    """Returns the turns, 0 from -pi to pi, of unwrapped angles: of what is drawn, ``[T, K]`` each, in a column."""
+    """Returns the turns that a column of unwrapped angles ``[T, K]`` covers; turn 0 is -pi to pi."""
     values = torch.cat([value[:, column] for value in drawn if value is not None])
     values = values[values.isfinite()]
     if not len(values):

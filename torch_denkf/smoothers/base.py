@@ -19,7 +19,7 @@ __all__ = ["Smoother"]
 
 
 class Smoother(Checked, TensorDictModuleBase):
-    """Filters a sequence ``[*B, T]``, then says what each state looks like given what came later.
+    """Filters a sequence ``[*B, T]``, then corrects each state by the later readings.
 
     It writes all that the filter writes, and ``("smoothed", "mean")`` and ``("smoothed", "var")`` ``[*B, T, S]``, with
     ``("smoothed", "cov")`` or ``("smoothed", "ensemble")`` where there is one. At a time t that is the belief of the
@@ -106,14 +106,14 @@ class Smoother(Checked, TensorDictModuleBase):
         return filter
 
     def _extended(self, lag: int | None) -> Filter:
-        """Returns the filter, or one of the same modules that also writes what the smoother needs."""
+        """Returns the filter, or one of the same modules that also writes the smoother's inputs."""
         return self.filter
 
     def _smooth(self, entries: Entries, follows: Tensor, out: TensorDictBase) -> tuple[Tensor, ...]:
         """Returns the smoothed belief, in the order of ``smoothed_keys``.
 
         Args:
-            entries: ``[*B, T, ...]``, what is read and what the filter wrote.
+            entries: ``[*B, T, ...]``, what is read and the outputs of the filter.
             follows: which elements are a step on from those before them, ``[*B, T]``; the first is not read.
             out: the same as a tensordict.
         """

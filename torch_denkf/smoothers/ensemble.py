@@ -17,7 +17,7 @@ __all__ = ["EnKS", "EnRTS"]
 
 
 class EnRTS(Smoother):
-    """Ensemble Rauch-Tung-Striebel smoother: one pass back over what the filter wrote.
+    """Ensemble Rauch-Tung-Striebel smoother: one pass back over the outputs of the filter.
 
     The gain of each step back is a regression of members on their own forecasts. It asks nothing of the analysis, and
     costs about as much as the filter's analysis. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, ``mean`` and

@@ -59,7 +59,7 @@ def with_past(
         past: ``ENSEMBLE_PAST``, ``MOMENTS_PAST`` or ``JOINT_PAST``.
         age: steps between the first belief of an episode and the first state: 0, or -1 where that belief is yet to be
             updated with its own frame.
-        belief_prefix: prefix of what ``initial`` writes, and of the lag window.
+        belief_prefix: prefix of the outputs of ``initial``, and of the lag window.
 
     Raises:
         ValueError: if ``lag`` is not positive.
@@ -175,7 +175,7 @@ class LaggedAnalysis(Around):
 
 
 def lagged(analysis: Update) -> Update:
-    """Extends an analysis to correct the lag window, too; inside of what goes around it, such as a gate.
+    """Extends an analysis to correct the lag window, too; inside of wrappers such as a gate.
 
     Raises:
         TypeError: if it does not say what it does to other states.

@@ -165,7 +165,7 @@ class Stage:
 
 
 def why_no_gain(stage: Stage, first: float, value: float, update: int) -> str:
-    """Returns what a stage that gained less than 1 % is to be told, or nothing.
+    """Returns advice for a stage that gained less than 1 %, or nothing.
 
     Args:
         stage: the stage.

@@ -71,7 +71,7 @@ class DEnKFTransform(Checked, Transform):
 
     Raises:
         TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``.
-        KeyError: if the environment does not emit what the filter reads, or the belief got lost on the way.
+        KeyError: if the environment does not emit the inputs of the filter, or the belief got lost on the way.
         ValueError: if the filter's result is not finite, or shapes do not fit.
 
     Example:
@@ -246,7 +246,7 @@ class DEnKFTransform(Checked, Transform):
     # ------------------------------------------------------------------------------------------------- the specs
 
     def _add_specs(self, spec: Composite, keys: Sequence[NestedKey], observation_spec: Composite) -> Composite:
-        """Adds to ``spec`` what the filter writes under ``keys`` on observations that are all zero."""
+        """Adds to ``spec`` the outputs of the filter under ``keys`` on observations that are all zero."""
         dtypes = {p.dtype for p in (*self.filter.parameters(), *self.filter.buffers()) if p.is_floating_point()}
         probe = observation_spec.zero()
         row = TensorDict({}, observation_spec.shape, device=observation_spec.device)

@@ -59,7 +59,7 @@ class LeggedErrors:
 
 
 class LeggedEnv(EnvBase):
-    """One robot in MuJoCo that emits what a legged robot reads, and the true motion of its base.
+    """Simulates one robot in MuJoCo; emits the readings of a legged robot, and the true motion of its base.
 
     Emits ``"imu"`` ``[6]`` (gyro in rad/s, accelerometer in m/s^2, in the sensor's axes: means over the step),
     ``"joints"`` and ``"joint_rates"`` ``[J]``, ``"force"`` ``[F]`` that presses each foot, in N, and ``"contact"``

@@ -147,7 +147,7 @@ def _varies(model: RobotModel, rows: TensorDict, name: str) -> Tensor:
 
 
 def _start_from(model: RobotModel, rows: TensorDict, name: str, varies: Tensor) -> None:
-    """Sets white noise to what readings differ from the line through their neighbours."""
+    """Sets white noise to the residuals of readings from the line through their neighbours."""
     there = rows[f"{name}_observed"][:, 0]
     seen, given = rows[name][there], rows[f"{name}_noise"][there].diagonal(dim1=-2, dim2=-1).mean(0).sqrt()
     if len(seen) < 3 * _HELD_OUT or model.drifts is None:

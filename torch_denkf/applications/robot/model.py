@@ -24,7 +24,7 @@ PLANE_VARIANCE = 1e-6  # of the zeros that are read in the plane
 
 @dataclass(frozen=True)
 class RobotModel:
-    """A filter, and what it reads.
+    """A filter and its inputs.
 
     Attributes:
         filter: of the fifteen states; its rows have ``"dt"``, and for each sensor its readings, their mask and their
@@ -89,7 +89,7 @@ def _initial(mean: Tensor, cov: Tensor, drifts: Drifts | None) -> MomentPrior:
 
 
 class LearnedScale(SubModel):
-    """The covariances that messages bring, with standard deviations scaled by what is learned.
+    """Covariances of the messages, with learned factors on the standard deviations.
 
     Args:
         in_key: covariances of the data ``[*B, O, O]``.

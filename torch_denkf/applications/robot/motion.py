@@ -148,7 +148,7 @@ class RobotMotion(Motion):
 
 
 class RobotNoise(SubModel):
-    """Process noise of the fifteen states, a covariance for each second, scaled by what is learned, and of drifts.
+    """Process noise of the fifteen states, a covariance per second with learned factors, and that of drifts.
 
     Args:
         cov: of a second, ``[15, 15]``.

@@ -55,7 +55,7 @@ def from_north(name: str) -> bool:
 def seen_by(
     sensor: SensorConfig, group: str, config: Config, table: Readings, origin: Sequence[float] | None, scale: float
 ) -> Seen:
-    """Finds what a sensor reads of the states.
+    """Extracts a sensor's readings of state components from a log.
 
     Args:
         sensor: its settings.

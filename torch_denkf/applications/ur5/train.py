@@ -44,7 +44,7 @@ def train_ur5_table(
     command: str = "",
     progress: bool = True,
 ) -> UR5TableFilter:
-    """Collects what is missing, trains the filter and writes it to a folder; a repeated call continues.
+    """Collects missing demos, trains the filter and writes it to a folder; a repeated call continues.
 
     Demos below ``sequences`` are the filter's, so that it sees how wrong its sensor is on new ones; the others are the
     sensor's. The replay's hash decides which demos are for tests; those are in neither.

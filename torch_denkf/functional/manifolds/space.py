@@ -69,7 +69,7 @@ class Space:
         raise NotImplementedError
 
     def exp_and_jacobian(self, tangent: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns :meth:`exp` and :meth:`right_jacobian`, which may share what they need."""
+        """Returns :meth:`exp` and :meth:`right_jacobian`, which may share computations."""
         return self.exp(tangent), self.right_jacobian(tangent)
 
     def adjoint(self, point: Tensor) -> Tensor:

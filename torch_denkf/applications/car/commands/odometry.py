@@ -57,7 +57,7 @@ class Odometry(Command):
     example = "denkf odometry drive.mp4 --calibration camera.yaml --checkpoint runs/car --height 1.4 --out runs/drive"
 
     def run(self) -> None:
-        """Reads what is given, tracks, and writes the path as it comes."""
+        """Reads the inputs, tracks, and writes the path step by step."""
         if self.fps is not None and self.times is not None:
             raise ValueError("pass --fps or --times, not both")
         given = {"frames": self.frames, "calibration": self.calibration, "times": self.times}
@@ -97,7 +97,7 @@ class Odometry(Command):
 
 
 def _leave(beliefs, out: Path, *, pictures: bool) -> None:
-    """Writes the path, as it comes, and what follows from it."""
+    """Writes the path step by step, and the entries computed from it."""
     import torch
 
     from torch_denkf.applications.car.kitti.trajectories import write_trajectory

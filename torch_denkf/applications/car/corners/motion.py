@@ -195,7 +195,7 @@ def corner_motions(
     steps: int = 6,
     memory: bool = True,
 ) -> CornerMotion:
-    """Returns the motion of each row since the row before; what a corner has shown of its disparity is remembered.
+    """Returns the motion of each row since the row before, and remembers each corner's disparity error.
 
     A corner that moves shows how far it is. So the error of its disparity, which stays with it, is known better from
     row to row.

@@ -32,7 +32,7 @@ def with_motion(
     signs: bool = False,
     repair: bool = False,
 ) -> TensorDict:
-    """Adds what the flow sensor reads to a drive: the motion of each image since the one before.
+    """Adds the inputs of the flow sensor to a drive: the motion of each image since the one before.
 
     ========= =============== =========================================================================================
     key       shape           content

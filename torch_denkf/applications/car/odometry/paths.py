@@ -79,7 +79,7 @@ def _row(belief: TrackedBelief) -> list[Any]:
 
 
 def read_path(file: str | Path) -> TensorDict:
-    """Reads what :func:`write_path` wrote.
+    """Reads a file of :func:`write_path`.
 
     Args:
         file: ``path.csv``.

@@ -29,7 +29,7 @@ _WHITE, _BLACK = 250, 5  # grey levels at which a pixel counts as too bright, or
 
 
 def static_region(previous: np.ndarray, current: np.ndarray, *, noise: int = 0, cells: int = _CELLS) -> np.ndarray:
-    """Masks what stands still before a moving camera: dirt on the lens, an occlusion, dead pixels.
+    """Masks static pixels before a moving camera: dirt on the lens, an occlusion, dead pixels.
 
     The picture is divided into square cells. A cell is static if none of its pixels changed by more than the noise,
     while more than half of the cells did change. Cells that are too bright in both pictures are left out, because an
@@ -156,7 +156,7 @@ def plane_distance(flow: Tensor, *, height: float = KITTI_HEIGHT) -> Tensor:
 
 
 def flow_signs(plane: Tensor, road: Tensor, distance: Tensor) -> Tensor:
-    """Signs that what was taken for the road is none, such as the back of a car close ahead.
+    """Returns signs that the assumed road is none, such as the back of a car close ahead.
 
     ============ ======================================================================================================
     entry        content
