@@ -1,10 +1,10 @@
-"""Tells how wrong speed and turn rate are for longer than a second, on drives with known poses.
+"""Estimates coloured errors of speed and turn rate on drives with known poses.
 
 ``python -m benchmarks.odometry.calibration --root KITTI --out FOLDER``
 
-The shipped filter has learned from rendered drives alone. How wrong its speed is on real ones, by a factor that lasts,
-and its turn rate, by an offset that lasts, only real ones can say. Each drive is scored with what the others say; the
-filter that is left has what all say.
+The shipped filter was trained on rendered drives alone. The scale error of its speed and the bias of its turn rate,
+each averaged over one second, are estimated on real drives. Each drive is scored with the estimates of the others; the
+saved filter has those of all.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from torch_denkf.applications.car.odometry.filter import VELOCITIES, CarFilter
 from torch_denkf.applications.car.odometry.streams import Drive, all_frames, read_spans
 
 SECOND = 10  # steps
-SLOW = 1.0  # m/s: below it a factor says nothing
-NEAREST = 0.05  # of the true speed: a reading that is smaller, or negative, counts as this
+SLOW = 1.0  # m/s: lower speeds give no scale
+NEAREST = 0.05  # share of the true speed at which smaller or negative readings are clamped
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Calibration:
 
     root: Path  # folder with sequences and poses
     out: Path = Path("runs/calibrated")  # folder for the filter, calibrated on all drives
-    checkpoint: str = "car-odometry"  # that of the library, or a folder that denkf train left
+    checkpoint: str = "car-odometry"  # a pretrained filter, or a folder of denkf train
     draws: int = 8  # of the filter's noise
 
 

@@ -23,7 +23,7 @@ __all__ = ["NAMES", "DT", "ensemble_filter", "gaussian_filter", "recordings"]
 
 DT = 0.01  # s
 NAMES = ("x", "y", "heading", "speed", "turn rate", "gyro bias", "wheel scale")
-#: Of the process noise of one step, and where a run starts: m, m, rad, m/s, rad/s, rad/s, 1.
+#: Standard deviations of the process noise of one step and of the initial state: m, m, rad, m/s, rad/s, rad/s, 1.
 PROCESS = [0.0, 0.0, 0.0, 0.05, 0.05, 1e-4, 1e-5]
 MEAN, STD = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0], [0.5, 0.5, 0.1, 0.3, 0.1, 0.02, 0.05]
 #: Standard deviations of the readings, and steps between two.
@@ -38,12 +38,12 @@ def moved(state: Tensor) -> Tensor:
 
 
 def turn_rate(state: Tensor) -> Tensor:
-    """Returns what the gyro reads, with its bias."""
+    """Returns the gyro's reading, with its bias."""
     return state[..., 4:5] + state[..., 5:6]
 
 
 def wheel_speed(state: Tensor) -> Tensor:
-    """Returns what the wheels read, by their scale."""
+    """Returns the wheels' reading, with their scale."""
     return state[..., 3:4] * state[..., 6:7]
 
 
@@ -72,7 +72,7 @@ def _sensors() -> dict[str, FusedSensor]:
 
 
 def ensemble_filter(members: int, **options) -> FusedFilter:
-    """Square root updates of an ensemble, a sensor after the other; ``options`` of its analyses."""
+    """Returns an ensemble filter with square-root updates, sensor by sensor; ``options`` of its analyses."""
     return FusedFilter(
         LearnedTransition(moved, residual=False),
         _sensors(),

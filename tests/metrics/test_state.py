@@ -12,7 +12,7 @@ from torch_denkf.metrics import state_errors
 from torch_denkf.metrics.state import state_difference
 
 
-def test_by_hand():
+def test_errors_equal_values_by_hand():
     truth = torch.tensor([[[0.0, 3.0, 1.0], [0.0, -3.0, 1.0]]], dtype=torch.float64)
     estimated = torch.tensor([[[3.0, -3.0, 1.0], [-1.0, -2.5, 1.0]]], dtype=torch.float64)
     turn = 2 * math.pi - 6  # from 3 to -3 rad, to the left

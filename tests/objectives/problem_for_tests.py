@@ -1,4 +1,4 @@
-"""Holds what tests of objectives start from: frames with the truth, weights of one term, what counts, and training."""
+"""Fixtures of objective tests: frames with true states, weights of one term, a mask of scored rows, and training."""
 
 import torch
 
@@ -18,7 +18,7 @@ def only(terms, name, weight=1.0):
 
 
 def stepped(frames):
-    """Elements that were stepped to."""
+    """Returns a mask of elements that a step has led to."""
     mask = ~frames["is_init"].squeeze(-1)
     mask[..., 0] = False
     return mask

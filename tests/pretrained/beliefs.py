@@ -23,7 +23,7 @@ _READINGS = {
 
 
 def all_beliefs():
-    """By name, the last mean and variance as one list."""
+    """Returns the last mean and variance of each filter, by name."""
     out = {}
     for name in torch_denkf.available():
         generator = torch.Generator().manual_seed(0)
