@@ -24,7 +24,7 @@ __all__ = [
     "select_episodes",
 ]
 
-ROW = "_row"  # entry of stored rows: index of the row in the whole data set, by which its image is found
+ROW = "_row"  # entry of stored rows: index of the row in the whole data set, which selects its image
 Split = Literal["train", "validation", "test", "all"]
 
 
@@ -33,7 +33,7 @@ class Episode:
     """Consecutive rows of a data set.
 
     Attributes:
-        name: of the episode, unique in the data set.
+        name: name of the episode, unique in the data set.
         start: its first row in the data set.
         length: number of its rows.
     """
@@ -54,8 +54,8 @@ def hashed_share(name: str, purpose: str) -> float:
     A name that is in a split stays there when the share grows.
 
     Args:
-        name: of an episode.
-        purpose: salt of the hash: two purposes give independent numbers.
+        name: name of an episode.
+        purpose: salt of the hash: two purposes give independent hashes.
 
     Examples:
         >>> share = [hashed_share(str(k), "test") < 0.2 for k in range(1000)]
@@ -83,7 +83,7 @@ def roles_of(
     """Assigns each episode to a split, independently of all others, so that later episodes change no assignment.
 
     Args:
-        episodes: of the whole data set.
+        episodes: all episodes of the data set.
         for_tests: predicate that selects test episodes.
         validation_share: share of the other episodes for validation, by :func:`hashed_share`.
     """
@@ -142,7 +142,7 @@ def select_episodes(
     """Returns rows of the chosen episodes with flags and episode numbers, and these episodes with their new starts.
 
     Args:
-        rows: of the whole data set, ``[N]``.
+        rows: rows of the whole data set, ``[N]``.
         chosen: some of its episodes.
         single: bool ``[N]``: selects rows, each of which becomes an episode of one row.
     """

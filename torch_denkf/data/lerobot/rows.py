@@ -1,4 +1,4 @@
-"""Turns rows of torchrl's robot data sets into a recording."""
+"""Conversion of rows of torchrl's robot data sets into a recording."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def recording_from_rows(
 ) -> DecodedRecording:
     """Turns rows as :class:`torchrl.data.datasets.OpenXExperienceReplay` stores them into a recording.
 
-    The defaults are the keys that most of the Open X-Embodiment sets have there, and those of
+    The defaults are the keys of most of the Open X-Embodiment sets, and of
     :class:`torchrl.data.datasets.LeRobotExperienceReplay`. Berkeley's UR5 set has others::
 
         data = OpenXExperienceReplay("berkeley_autolab_ur5", download=True, streaming=False)
@@ -58,11 +58,11 @@ def recording_from_rows(
         state_key: state vector, ``[N, S]`` or ``[N]``; the entries of a list of keys are concatenated.
         action_key: action vector, ``[N, A]`` or ``[N]``, or a list of keys. None reads no actions; the default key may
             be missing from the rows.
-        episode_key: a number for each row, the same in all rows of an episode and in no others.
+        episode_key: number of each row's episode; different episodes have different numbers.
         size: (H, W) to scale the images to. None keeps their size: uint8 images of a tensordict are then not copied,
             and memory-mapped ones stay memory-mapped.
-        names: of the components of the state.
-        folder: for a file of copied images, which is deleted with the recording; None keeps them in memory.
+        names: names of the state's components.
+        folder: folder for a temporary file of copied images; None keeps them in memory.
 
     Returns:
         The recording, which :class:`torch_denkf.data.LeRobotReplay` takes instead of a folder. Times start at 0 in
