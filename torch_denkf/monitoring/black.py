@@ -1,4 +1,4 @@
-"""Masks images that are black all over."""
+"""Masks images that are entirely black."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["BlackIsMissing"]
 
 
 class BlackIsMissing(Sensor):
-    """Marks images that are black all over as not observed.
+    """Marks images that are entirely black as not observed.
 
     A network outputs a reading for a black image, too, and the filter would use it. Put this module in front of the
     sensor, ``TensorDictSequential(BlackIsMissing(), sensor)``, and let the filter read its mask,

@@ -17,21 +17,21 @@ __all__ = ["SignGate"]
 
 
 class SignGate(Sensor):
-    """Marks readings as not observed where a sign of a fault exceeds its limit, which clean data calibrate.
+    """Marks readings as not observed if a sign of a fault exceeds its limit, which is calibrated on clean data.
 
-    A *sign* is a scalar that is small while a sensor works and large when it fails, whatever it reads: the share of an
-    image that is black (:func:`torch_denkf.applications.car.vision.signs.picture_signs`), the residual of a fit, a
-    motor's temperature. A sign shows a fault at once; innovations show it after some steps, or never. Put this module
-    in front of the filter, or of its sensor. An :class:`InnovationMonitor` can raise its alarm by the same signs.
+    A *sign* is a scalar that is small while a sensor works and large when it fails, independently of its reading: the
+    share of an image that is black (:func:`torch_denkf.applications.car.vision.signs.picture_signs`), the residual of a
+    fit, a motor's temperature. A sign shows a fault at once; innovations show it after some steps, or never. Put this
+    module before the filter, or before its sensor. An :class:`InnovationMonitor` can use the same signs.
 
     Args:
         count: K, the number of signs of a reading.
-        rate: share of the clean readings that are rejected, by all signs together.
+        rate: share of the clean readings that all signs together reject.
         floor: lower bounds of the limits, one for all signs or one for each.
         sign_key: the signs ``[*B, K]``. NaN stands for an unknown sign, which never rejects.
         observed_key: optional observed mask ``[*B, 1]`` or ``[*B, O]``.
-        out_key: the mask, of the same shape: False where a sign exceeds its limit, or ``observed_key`` is False. Let
-            the filter read it, ``observed_key="seen"``.
+        out_key: new mask of the same shape: False if a sign exceeds its limit, or ``observed_key`` is False. Pass it to
+            the filter as ``observed_key="seen"``.
 
     Raises:
         ValueError: if a number is out of range, or both masks have one key.
@@ -89,7 +89,7 @@ def floors(floor: float | Sequence[float], count: int) -> Tensor:
     """Returns the floors ``[K]``.
 
     Raises:
-        ValueError: if ``floor`` has another number of values than K, or one is negative.
+        ValueError: if the number of values is not K, or one is negative.
     """
     values = [floor] * count if isinstance(floor, (int, float)) else list(floor)
     if len(values) != count:
