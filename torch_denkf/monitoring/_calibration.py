@@ -33,7 +33,7 @@ def empirical_quantile(values: Tensor, levels: Tensor) -> Tensor:
 
 
 def chi_square_table(nis: Tensor, freedom: int) -> Tensor:
-    """Returns knots and heights ``[2, N]`` of the map from ``nis`` ``[M]`` of clean data to chi-square; linear beyond."""
+    """Returns knots and heights ``[2, N]`` that map ``nis`` ``[M]`` of clean data to chi-square; linear beyond."""
     levels = _levels(len(nis))
     measured = _rising(empirical_quantile(nis, levels).clamp_min(1e-9))
     expected = torch.tensor([chi_square_quantile(1 - level, freedom) for level in levels.tolist()])

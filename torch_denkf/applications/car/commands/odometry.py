@@ -97,7 +97,7 @@ class Odometry(Command):
 
 
 def _leave(beliefs, out: Path, *, pictures: bool) -> None:
-    """Writes the path step by step, and the entries computed from it."""
+    """Writes the path step by step, then trajectory files, a summary and plots."""
     import torch
 
     from torch_denkf.applications.car.kitti.trajectories import write_trajectory

@@ -45,7 +45,7 @@ class Train(Command):
     example = "denkf train --rendered 20 --out runs/car"
 
     def run(self) -> None:
-        """Trains, and says how good the filter is."""
+        """Trains the filter, and prints its validation score."""
         if self.root is None and self.rendered < 3:
             raise ValueError("nothing to learn from: pass --root FOLDER, or --rendered N with three drives or more")
         import torch

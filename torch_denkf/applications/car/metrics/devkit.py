@@ -50,7 +50,7 @@ def kitti_devkit_error(
     Args:
         estimated: poses (x m, y m, θ rad), ``[*B, T, 3]``, or (quaternion, position in m), ``[*B, T, 7]``.
         truth: the true poses, of the same shape.
-        lengths: of the segments, in m; lengths that do not fit into a path are left out.
+        lengths: lengths of the segments, in m; lengths that do not fit into a path are left out.
         step: frames between the starts of segments.
 
     Returns:

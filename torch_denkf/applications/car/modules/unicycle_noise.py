@@ -18,9 +18,9 @@ class UnicycleNoise(NoiseThrough):
     r"""Computes process noise of a unicycle in which the noise of the velocities also moves the pose of the same step.
 
     :class:`~torch_denkf.applications.car.UnicycleTransition` moves the pose with the *new* velocities, which have the
-    noise. A covariance that is added to the velocities *after* the motion would leave the pose of that step
-    uncorrelated with them, and an innovation of the velocities would not correct the pose. Here :math:`Q = G Q_v G^T`
-    with :math:`G = \partial (x, y, \theta, v, \dot\theta)_t / \partial (v, \dot\theta)_t`.
+    noise. Noise that is added to the velocities *after* the motion would be uncorrelated with the pose of that step,
+    and an innovation of the velocities would not correct the pose. Here :math:`Q = G Q_v G^T` with :math:`G = \partial
+    (x, y, \theta, v, \dot\theta)_t / \partial (v, \dot\theta)_t`.
 
     Args:
         noise: writes variances ``[*B, 2]`` or a covariance ``[*B, 2, 2]`` of (v, theta_dot), in (m/s)^2 and

@@ -1,4 +1,4 @@
-"""The camera of a car: its images at the training's resolution, their optical flow, and plausibility checks."""
+"""Camera of a car: scales images to the training's resolution, computes their optical flow, and checks plausibility."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _PITCH_MARGIN = 0.01  # rad
 
 
 def check_frame(frame: object, number: int) -> None:
-    """Raises unless this is an image in OpenCV's layout.
+    """Checks that a frame is an image in OpenCV's layout.
 
     Raises:
-        ValueError: if it is no array, or one of another shape or dtype; names the frame.
+        ValueError: if it is no array, or has another shape or dtype; the message names the frame.
     """
     if not isinstance(frame, np.ndarray):
         raise ValueError(f"frame {number} is a {type(frame).__name__}; pass an array, uint8 [H, W] or [H, W, 3]")
@@ -47,7 +47,7 @@ class CarCamera:
     Args:
         frame: the first image, ``[H, W]`` or ``[H, W, 3]``.
         calibration: (fx, fy, cx, cy) in pixels.
-        height: over the road, in m.
+        height: height over the road, in m.
         pitch: upward pitch of the camera relative to the road, in rad.
         focal: focal length of the training images in pixels; ``None`` leaves images as they are.
         two_view: whether corners are tracked, too.
@@ -101,9 +101,9 @@ class CarCamera:
         return grey if self.size == grey.shape[::-1] else cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA)
 
     def motion(self, previous: np.ndarray, current: np.ndarray) -> tuple[dict[str, Tensor], float]:
-        """Returns flow and road of a pair, rounded as for the training; and how corners moved, where they are tracked.
+        """Returns flow, road correlation and corner motion (if tracked) of a pair, rounded as in the training.
 
-        It also returns the share of the image that is static.
+        It also returns the static share of the image.
         """
         static = static_region(previous, current)
         hidden = {"hidden": static} if self.repair and static.any() else {}
