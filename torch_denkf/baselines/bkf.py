@@ -1,4 +1,4 @@
-"""The Backprop KF (Haarnoja et al. 2016): a Kalman filter behind a learned sensor that also says how sure it is."""
+"""The Backprop KF (Haarnoja et al. 2016): a Kalman filter with a learned sensor that also predicts its noise."""
 
 from __future__ import annotations
 

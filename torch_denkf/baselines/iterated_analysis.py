@@ -64,7 +64,7 @@ def _twice(prefix: str, keys: Sequence[NestedKey], space: Space | None, belief: 
 
 
 class IteratedAnalysis(Rotated):
-    r"""Finds from where the reading says that the last step began, and makes the step again from there.
+    r"""Corrects the previous state by the reading, and repeats the step from there.
 
     Gauss-Newton steps in the space of the members, each with a run of transition and observation; see
     :func:`~torch_denkf.baselines.iterated_smoothing.iterated_smoothing`. Where the motion has Gaussian noise, the
@@ -77,7 +77,7 @@ class IteratedAnalysis(Rotated):
         iterations: of Gauss-Newton.
         inflation: factor on the anomalies of the smoothed members, where anything is observed.
         rotate: random mean-preserving rotation of them.
-        space: in which the state lives; ``None`` for plain numbers. Members are corrected as tangents at their mean.
+        space: space of the state; ``None`` for vectors. Members are corrected as tangents at their mean.
         reading_space: in which the reading lives; innovation and R are tangents.
         ensemble_key: members before the step, ``[*B, E, S]``.
         observation_key: learned observations ``[*B, E, O]``, whose mean is used, or one reading ``[*B, O]``.

@@ -1,4 +1,4 @@
-"""Explains errors: what was read, in which precision, and what is missing."""
+"""Explains errors by inputs, precision and missing entries."""
 
 from __future__ import annotations
 

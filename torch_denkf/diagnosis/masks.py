@@ -1,4 +1,4 @@
-"""Warns where an observed mask hides observations, and a module uses them all the same."""
+"""Warns if a module uses observations that an observed mask marks as missing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _OWN_MASK = "_observed"
 
 
 class UnreadMasks(Once):
-    """Warns once of each mask that hides observations which a module of the filter uses all the same.
+    """Warns once of each observed mask that a module of the filter ignores.
 
     Such a mask is one that no module reads, one that is spelt otherwise, that of a table whose values are held until
     the next arrives, or one that a transform of the environment writes.

@@ -1,4 +1,4 @@
-"""Raises where a noise is no covariance, and warns where a sequence ends in NaN."""
+"""Raises if a noise is no covariance, and warns if a sequence ends in NaN."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _ROUNDING = 1e-4
 class WrongNoise(Once):
     """Raises where the noise of a reading, or a variance of the belief, is negative, and warns of NaN in a sequence.
 
-    A noise that a mask hides is not looked at. With ``check_finite=False`` nothing is.
+    Noise of missing observations is not checked. ``check_finite=False`` disables all checks.
     """
 
     def __init__(self) -> None:

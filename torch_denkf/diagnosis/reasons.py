@@ -63,11 +63,11 @@ def noises_of(structure: Structure) -> list[NoiseEntry]:
 
 
 def no_covariance(noise: Tensor, mask: Tensor | None, batch_dims: int, *, strict: bool = False) -> Tensor:
-    """Tells in which rows a noise whose numbers are finite is no covariance, ``[*B]``.
+    """Masks rows in which a finite noise is no covariance, ``[*B]``.
 
     Args:
         noise: variances ``[*B, O]`` or covariances ``[*B, O, O]``.
-        mask: ``[*B, 1]`` or ``[*B, O]``; what it hides may be anything.
+        mask: ``[*B, 1]`` or ``[*B, O]``; noise of missing components is ignored.
         batch_dims: dimensions of ``*B``.
         strict: whether zero is no variance.
     """
@@ -103,8 +103,8 @@ def why_not_finite(structure: Structure, entries: Entries, written: Entries) -> 
 
     Args:
         structure: of the filter.
-        entries: what the step read.
-        written: what it wrote.
+        entries: inputs of the step.
+        written: outputs of the step.
     """
     why = bad_inputs(structure, entries, written) or _of_first_row(structure, entries, written)
     return (
@@ -121,7 +121,7 @@ def cure_of(why: str) -> str:
 
 
 def bad_inputs(structure: Structure, entries: Entries, written: Entries) -> str:
-    """Names inputs that are not finite and that no mask hides, and flaws of the belief that was given."""
+    """Names observed inputs that are not finite, and flaws of the given belief."""
     kinds, bad = dict(structure.carried), []
     masks = {
         unravel_key(key): unravel_key(part.observed_key)

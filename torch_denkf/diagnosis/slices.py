@@ -1,4 +1,4 @@
-"""Raises where a flat batch holds several sequences end to end and does not mark where each begins."""
+"""Raises if a flat batch has several concatenated sequences without marks of their beginnings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames that do not arrive."""
+"""Missing frames."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ __all__ = ["MissingFrames"]
 class MissingFrames(FrameTransform):
     """Drops each frame with probability ``p``: its entries become zero and ``observed`` becomes ``False``.
 
-    This is the paper's test with missing observations (section IV-A, p = 0.3). Frames that are missing already stay
-    so; the frame of a reset counts like any other. Black frames that nobody reports are
+    This is the paper's test with missing observations (section IV-A, p = 0.3). Frames that are already missing stay
+    missing; the frame of a reset may be dropped, too. For unannounced black frames see
     :class:`torch_denkf.envs.BlackFrames`.
 
     Args:
         p: probability that a frame is dropped.
         in_keys: entries of the frame ``[*B, ...]``.
-        observed_key: the mask ``[*B, 1]``; it is added where the environment has none.
+        observed_key: the mask ``[*B, 1]``; it is added if the environment has none.
         generator: source of randomness; torch's global one by default.
 
     Raises:

@@ -41,7 +41,7 @@ __all__ = ["BiasedBelief", "BiasedNoise", "BiasedObservation", "BiasedTransition
 
 
 class FadingBias(nn.Module):
-    """K biases that fade: Ornstein-Uhlenbeck processes, whose size and time are learned.
+    """K fading biases: Ornstein-Uhlenbeck processes with learned standard deviations and time constants.
 
     Args:
         std: standard deviation of each bias in the long run ``[K]``, in the reading's units, before training.
@@ -156,7 +156,7 @@ class FadingBias(nn.Module):
         initial: TensorDictModuleBase,
         reading_space: Space | None = None,
     ) -> tuple[BiasedTransition, BiasedObservation, BiasedNoise, BiasedBelief]:
-        """Gives each part of a filter the same biases.
+        """Augments each part of a filter by the same biases.
 
         Args:
             transition: moves ensembles of the state.
@@ -223,7 +223,7 @@ class FadingBias(nn.Module):
 
 
 class BiasedTransition(Wrapper, Transition):
-    """A transition of S numbers, and behind them biases that fade.
+    """Augments a transition of S components by fading biases.
 
     Args:
         transition: moves ensembles ``[*B, E, S]``; its keys are kept, its noise too.

@@ -1,4 +1,4 @@
-r"""Readings of which a share is wrong: an update under a contaminated Gaussian likelihood.
+r"""Update under a contaminated Gaussian likelihood, in which a share of the readings are outliers.
 
 .. math:: p(y \mid x) = (1 - \epsilon)\, N(y; h(x), R) + \epsilon\, N(y; h(x), W)
 
@@ -188,7 +188,7 @@ class Contaminated(MixedUpdate):
         return {**out, **both, (self.info_prefix, "outlier"): outlier}
 
     def _run(self, entries: Entries, call: Call) -> Entries:
-        """Returns the outputs of the analysis; an ensemble's predictions and reading are plain numbers already."""
+        """Returns the outputs of the analysis; an ensemble's predictions and reading are vectors already."""
         return (self.module.on_aligned if self.kind == "members" else self.module.on_entries)(entries, call)
 
     def _of_sound(self, entries: Entries, call: Call, seen: Tensor | None) -> Entries:
@@ -252,7 +252,7 @@ class Contaminated(MixedUpdate):
 
 
 class _Quantity(nn.Module):
-    """Numbers that are given or trained, an entry, or the outputs of a module.
+    """A quantity that is a constant, a parameter, an entry, or the output of a module.
 
     Args:
         name: for messages, and of the place of the module's noise.

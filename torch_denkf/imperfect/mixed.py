@@ -1,4 +1,4 @@
-"""Updates whose posterior is a mixture of two beliefs, and what they share: moments, members and draws of both."""
+"""Base of updates whose posterior is a mixture of two beliefs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["MixedUpdate", "kind_of_update", "wider_forecast", "wider_past", "wit
 
 
 class MixedUpdate(Around):
-    """Goes around an update, and replaces a mixture of two beliefs by one that has its mean and its covariance.
+    """Wraps an update, and replaces a mixture of two beliefs by one belief with its mean and covariance.
 
     Attributes:
         kind: of the belief, see :func:`kind_of_update`.

@@ -1,4 +1,4 @@
-r"""A reading that may be about something else: the mixture of two beliefs, and what speaks for each.
+r"""Mixture of two beliefs, for a reading that may not be about the state, and their responsibilities.
 
 With the probability p the reading is about the state, :math:`y \sim N(h(x), S)`; with 1 - p it is anything, :math:`y
 \sim b`. The belief then is a mixture: with the share
@@ -25,7 +25,7 @@ _RIDGE = 1e-12
 
 
 def responsibility(probability: Tensor, log_own: Tensor, log_other: Tensor) -> Tensor:
-    """Returns the probability that the reading was about the state, now that it is known.
+    """Returns the posterior probability that the reading is about the state.
 
     Args:
         probability: p, before the reading is known, in [0, 1].

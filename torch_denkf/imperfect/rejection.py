@@ -1,4 +1,4 @@
-"""Rejection of readings that cannot be true, in front of a filter: not a number, infinite, or too large."""
+"""Rejects invalid readings before a filter: NaN, infinite, or too large."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _WRITTEN = WeakIdKeyDictionary()
 
 
 class RejectReadings(Checked, Transform):
-    """Sets the mask of each reading that cannot be true to ``False``, or raises.
+    """Sets the mask of each invalid reading to ``False``, or raises.
 
     A reading is bad where it is NaN, infinite, or larger than ``limit``; and where its noise is not finite, negative,
     or no covariance. The bad numbers become zero, so that no network, and no gradient, meets a NaN. The filter behind

@@ -1,4 +1,4 @@
-r"""A sensor that says whether it sees, and updates that use it.
+r"""Visibility estimates of a sensor, and updates that use them.
 
 A camera that looks at a pillar still reads something. :class:`Visibility` is a head next to a sensor: it writes the
 probability p that this reading is about the state at all. :class:`Visible` goes around an analysis: the density of a
@@ -99,7 +99,7 @@ class Visibility(Sensor):
 
 
 class Visible(MixedUpdate):
-    r"""Lets a reading count as far as it is about the state.
+    r"""Weights a reading by the probability that it is about the state.
 
     The analysis runs once. With q, the probability that the reading was about the state now that it is known, the
     belief is that of the mixture, of q times what the analysis makes of the reading and 1 - q times the forecast:

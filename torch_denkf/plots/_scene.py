@@ -1,4 +1,4 @@
-"""The figure that a video shows."""
+"""Figure of a video."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Scene:
     def freeze(self, seen: Tensor | None, seconds: np.ndarray) -> None:
         """Fixes layout and limits, and draws the static parts once, with and without the bands."""
         self.seen, self.bounds = seen, step_bounds(seconds)
-        if self.camera is not None:  # a path that is drawn on it stretches nothing
+        if self.camera is not None:  # the path does not change the image's limits
             height, width = self.image.get_size()
             self.camera.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="", ylabel="")
             self.camera.set_aspect("equal", adjustable="box")
@@ -96,7 +96,7 @@ class Scene:
         self.background = self.canvas.copy_from_bbox(self.figure.bbox)
 
     def _outline_lines(self) -> None:
-        """Makes the lines on the picture seen where it is dark."""
+        """Outlines the lines on the image in white, for dark images."""
         from matplotlib.patheffects import withStroke
 
         for line in self.camera.get_lines() if self.camera is not None else ():
@@ -104,7 +104,7 @@ class Scene:
                 line.set_path_effects([withStroke(linewidth=line.get_linewidth() + 1, foreground="white")])
 
     def _shrink_labels(self) -> None:
-        """Makes the bands' names fit next to their Axes, all of one size."""
+        """Shrinks the bands' labels to fit next to their Axes, all in the same size."""
         self.figure.draw_without_rendering()
         labels = [axes.yaxis.label for axes in self.bands]
         needed = [label.get_window_extent().height for label in labels]

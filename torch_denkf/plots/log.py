@@ -1,4 +1,4 @@
-"""The streams of a log: when each has read, turn rates on one clock, and the path."""
+"""Plots the streams of a log: time steps, and quantities that several streams share."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def draw_log(
 
     Args:
         steps: times of the readings by stream, s.
-        changes: by title, times and values of each stream.
+        changes: times and values of each stream, by title.
 
     Raises:
         ImportError: without matplotlib.
