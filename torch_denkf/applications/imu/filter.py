@@ -1,4 +1,4 @@
-"""The filter of an inertial sensor's orientation, whose acceleration and magnetic errors are part of the model."""
+"""Filter of an inertial sensor's orientation, with acceleration and magnetic disturbances in the state."""
 
 from __future__ import annotations
 
@@ -28,40 +28,40 @@ BIAS, FIELD = 4, 28  # their places in a point
 
 @dataclass(frozen=True)
 class ImuSettings:
-    """All numbers that an :class:`ImuFilter` is built from.
+    """Settings of an :class:`ImuFilter`.
 
     Attributes:
         gyro: density of the gyro's white noise in rad/s/sqrt(Hz).
-        gyro_rate: what is added to it per rad/s of rotation.
-        gyro_walk: of the gyro's bias, in rad/s^2/sqrt(Hz).
-        gyro_bias: standard deviation of that bias at the start, in rad/s.
-        gyro_scale: standard deviation of the errors of the gyro's scales.
-        gyro_skew: of those of its axes' directions, in rad.
+        gyro_rate: increase of ``gyro`` per rad/s of rotation.
+        gyro_walk: random walk of the gyro's bias, in rad/s^2/sqrt(Hz).
+        gyro_bias: initial standard deviation of that bias, in rad/s.
+        gyro_scale: standard deviation of the gyro's scale factor errors.
+        gyro_skew: standard deviation of the gyro's axis misalignments, in rad.
         poles: the three rates, in 1/s, of the process whose output is the position of the body about a place.
         motion: standard deviation that sets the size of the acceleration of a resting body, in m/s^2.
-        motion_unrest: what is added to it per m/s^2 of ``"unrest"``.
-        motion_start: standard deviation of position, velocity and acceleration at the start.
+        motion_unrest: increase of ``motion`` per m/s^2 of ``"unrest"``.
+        motion_start: initial standard deviation of position, velocity and acceleration.
         accelerometer: standard deviation of the mean over a block, in m/s^2.
-        magnetometer: of the mean over a block, in uT.
-        magnetometer_rate: what is added to it per rad/s of rotation.
-        magnetic_bias: standard deviation of the magnetometer's bias at the start, in uT.
-        magnetic_walk: of that bias, in uT/sqrt(s).
+        magnetometer: standard deviation of the mean over a block, in uT.
+        magnetometer_rate: increase of ``magnetometer`` per rad/s of rotation.
+        magnetic_bias: initial standard deviation of the magnetometer's bias, in uT.
+        magnetic_walk: random walk of that bias, in uT/sqrt(s).
         field: standard deviation of the first reading of the magnetic field, in uT.
-        field_walk: of the field, in uT/sqrt(s).
-        stray: standard deviation of the stray field, which comes and goes, about each axis, in uT.
-        stray_unrest: what is added to it per uT of ``"disturbance"``.
-        stray_time: in which it fades to 1/e, in s.
-        lag: how much later the magnetometer reads than the gyro, in s.
-        lag_std: standard deviation of that number.
-        lever: standard deviation of the lever at the start, about each axis, in m: whatever is held in a hand turns
-            about a joint, so that its acceleration follows from how it turns.
-        lever_walk: of the lever, in m/sqrt(s).
-        tilt: standard deviation of the inclination at the start, in rad.
-        heading: of the heading at the start, in rad.
-        rest: of the gyro's mean over a block at rest, in rad/s.
+        field_walk: random walk of the field, in uT/sqrt(s).
+        stray: standard deviation of the time-varying stray field along each axis, in uT.
+        stray_unrest: increase of ``stray`` per uT of ``"disturbance"``.
+        stray_time: time constant of the stray field, in s.
+        lag: delay of the magnetometer relative to the gyro, in s.
+        lag_std: standard deviation of ``lag``.
+        lever: initial standard deviation of the lever arm along each axis, in m: a hand-held sensor rotates about a
+            joint, so that its acceleration follows from its rotation.
+        lever_walk: random walk of the lever arm, in m/sqrt(s).
+        tilt: initial standard deviation of the inclination, in rad.
+        heading: initial standard deviation of the heading, in rad.
+        rest: standard deviation of the gyro's mean over a block at rest, in rad/s.
         gravity: in m/s^2.
-        block: seconds of readings that make one step.
-        latency: how old the readings are when they get their time stamp, in s; orientations are moved on by it.
+        block: duration of the readings of one step, in s.
+        latency: delay between readings and their time stamps, in s; orientations are predicted by it.
         heading_scale: factor on the standard deviation of the heading, which sets the coverage.
         heading_floor: least standard deviation of the heading, in degrees.
         tilt_scale: factor on the standard deviations of the inclination.
