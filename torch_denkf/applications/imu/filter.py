@@ -66,8 +66,8 @@ class ImuSettings:
         heading_floor: least standard deviation of the heading, in degrees.
         tilt_scale: factor on the standard deviations of the inclination.
         tilt_floor: least standard deviation of the inclination about each axis, in degrees.
-        place: the earth's field northwards and upwards there, in uT, if it is known. As far as the estimated field is
-            off in these directions it may be off eastwards, too: the heading's standard deviation is so much larger.
+        place: north and up components of the local earth's field, in uT, if known. The heading's standard deviation
+            increases with the deviation of the estimated field from them, as an unknown east component is as likely.
     """
 
     gyro: float = 1e-3
@@ -120,14 +120,15 @@ class ImuSettings:
 
 
 class ImuMotion(Motion):
-    r"""Turns the orientation by the gyro, and moves the body about a place.
+    r"""Rotates the orientation by the gyro, and moves the body about a fixed point.
 
     The gyro reads :math:`\omega + b + M \tilde\omega`. The position is the output of a linear process of third order
-    with white noise at its input, so that neither velocity nor position run away: what the accelerometer reads for long
-    is gravity. ``"moves"`` ``[*B, 9]`` is that process' transition matrix, see :func:`moves`. The stray field fades.
+    with white noise at its input, so that velocity and position stay bounded: the mean of the accelerometer over long
+    times is gravity. ``"moves"`` ``[*B, 9]`` is that process' transition matrix, see :func:`moves`. The stray field
+    fades.
 
     Args:
-        stray_time: in which it fades to 1/e, in s.
+        stray_time: time constant of the stray field, in s.
     """
 
     stray_time: Tensor
@@ -137,7 +138,7 @@ class ImuMotion(Motion):
         self.register_buffer("stray_time", torch.tensor(stray_time))
 
     def move(self, state, gyro, moves, *, dt):
-        """Returns the state one step later."""
+        """Returns the state after one step."""
         orientation, bias, errors, position, velocity, acceleration, *others, stray, lever = SPACE.points(state)
         turn = SO3().exp((gyro - bias - (errors.unflatten(-1, (3, 3)) * gyro.unsqueeze(-2)).sum(-1)) * dt)
         matrix, before = moves.unflatten(-1, (3, 3)), torch.stack([position, velocity, acceleration], -2)
@@ -164,7 +165,7 @@ def moves(poles: Sequence[float], dt: float) -> Tensor:
 
 
 class ImuNoise(SubModel):
-    """Variances ``[*B, 36]`` that a step adds, learnable: of the gyro, the motion's acceleration and slow errors.
+    """Process noise variances ``[*B, 36]``, learnable: of the gyro, the motion's acceleration and slow errors.
 
     Args:
         settings: the numbers before training.
@@ -199,14 +200,14 @@ class _Accelerometer(SubModel):
         self.register_buffer("up", torch.tensor([0.0, 0.0, gravity]))
 
     def compute(self, state, lever):
-        """Sums gravity and the acceleration of the joint and about it; ``lever`` ``[*B, 9]``, see :func:`imu_rows`."""
+        """Sums gravity and accelerations of and about the joint; ``lever`` ``[*B, 9]``, see :func:`imu_rows`."""
         parts = SPACE.points(state)
         about = (lever.unflatten(-1, (3, 3)).unsqueeze(-3) * parts[10].unsqueeze(-2)).sum(-1)
         return rotate(parts[0], self.up, back=True) + parts[5] + about
 
 
 class _Magnetometer(SubModel):
-    """The field that a magnetometer reads, which lags behind the gyro: ``[*B, E, 3]``."""
+    """Magnetometer readings, delayed relative to the gyro: ``[*B, E, 3]``."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("forecast", "ensemble"), "gyro"], [("forecast", "observation")])
@@ -219,7 +220,7 @@ class _Magnetometer(SubModel):
 
 
 class MagnetometerNoise(Sensor):
-    """Variances ``[*B, 3]`` of the magnetometer, larger while the body turns fast, learnable.
+    """Variances ``[*B, 3]`` of the magnetometer, learnable; they increase with the rate of rotation.
 
     Args:
         settings: the numbers before training.

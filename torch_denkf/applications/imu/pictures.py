@@ -1,4 +1,4 @@
-"""A log's orientation in one figure."""
+"""Figure of the orientation over a log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def orientation_picture(found: Orientations, rate: float, *, points: int = 4000)
     Args:
         found: of :func:`~torch_denkf.applications.imu.orientations`.
         rate: readings per second.
-        points: at most as many are drawn.
+        points: maximum number of points drawn.
     """
     every = max(1, len(found.quaternion) // points)
     seconds = torch.arange(0, len(found.quaternion), every) / rate

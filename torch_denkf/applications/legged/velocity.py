@@ -55,7 +55,7 @@ class BaseVelocity(SubModel):
 
     Args:
         sensor: the sensor's pose on the base, ``[7]``.
-        gyro_std: of the gyro's white noise in one reading, in rad/s.
+        gyro_std: standard deviation of the gyro's white noise in one reading, in rad/s.
         ensemble: whether the belief is an ensemble, or a mean and a covariance.
         imu_key: entry ``[*B, 6]``; its first half is the gyro.
     """

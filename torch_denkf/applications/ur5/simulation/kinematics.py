@@ -18,7 +18,7 @@ NODES = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, 6))
 
 
 class Unreachable(ValueError):
-    """No joints bring the tool to the pose that was asked for."""
+    """Raised if a pose or path is out of the arm's reach."""
 
 
 @dataclass
