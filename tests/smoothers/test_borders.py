@@ -121,7 +121,7 @@ WRONG = [
     (TypeError, "takes a filter with a mean and a covariance; DEnKF carries", RTSSmoother, linear_denkf),
     (TypeError, "takes a filter with particles", ParticleSmoother, linear_denkf),
     (TypeError, "density of the motion", ParticleSmoother, partial(bootstrap, 5)),
-    (ValueError, "picks none", partial(FixedLag, lag=2), partial(bootstrap, 5, resampling="transport")),
+    (ValueError, "picks no particles", partial(FixedLag, lag=2), partial(bootstrap, 5, resampling="transport")),
     (TypeError, "carries a past already", partial(FixedLag, lag=2), lambda: FixedLag(linear_denkf(), 2)),
 ]
 
