@@ -44,7 +44,7 @@ def cholesky(matrix: Tensor) -> Tensor:
 
 
 def semidefinite_root(cov: Tensor) -> Tensor:
-    """Returns a root A of a covariance, A Aᵀ = P, singular ones included.
+    """Returns a root A of a covariance P, A Aᵀ = P; P may be singular.
 
     It is the Cholesky factor of the correlations times the standard deviations. The correlations have a ridge, which
     is relative, so that the units of the components do not matter, and covers negative eigenvalues of a Gram matrix
@@ -198,7 +198,7 @@ class _Inverse(torch.autograd.Function):
 
 
 def is_covariance(cov: Tensor) -> Tensor:
-    """Tests matrices for being covariances up to rounding: symmetric and positive semi-definite, without NaN.
+    """Tells which matrices are covariances up to rounding: symmetric and positive semi-definite, without NaN.
 
     Rounding is relative to the variances, so that units do not matter. There is no gradient.
 

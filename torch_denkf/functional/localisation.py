@@ -1,8 +1,8 @@
-r"""Localisation: tapers covariances of distant components to zero, which few members estimate by chance only.
+r"""Localisation: tapers covariances of distant components, which in small ensembles are sampling noise, to zero.
 
 There are two ways. If O x O matrices fit in memory, factors of the covariances are passed to
-:func:`~torch_denkf.functional.analyse` as its ``taper``. If they do not, or for a transform of the ensemble, each
-component of the state gets its own analysis, from the observations near it (:func:`letkf`).
+:func:`~torch_denkf.functional.analyse` as its ``taper``. If they do not, or for an ensemble transform,
+each component of the state gets its own analysis, from the observations near it (:func:`letkf`).
 """
 
 from __future__ import annotations

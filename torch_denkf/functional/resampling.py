@@ -39,7 +39,7 @@ def effective_sample_size(log_weights: Tensor) -> Tensor:
 def systematic_resample(particles: Tensor, log_weights: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
     """Resamples without gradients, neither to the weights nor to the particles.
 
-    The first differentiable particle filter, whose gradient ends at the step, did so (Jonschkowski et al. 2018,
+    The gradient ends at the step, as in the first differentiable particle filter (Jonschkowski et al. 2018,
     arXiv:1805.11122).
 
     Args:

@@ -92,8 +92,6 @@ def energy_score(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Tens
     Args:
         ensemble: X, ``[*B, E, S]``.
         target: the truth y, ``[*B, S]``.
-        log_weights: of weighted particles, normalised, ``[*B, E]``: the score is that of the weighted empirical
-            distribution, ``Σ wⁱ|xⁱ − y| − 1/2 Σ Σ wⁱwʲ|xⁱ − xʲ|``, for which ``fair`` has no meaning.
         fair: average over pairs of different members, as in :func:`crps_ensemble`.
 
     Returns:
