@@ -116,8 +116,9 @@ class GaussianAnalysisOptions(TypedDict, total=False):
     """Options of an update of mean and covariance, in addition to the observation model.
 
     Attributes:
-        inflation: factor of the belief's standard deviations where anything is observed; 1 by default, for none. Never
-            observed components, such as a vehicle's position, grow by it without bound: for them scale Q and R.
+        inflation: factor of the belief's standard deviations where anything is observed; 1 by default, for none. It
+            makes components that are never observed, such as a vehicle's position, grow without bound: there scale Q
+            and R instead.
         space: space of the state; ``None`` by default, for plain numbers. ``cov`` and ``var`` are of the tangents
             at ``mean``.
         reading_space: space of the reading, such as ``Circle()`` for an angle, whose innovation is wrapped to

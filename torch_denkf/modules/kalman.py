@@ -198,8 +198,9 @@ class KalmanAnalysis(Update):
         matrix: H, ``[O, S]``.
         noise: R, variances ``[O]`` or a covariance ``[O, O]``; ``None`` to read it from ``noise_variance_key``.
         trainable: whether H is a parameter.
-        inflation: factor of the belief's standard deviations where anything is observed; 1 for none. Never observed
-            components, such as a vehicle's position, grow by it without bound: for them scale Q and R.
+        inflation: factor of the belief's standard deviations where anything is observed; 1 for none. It makes
+            components that are never observed, such as a vehicle's position, grow without bound: there scale Q and R
+            instead.
         reading_space: space of the reading, made of numbers and angles, such as ``Euclidean(1) * Circle()``;
             ``None`` for plain numbers.
         observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used; in a filter

@@ -108,8 +108,8 @@ class LearnedLikelihood(Update):
     .. math:: \log l^i = b(g(e \oplus (h(x^i) - m) / s))
 
     It needs no noise model and is not normalised over readings. The bound b prevents a single reading from removing
-    all particles. If nothing is observed it is zero for all particles; if only some dimensions are, the others have
-    the mean instead of the particle's values.
+    all particles. If nothing is observed it is zero for all particles; if only some dimensions are, the network
+    reads the mean of the others instead of the particle's values.
 
     This is the form of the papers, in which the encoding has the information about the reading. A network trained on
     few recordings does not generalise to the encodings of new ones. With a trained sensor, ``observation_key`` gives
