@@ -38,7 +38,8 @@ def recorded_draws(filter: nn.Module, parts: Sequence[tuple[str, SubModel]]) -> 
     places = dict(parts)
 
     def record(place: str, part: SubModel, sizes: dict[str, Any]) -> None:
-        own = [place] if place in places else [name for name, other in parts if other is part]  # own forward
+        # A sub-model that overrides forward() draws without its place in the filter.
+        own = [place] if place in places else [name for name, other in parts if other is part]
         drawn.update(dict.fromkeys(own, (part, sizes)))
 
     before = [(part, part._forward_hooks, part._forward_pre_hooks, part.training) for part in filter.modules()]
