@@ -24,7 +24,7 @@ class Smoother(Checked, TensorDictModuleBase):
     It writes all outputs of the filter, and ``("smoothed", "mean")`` and ``("smoothed", "var")`` ``[*B, T, S]``, with
     ``("smoothed", "cov")`` or ``("smoothed", "ensemble")`` if the belief has one. The entry at time t is the belief of
     the state *at t*, given the readings up to t + lag. (:class:`FixedLag` writes at t the belief of t - lag.) No
-    correction crosses the border of an episode or a slice, as found by :meth:`Filter.sequence`. Gradients flow
+    correction crosses the boundary of an episode or a slice, as found by :meth:`Filter.sequence`. Gradients flow
     through filter and smoother.
 
     A subclass implements :meth:`_smooth`, and :meth:`_extended` if the filter needs further outputs.

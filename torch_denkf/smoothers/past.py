@@ -131,7 +131,7 @@ class LaggedAnalysis(Around):
             noise are kept.
 
     Raises:
-        TypeError: for an analysis without :meth:`Update.move_past` for ensembles.
+        TypeError: if the analysis cannot correct earlier states.
 
     Example:
         >>> from tensordict import TensorDict
