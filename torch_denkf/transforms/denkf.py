@@ -63,7 +63,6 @@ class DEnKFTransform(Checked, Transform):
         check_finite: whether a belief that is not finite raises; not on a GPU, for which a step would have to wait.
             If an environment emits readings that are not finite, put ``torch_denkf.imperfect.RejectReadings``
             before this transform.
-            front.
         ahead: also writes the belief of a later time: :class:`~torch_denkf.fusion.BeliefAhead`.
         packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step` (native code:
             load only what you would execute). At B=1 it is ten times as fast as the filter itself. It has the

@@ -38,7 +38,7 @@ class LastAction(TensorDictPrimer):
     """Stores the action that led to an observation, as ``("previous", "action")``; zero after a reset.
 
     A filter in a policy runs before the next action is chosen, and needs the last one.
-    :meth:`torch_denkf.filters.Filter.make_tensordict_primer` returns it if actions drive the filter; append it
+    :meth:`torch_denkf.filters.Filter.make_tensordict_primer` includes it if actions drive the filter; append it
     yourself if a policy reads the last action for another reason.
 
     Args:
