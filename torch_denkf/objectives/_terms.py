@@ -128,7 +128,7 @@ class Noise(Term):
 
     def forward(self, out, truth):
         samples, labels = sensor_samples(truth)
-        noise = truth.entry(truth.keys.noise or truth.loss.reading.noise, "R must be computed from frames only.  ")
+        noise = truth.entry(truth.keys.noise or truth.loss.reading.noise, "R must be computed from frames only. ")
         error = labels.errors(samples).mean(-2)
         return score_gaussian(error, labels.mask, as_covariance(noise, error), "nll", labels.scale), labels.rows
 

@@ -251,7 +251,7 @@ class FilterLoss(Checked, LossModule):
         raise AttributeError("in_keys are determined by the filter; rename the state with set_keys(state=...).")
 
     def set_keys(self, **kwargs: NestedKey | None) -> None:
-        """Renames input entries, see the class's ``_AcceptedKeys``; ``None`` for the default.
+        """Sets the keys of input entries, see the class's ``_AcceptedKeys``; ``None`` for the default.
 
         Raises:
             TypeError: if a key is neither a string nor a tuple of strings.
@@ -337,7 +337,7 @@ def _checked_scale(name: str, scale: Scale) -> Tensor | None:
     if scale.ndim > 1:
         raise ValueError(f"{name} is one number per dimension; got {list(scale.shape)}.")
     if not ((scale > 0).all() and scale.isfinite().any()):
-        raise ValueError(f"{name} must be positive, infinite to leave a dimension out, and finite once. Got {scale}.")
+        raise ValueError(f"{name} must be positive; infinite leaves a dimension out, but not all. Got {scale}.")
     return scale
 
 

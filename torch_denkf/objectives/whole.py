@@ -41,8 +41,8 @@ class DEnKFLoss(FilterLoss):
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied, so
     that their sum is the objective. Only elements that are results of a step are scored for state, transition, smoothed
-    and nll: the first of a sequence and those with ``is_init`` have an initial belief. The sensor is scored where it
-    observed.
+    and nll: the first of a sequence and those with ``is_init`` have an initial belief. The sensor is scored in
+    observed elements.
 
     Args:
         filter: the filter to train; its parameters are the loss's.
@@ -66,7 +66,7 @@ class DEnKFLoss(FilterLoss):
     Raises:
         ValueError: on an unknown score, a scale that is not positive, labels of another shape, or slices that are not
             marked.
-        TypeError: for particles with weights, which :class:`MixtureLoss` scores; or if ``smoother`` returns none.
+        TypeError: for particles with weights, which :class:`MixtureLoss` scores; or if ``smoother`` makes no smoother.
         KeyError: if an entry that a term needs is missing.
 
     Reference:
@@ -189,7 +189,7 @@ class GaussianLoss(FilterLoss):
     ========================  =====================================================================================
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied. Only
-    elements that are results of a step are scored for state, transition and nll; the sensor where it observed.
+    elements that are results of a step are scored for state, transition and nll; the sensor in observed ones.
 
     Args:
         filter: the filter to train, e.g. :class:`~torch_denkf.filters.EKF`.
@@ -267,7 +267,7 @@ class MixtureLoss(FilterLoss):
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied, so
     that their sum is the objective. Only elements that are results of a step are scored: the first of a sequence and
-    those with ``is_init`` have an initial belief. The sensor is scored where it observed.
+    those with ``is_init`` have an initial belief. The sensor is scored in observed elements.
 
     Args:
         filter: the filter to train, e.g. :class:`~torch_denkf.filters.DPF`. Members without weights have equal weight.
