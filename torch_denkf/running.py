@@ -167,7 +167,7 @@ def reading_of(sensor: TensorDictModuleBase) -> NestedKey:
 
 
 def marks_of(module: TensorDictModuleBase) -> dict[NestedKey, NestedKey]:
-    """Maps each mask that a module derives (it finds readings missing) to the mask from which it is derived."""
+    """Maps each derived mask, which also marks readings that the module finds missing, to its original mask."""
     return {made: given for part in in_sequences(module) for made, given in role(part, Sensor).marks.items()}
 
 

@@ -323,7 +323,7 @@ class Sensor(SubModel):
         observation_dim: O of its output, if known beforehand.
         judges_reading: whether it writes no reading, but noise or a mask for the reading of the module before it.
         joins_readings: whether it combines several readings, and needs all of them.
-        marks: maps each derived mask, which also marks missing readings that it finds, to the mask it derives from.
+        marks: maps each derived mask, which also marks readings that it finds missing, to its original mask.
     """
 
     observation_dim: int | None = None
