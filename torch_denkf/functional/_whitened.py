@@ -16,7 +16,7 @@ class Whitened(NamedTuple):
         predicted: HX, ``[*B, E, O]``.
         samples: ỹ, ``[*B, E, O]``, or one for all members, ``[*B, 1, O]``.
         noise: the variances R, ``[*B, O]``.
-        innovation: of the means, ``[*B, 1, O]``.
+        innovation: innovation of the means, ``[*B, 1, O]``.
         scale: R^-1/2 / √(E − 1), ``[*B, 1, O]``, the factor of the two below.
         normalised: Y, the anomalies of the predictions, ``[*B, E, O]``.
         mean_shift: the innovation, ``[*B, 1, O]``.

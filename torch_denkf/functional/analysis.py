@@ -192,7 +192,7 @@ def check_analysis_arguments(
     check_choice("space", space, get_args(Space))
     if scheme == "sensor" and observation.ndim != forecast.ndim:
         raise ValueError(
-            f"scheme 'sensor' needs one observation a member, [*B, E, O], got {list(observation.shape)}; "
+            f"scheme 'sensor' needs one observation per member, [*B, E, O], got {list(observation.shape)}; "
             "use 'perturbed', 'etkf' or 'sakov' for a single observation"
         )
     if observed is not None:
@@ -336,7 +336,7 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
         cross: products of the anomalies, ``[*B, O, S]``.
         predicted: anomalies of the predicted observations, ``[*B, E, O]``, in any unit.
         state: anomalies of the state, ``[*B, E, S]``.
-        threshold: :math:`z_0`, positive, one number or ``[S]``; below :math:`\sqrt{E - 1}`, or nothing is used.
+        threshold: :math:`z_0`, positive, one number or ``[S]``, below :math:`\sqrt{E - 1}`, the largest z.
 
     Returns:
         Factors in [0, 1), ``[*B, O, S]``.
@@ -350,7 +350,7 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
     spread = predicted.square().sum(-2).unsqueeze(-1) * state.square().sum(-2, keepdim=True)
     limit = threshold**2 * spread / (state.shape[-2] - 1)
     explained = cross.square()
-    chance = explained <= limit  # False for NaN, which so reaches the result
+    chance = explained <= limit  # False for a NaN threshold, which reaches the result
     return torch.where(chance, 0, 1 - limit / torch.where(chance, 1, explained))
 
 

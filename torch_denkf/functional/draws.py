@@ -34,8 +34,8 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
 
     Args:
         normal: standard-normal draws, ``[*B, E, q]``.
-        *uncorrelated: members, ``[*B, E, S]`` each, with which the draws shall be uncorrelated. If there is no room
-            for all, the first take precedence.
+        *uncorrelated: members, ``[*B, E, S]`` each, with which the draws shall be uncorrelated. If E is too small
+            for all, the first argument takes precedence.
 
     Returns:
         Draws ``[*B, E, q]``; zero where ``normal`` has no spread.

@@ -39,7 +39,7 @@ def relax_to_prior_spread(analysis: Tensor, forecast: Tensor, relaxation: float 
     """Relaxes the analysis to the prior spread (Whitaker & Hamill 2012, Mon. Wea. Rev. 140).
 
     Each component's anomalies are multiplied by 1 − α + α σ_f / σ_a, so that its standard deviation
-    becomes (1 − α) σ_a + α σ_f. A component without analysis spread stays as it is, with finite gradients.
+    becomes (1 − α) σ_a + α σ_f. A component without analysis spread is unchanged, with finite gradients.
 
     Args:
         analysis: the analysis ensemble, ``[*B, E, S]``, in the state's units.

@@ -25,7 +25,7 @@ from torch_denkf.functional.manifolds.space import Space, blocks, eye, side_by_s
 __all__ = ["SE2", "SE3", "SE23", "SO3", "Turned"]
 
 _SMALL = {torch.float32: 0.25, torch.float64: 1e-2}  # squared angles below which a series is as exact as the formula
-_NEAR = {torch.float32: 1e-2, torch.float64: 1e-4}  # squared tangents below which the arc tangent's series is as exact
+_NEAR = {torch.float32: 1e-2, torch.float64: 1e-4}  # squared sines below which the arc tangent's series is as exact
 
 
 def _one_by_one(self: Space, known: Tensor) -> tuple[Tensor, Tensor]:
@@ -321,7 +321,7 @@ class Function:
 
 
 def series(square: Tensor, function: Function) -> Tensor:
-    """Returns the function of an angle whose square is given; value and gradient are finite at 0."""
+    """Evaluates a function of an angle, given the square of the angle; value and gradient are finite at 0."""
     small = square < _SMALL[square.dtype]
     safe = torch.where(small, 1.0, square).sqrt()
     near = torch.zeros_like(square)

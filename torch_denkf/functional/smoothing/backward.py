@@ -22,7 +22,7 @@ def run_backward(
     """Smooths the beliefs of a whole sequence.
 
     Args:
-        step: smooths beliefs, from them, the links to the beliefs of one time later, and those beliefs smoothed.
+        step: returns smoothed beliefs, from the beliefs, their links to the next time, and its smoothed beliefs.
         time: the dimension of time, behind those of the batch.
         beliefs: entries of the filter's beliefs, ``[*B, T, *]``.
         links: entries computed in the step from the belief before to each time, ``[*B, T, *]``.

@@ -51,7 +51,7 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping:
     check_ensemble("ensemble", ensemble, min_size=2)
     for name, value in (("forecast", forecast), ("smoothed", smoothed)):
         check_shape(name, value, ensemble.shape, "[*B, E, S]")
-    check_number("damping", damping, above=0, most=1, cure="It is a factor on the gain")
+    check_number("damping", damping, above=0, most=1, cure="It is a factor of the gain")
     size, dim = ensemble.shape[-2:]
     anomalies, forecast_anomalies = ensemble_anomalies(ensemble), ensemble_anomalies(forecast)
     # If all members are equal up to rounding, their anomalies have no information.
