@@ -49,7 +49,7 @@ class Filter(Checked, TensorDictSequential):
     """A Bayesian filter: TensorDict modules in sequence, and an initial belief.
 
     The modules are sorted once, by their keys: those that depend on the belief (transition, observation, analysis) are
-    the step; the others (sensor, noise) read frames alone and, on a sequence, run once on all of them. The entries that
+    the step; the others (sensor, noise) read only frames and, on a sequence, run once on all of them. The entries that
     the step reads before it writes them, and that ``initial`` provides, are the *carry*: ``("belief", "ensemble")`` for
     an ensemble, ``("belief", "mean")`` and ``("belief", "cov")`` for a Kalman filter.
 

@@ -43,7 +43,7 @@ class Structure(NamedTuple):
         frames: modules that read frames, and not the belief.
         transition: the module that forecasts the carry: the first that depends on the belief.
         update: the modules between the forecast and the belief, and those that depend only on the action.
-        posterior: the same, and the ceiling of variances.
+        posterior: ``update``, then the ceiling of variances.
         needed: required keys in addition to the carry and the controls.
         must: all required keys of a step.
         optional: optional keys.
@@ -56,7 +56,7 @@ class Structure(NamedTuple):
         beside: other outputs of the transition.
         readings: raw entries from which the analyses' readings are computed.
         own_info: new names for diagnostics that several analyses would write under the same key.
-        totals: their sums over the analyses.
+        totals: sums of these diagnostics over the analyses.
         space: space of the state; ``None`` for plain numbers.
         kinds: kinds of the belief, one for each prefix.
         likelihoods: the log-likelihood of each analysis' reading.
@@ -226,7 +226,9 @@ def _forecasts(
     chosen = {unravel_key(key): unravel_key(value) for key, value in chosen.items()}
     unknown = [key for key in chosen if key not in carry] + [key for key in chosen.values() if key not in written]
     if unknown:
-        raise ValueError(f"forecast_keys has {unknown}; the filter carries {list(carry)}, and writes {list(written)}.")
+        raise ValueError(
+            f"forecast_keys has {unknown}; it carries {list(carry)}, the transition writes {list(written)}."
+        )
     found = {}
     for key in carry:
         name = key if isinstance(key, str) else key[-1]
