@@ -38,8 +38,8 @@ class EnsembleAnalysis(EnsembleUpdate):
             see :func:`~torch_denkf.functional.analysis.significant`. It prevents overconfidence of ensembles that are
             too small for exact draws, if fast sensors make thousands of updates. ``None`` uses all covariances.
         threshold: threshold of ``"significance"``, in standard deviations: one number or ``[S]``; a ``Parameter`` is
-            trained. Choose it larger, the more updates come between two readings about a component. A threshold
-            trained beyond sqrt(E - 1) ignores all readings, and has no gradient to return.
+            trained. Choose it larger if many updates come between two readings of a component. A threshold trained
+            beyond sqrt(E - 1) ignores all readings, and gets no gradient any more.
         space: space of the state, such as ``Product(SO3(), Euclidean(3))``: members are points, the update uses
             the tangents at the forecast's mean, and ``var`` is of the tangents at the belief's mean. See
             :mod:`torch_denkf.functional.manifolds`.

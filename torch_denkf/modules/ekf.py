@@ -153,7 +153,7 @@ def _linearise(
 
 
 def _fit(known: tuple[Space, Space] | None, wanted: tuple[Space | None, Space | None] | None) -> bool:
-    """Tells whether a Jacobian between known tangent spaces holds for the wanted ones, or for plain numbers."""
+    """Tells whether a Jacobian for the known spaces is also that for the wanted ones."""
     if known is None or known == wanted:
         return True
     pairs = zip(known, wanted or (None, None), strict=True)

@@ -90,7 +90,7 @@ class ConstantNoise(Sensor):
     """A constant diagonal of R, learned or known.
 
     Args:
-        r: standard deviation of each dimension ``[O]``, in the observation's units; 0 for none, allowed for Q or in a
+        r: standard deviation of each dimension ``[O]``, in the observation's units; 0 for none, only for Q or in a
             :class:`~torch_denkf.filters.KalmanFilter`: ensembles need R > 0.
         trainable: whether log R is a parameter.
         in_key: any entry of batch shape ``[*B, ...]``, of which only the dtype is used.

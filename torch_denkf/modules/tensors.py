@@ -165,7 +165,7 @@ def variance_and_floor(
         ValueError: if ``r`` is not positive or the floor reaches :math:`r^2`.
     """
     variance = as_vector(f"r of {owner}", r, size, above=0) ** 2
-    check_values(f"r^2 of {owner}", variance, above=0, cure="Scale the observation, so that its variance is a number")
+    check_values(f"r^2 of {owner}", variance, above=0, cure="Scale the observation, so that r^2 is finite and positive")
     floor = 0.01 * variance if floor is None else as_vector(f"floor of {owner}", floor, size)
     check_values(f"floor of {owner}", floor, least=0)
     check_values(f"r^2 - floor of {owner}", variance - floor, above=0, cure="The floor is a variance below r^2")
