@@ -204,7 +204,7 @@ class Particles(Belief):
 def kinds_of(
     keys: Iterable[NestedKey], space: Space | None = None, carry: Collection[NestedKey] = ()
 ) -> tuple[Belief, ...]:
-    """Returns the kinds of the beliefs that keys are entries of, one for each prefix.
+    """Returns the kinds of the beliefs to which keys belong, one for each prefix.
 
     Args:
         keys: keys of entries of beliefs.

@@ -167,7 +167,7 @@ def reading_of(sensor: TensorDictModuleBase) -> NestedKey:
 
 
 def marks_of(module: TensorDictModuleBase) -> dict[NestedKey, NestedKey]:
-    """Maps each derived mask, which also marks readings that the module finds missing, to its original mask."""
+    """Maps each mask that the module writes, which also marks readings it finds missing, to the given mask."""
     return {made: given for part in in_sequences(module) for made, given in role(part, Sensor).marks.items()}
 
 

@@ -197,7 +197,7 @@ class SubModel(Checked, TensorDictModule):
         return None
 
     def noise_sizes(self, *values: Any, **_: Any) -> dict[str, int]:
-        """Returns the sizes that :meth:`draw_noise` needs, from the values that :meth:`compute` gets by position."""
+        """Returns the sizes that :meth:`draw_noise` needs, from the positional arguments of :meth:`compute`."""
         return {}
 
     def parts(self) -> dict[str, TensorDictModuleBase]:
@@ -323,7 +323,7 @@ class Sensor(SubModel):
         observation_dim: O of its output, if known beforehand.
         judges_reading: whether it writes no reading, but noise or a mask for the reading of the module before it.
         joins_readings: whether it combines several readings, and needs all of them.
-        marks: maps each derived mask, which also marks readings that it finds missing, to its original mask.
+        marks: maps each mask that it writes, which also marks the readings that it finds missing, to the given mask.
     """
 
     observation_dim: int | None = None
@@ -472,7 +472,7 @@ class Update(SubModel):
             past: ``[*B, E, L, S]``.
             predicted: predicted observations ``[*B, E, O]``.
             observation: learned observations ``[*B, E, O]``, or one reading ``[*B, O]``.
-            variance: of the reading, ``[*B, O]``.
+            variance: variances of the reading, ``[*B, O]``.
             observed: mask ``[*B, 1]`` or ``[*B, O]``; ``None`` if all is observed.
             noise: the same draws as in :meth:`compute`.
 
@@ -527,5 +527,5 @@ def in_role(module: nn.Module, kind: type[R]) -> list[R]:
 
 #: Called in a trial step with the place of each sub-model that draws noise, the sub-model, and its noise sizes.
 RECORDERS: list[Callable[[str, SubModel, dict[str, int]], None]] = []
-#: Errors that can be raised again with more words.
+#: Errors that are raised again with an explanation.
 EXPLAINED = (RuntimeError, TypeError, ValueError, IndexError)

@@ -125,7 +125,7 @@ def test_untrained_parameters_raise_by_name(float64):
     radius, taper = nn.Parameter(torch.tensor(2.0)), torch.rand(S, S, requires_grad=True)
     with pytest.raises(ValueError, match=r"radius requires a gradient .* Detach it"):
         LocalEnsembleAnalysis.around(PLACES, PLACES, radius)
-    with torch.no_grad(), pytest.raises(ValueError, match="radius asks"):
+    with torch.no_grad(), pytest.raises(ValueError, match="radius requires"):
         LocalEnsembleAnalysis.around(PLACES, PLACES, radius)
     for near in (taper, neighbours_of_taper(taper), neighbours(PLACES.clone().requires_grad_(), PLACES, 2.0)):
         assert_raises(ValueError, "near requires a gradient", LocalEnsembleAnalysis, near)

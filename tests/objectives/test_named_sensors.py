@@ -102,7 +102,7 @@ def test_each_of_several_learned_sensors_is_named(kind):
         none = r"several sensors, of which none is selected \(there are \['camera', 'lidar'\]\).*set_keys\(sensor="
         with pytest.raises(KeyError, match=none):
             several(drive)
-        with pytest.raises(KeyError, match=r"writes the samples .*'lidar'.*: name one of several sensors"):
+        with pytest.raises(KeyError, match=r"writes the samples .*'lidar'.*: select one of several sensors"):
             several(drive.copy().set("target_observation", drive["wheel"]))
 
 

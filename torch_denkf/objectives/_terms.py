@@ -197,7 +197,7 @@ def score_members(errors: Tensor, mask: Tensor, score: str) -> Tensor:
     """Scores members by their ``errors``.
 
     One member is a point: the CRPS is its absolute error, the energy score the length of its error.
-    The fair scores of more members need pairs of them.
+    Fair scores need at least two members.
 
     Args:
         errors: ``[*, E, N]``, in the units of the score.

@@ -56,8 +56,8 @@ class StateOptions(TypedDict, total=False):
     The true state may have fewer dimensions than the belief: its labels are of the leading ones, or of ``dims``.
 
     Attributes:
-        dims: scored state dimensions; all that have labels by default. Labels are of the leading dimensions; or only
-            of ``dims``, in their order, if some of these are beyond that number of leading dimensions.
+        dims: scored state dimensions; all that have labels by default. N labels are of the leading N dimensions; or of
+            ``dims``, in their order, if ``dims`` has N dimensions of which one is beyond the leading N.
         state_scale: one for each of ``dims``, else of the labels' dimensions; errors of the state are divided by it. A
             dimension with infinite scale is not scored.
         space: the space of the states, such as ``Product(SO3(), Euclidean(3))``, or
