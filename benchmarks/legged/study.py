@@ -207,7 +207,7 @@ def page(frame: pd.DataFrame, study: Study) -> str:
         "grounds for all simulated rows. iCub has those of the simulated humanoid on firm ground, whose rows were "
         "stamped as unevenly as iCub's. Milliseconds are those of the processor for a step of all "
         f"{study.runs * len(GROUNDS)} runs of a simulated robot, or of iCub's, without compilation, one thread. "
-        "`--kinds` runs some filters again, with exact draws; rows of random draws are of a whole run before.",
+        "`--kinds` runs some filters again, with the quadruped's contacts that the library has.",
         "",
         *markdown(noises.set_axis(HEADS, axis=1)),
         "",
