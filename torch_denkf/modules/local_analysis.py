@@ -21,8 +21,7 @@ _CHOSEN_ONCE = "the neighbours and their weights are computed once"
 
 
 class LocalEnsembleAnalysis(EnsembleUpdate):
-    """Updates each component of the state from the observations near it; the mathematics is
-    :func:`~torch_denkf.functional.letkf`.
+    """Updates each component of the state from the observations near it, see :func:`~torch_denkf.functional.letkf`.
 
     It is for fields, in which a few members represent thousands of components, and covariances of distant components
     are due to chance. It replaces :class:`EnsembleAnalysis` and has the same inputs and outputs. Nothing of size S x O
