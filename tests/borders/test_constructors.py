@@ -9,9 +9,9 @@ import torch
 from tensordict import TensorDict
 
 from benchmarks.common.lorenz96 import lorenz96_step
-from benchmarks.reliability.borders.models import signed
 from benchmarks.reliability.damage import INF, NAN, put
 from benchmarks.reliability.documents import edited
+from tests.borders.models import signed
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.gaussian_for_tests import linear_filter
 from torch_denkf.applications.car import UnicycleMotion

@@ -23,9 +23,10 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from benchmarks.reliability.borders.recorded import V2, made, own, read_demos, read_drive, read_episodes, read_own
 from benchmarks.reliability.case import Case, apart, forked, judge
 from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
+from tests.borders import kitti, lerobot, recordings, ur5
+from tests.borders.folders import made
 from tests.filters.factories import linear_denkf
 from tests.training.problem import make_trainer
 from torch_denkf.applications.car import with_motion
@@ -98,11 +99,11 @@ large_demos = made(
 
 
 def _drive(folder: Path) -> TensorDict:
-    return read_drive(large_drive(), "a", size=PICTURE, cache=folder)
+    return kitti.read_drive(large_drive(), "a", size=PICTURE, cache=folder)
 
 
 def _motion(folder: Path) -> TensorDict:
-    return with_motion(read_drive(large_drive(), "a", size=PICTURE), cache=folder, keep_images=False)
+    return with_motion(kitti.read_drive(large_drive(), "a", size=PICTURE), cache=folder, keep_images=False)
 
 
 def _checkpoint(folder: Path) -> Any:
@@ -145,10 +146,14 @@ _train = lambda folder: make_trainer(folder / "run", updates=12, progress=False)
 WORKS: dict[str, Work] = {
     "cache of a drive": read(_drive, killed=True, alone=False),
     "cache of a drive's motion": read(_motion),
-    "cache of demos": read(lambda folder: read_demos(large_demos(), cache=folder), killed=True),
-    "cache of a LeRobot recording": read(lambda folder: read_episodes(V2.sound(), size=(200, 300), cache=folder)),
+    "cache of demos": read(lambda folder: ur5.read_demos(large_demos(), cache=folder), killed=True),
+    "cache of a LeRobot recording": read(
+        lambda folder: lerobot.read_episodes(lerobot.V2.sound(), size=(200, 300), cache=folder)
+    ),
     "cache of pictures": read(
-        lambda folder: read_own(own(), camera="images", replay={"cache": folder, "size": (300, 300)})
+        lambda folder: recordings.read_own(
+            recordings.own(), camera="images", replay={"cache": folder, "size": (300, 300)}
+        )
     ),
     "checkpoint": read(_checkpoint, ("last.pt",), alone=False),
     "trainer": Work(_train, _trained, _CHECKPOINTS, killed=True, alone=True),
@@ -300,7 +305,7 @@ def disk_jobs() -> Rows:
     """
     if os.geteuid() != 0:
         raise PermissionError("small disks are mounted, which needs root; leave out the part 'disks'")
-    for sound in (own, V2.sound, large_drive, large_demos):
+    for sound in (recordings.own, lerobot.V2.sound, large_drive, large_demos):
         sound()
     kinds, tried = {"full": True, "read-only": False}, {name: work for name, work in WORKS.items() if work.words}
     alone = {f"{name}, {kind} disk": partial(on_disk, name, full) for name in tried for kind, full in kinds.items()}

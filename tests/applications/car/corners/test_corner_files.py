@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from benchmarks.reliability.borders.recorded import BAD_ENTRIES, sound_entries
+from tests.borders.corners import BAD_ENTRIES, sound_entries
 from torch_denkf.applications.car.corners.drive import corner_replay, read_corner_drive
 
 

@@ -18,10 +18,10 @@ import torch
 from hypothesis import strategies as st
 
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.borders.recorded import ALL_ROWS, made
 from benchmarks.reliability.damage import INF, NAN, put
 from benchmarks.reliability.documents import edited
 from benchmarks.reliability.target import Source, Subject, Target, targets_of
+from tests.borders.folders import ALL_ROWS, made
 from tests.data.lerobot.lerobot_folder import write_version_2, write_version_3
 from tests.data.recordings.own_files import SIZE, write_csv, write_images
 from torch_denkf.data import Images, LeRobotReplay, Recording, RecordingReplay, Table

@@ -1,0 +1,174 @@
+"""Drives in KITTI's layout, and what reads them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from benchmarks.reliability import damage as d
+from benchmarks.reliability.damage import gone, instead, kept, put, renamed, same, written
+from benchmarks.reliability.documents import edited
+from benchmarks.reliability.target import Source, Subject, Target, targets_of
+from tests.borders.folders import SIZES, bomb, made, one_row
+from torch_denkf.applications.car import (
+    KITTIOdometryExperienceReplay,
+    read_kitti_drive,
+    with_motion,
+    write_drives,
+)
+from torch_denkf.applications.car.kitti.drive import list_kitti_drives
+
+DRIVE, FRAMES, SIZE = "town", 10, (24, 72)
+POSE_FILE, SEQUENCE = f"poses/{DRIVE}.txt", f"sequences/{DRIVE}"
+IMAGES, TIME_FILE, CALIBRATION_FILE = f"{SEQUENCE}/image_2", f"{SEQUENCE}/times.txt", f"{SEQUENCE}/calib.txt"
+
+
+def read_drive(root: Path, drive: Any = DRIVE, **options: Any) -> TensorDict:
+    """A drive, as a user reads it."""
+    return read_kitti_drive(root, drive, **{"size": SIZE, "cache": None, **options})
+
+
+drives = made("kitti", lambda root: write_drives(root, [DRIVE], frames=FRAMES, size=SIZE))
+KITTI = Source("kitti", drives, read_drive)
+
+
+def _equal_so_far(result: TensorDict) -> bool:
+    return len(result) > 0 and same(result, KITTI.reference()[: len(result)])
+
+
+def _that_picture(result: TensorDict) -> bool:
+    """A picture is read by what it holds, whatever its name ends in: this one is of one grey."""
+    picture = result["image"][4].flatten()
+    return bool((picture == picture[0]).all() and result["frame_valid"].all())
+
+
+def _times_masked(result: TensorDict) -> bool:
+    """Right where poses and pictures are as without damage, and frames of a wrong time are marked as missing.
+
+    A first time that is too early is a gap, after which no motion is known.
+    """
+    expected, seen = KITTI.reference(), result["frame_valid"].squeeze(-1)
+    gap = bool((result["time"].diff(dim=0) > 10).any())
+    poses = len(result) == FRAMES and torch.equal(result["state"][:, :3], expected["state"][:, :3])
+    pictures = poses and torch.equal(result["image"][seen], expected["image"][seen])
+    return d.finite(result) and pictures and (not bool(seen.all()) or gap)
+
+
+def _times_as_told(result: TensorDict) -> bool:
+    """Without stamps, frames come ten times a second, and all that needs no time is as it was."""
+    expected = KITTI.reference()
+    return same(result["state"][:, :3], expected["state"][:, :3]) and same(result["image"], expected["image"])
+
+
+def _picture(size: tuple[int, int], suffix: str) -> d.Change:
+    return lambda file: file.write_bytes(cv2.imencode(suffix, np.full((*size, 3), 7, np.uint8))[1].tobytes())
+
+
+NAMES = ("0004.png", "-00004.png", "000004.PNG", "000999.png", "9" * 30 + ".png")
+PICTURES = (
+    d.SEALED | d.PLACES | d.of(*NAMES).each(renamed) | {"a JPEG": _picture(SIZE, ".jpg"), "a bomb": written(bomb)}
+)
+NO_PICTURES = {
+    "another size": _picture((10, 10), ".png"),
+    "the same number twice": lambda file: shutil.copy(file.with_name("000003.png"), file.with_name("4.png")),
+}
+POSES: dict[str, d.Change] = {
+    "a comment": lambda line: ["#", *line],
+    "thirteen numbers": lambda line: [*line, "1"],
+    "an empty line": lambda line: [],
+    "no rotation": lambda line: ["0"] * 11 + line[11:],
+    "mirrored": lambda line: ["-1", *line[1:]],
+    "sheared": lambda line: [line[0], "0.2", *line[2:]],
+    "1e200": lambda line: [*line[:11], "1e200"],
+    "a jump of 1e9 m": lambda line: [*line[:3], "1e9", *line[4:]],
+}
+CALIBRATION = d.of((1, "0"), (1, "-700"), (6, "0"), (1, "1e300"), (0, "Q2:")).each(
+    lambda one: edited(put((2, one[0]), one[1]))
+)
+
+
+def _files() -> Iterator[Target]:
+    picture, names = f"{IMAGES}/000004.png", ("000004.png", "4.png", *NAMES)
+    without_times = dict.fromkeys(d.NOTHING.named, _times_as_told)
+    yield KITTI.target("poses", d.FILE, _equal_so_far, file=POSE_FILE)
+    yield KITTI.target("times.txt", d.FILE, _equal_so_far, file=TIME_FILE, rights=without_times)
+    yield KITTI.target("calib.txt", d.FILE, KITTI.like(), file=CALIBRATION_FILE)  # another row of it may be damaged
+    yield from KITTI.document(POSE_FILE, skip=one_row)
+    yield from KITTI.document(TIME_FILE, skip=one_row)
+    yield from KITTI.document(CALIBRATION_FILE, KITTI.like(), skip=one_row, loose=lambda place: place[0] != 2)
+    pose = d.Wrong(POSES).each(lambda change: edited(put(4, change)))
+    time = d.of(["1e300"], ["-1e300"], [], ["0.1", "0.2"]).each(lambda line: edited(put(4, line)))
+    yield KITTI.target("pose 4", pose, None, f"{DRIVE}.txt:5", POSE_FILE)
+    yield KITTI.target("time 4", time, _times_masked, "times.txt:5", TIME_FILE)
+    yield KITTI.target("calibration", CALIBRATION, file=CALIBRATION_FILE)
+    masked = lambda result: kept(result, KITTI.reference())  # noqa: E731
+    yield KITTI.target("picture", PICTURES, masked, names, picture, rights={"a JPEG": _that_picture})
+    yield KITTI.target("picture of", NO_PICTURES, None, names, picture)
+    emptied, without = (lambda folder: [file.write_bytes(b"") for file in folder.iterdir()]), d.instead(Path.mkdir)
+    yield KITTI.target("all pictures empty", emptied, None, "image_2", IMAGES)
+    yield KITTI.target("no pictures", without, None, ("image_2", DRIVE), IMAGES)
+    for name, word in (("poses", f"{DRIVE}.txt"), (SEQUENCE, DRIVE), ("sequences", "sequences"), ("", "sequences")):
+        yield KITTI.target(f"no folder {name}", gone, None, word, name)
+    yield KITTI.target("a file as root", instead(Path.touch), None, "sequences")
+    for key in ("image", "frame_valid", "calibration"):
+        act = lambda key, folder: with_motion(KITTI.reference().exclude(key), cache=None)  # noqa: E731
+        yield Target("kitti", f"with_motion without {key}", (key,), act, d.Wrong({"taken away": key}))
+
+
+# -------------------------------------------------------------------------------------------------------- arguments
+
+
+def drive() -> TensorDict:
+    return KITTI.reference().clone()
+
+
+def _replayed(**given: Any) -> Any:
+    data = KITTIOdometryExperienceReplay(drives(), **{"size": SIZE, "cache": None, **given})
+    return data.sample() if {"batch_size", "num_slices", "slice_len"} & set(given) else data[:]
+
+
+def _arguments() -> Iterator[Subject]:
+    outside = ("../../../etc", "/etc")
+    one = {
+        "size": SIZES | d.of(10),
+        "camera": d.of("image_9", 2, *outside),
+        "drive": d.of("nope", -1, 0.5, "", *outside),
+        "colour": d.of("yes", 3),
+    }
+    share = d.SHARE.but("inf")
+    many = {
+        "drives": d.of([], [DRIVE, DRIVE], ["nope"], ["../../etc"]),
+        "test_share": share,
+        "validation_share": share.but("beyond one") | {"one": 1.0},
+        "split": d.CHOICE.but("empty"),
+        **dict.fromkeys(("batch_size", "num_slices"), d.COUNT),
+        "slice_len": d.COUNT.without("fraction") | {"beyond the drive": 1000},
+        "cameras": d.of("third", ["image_7"], []),
+        "flow": d.Wrong({"text": "yes", "no flow": lambda drive: drive}),
+        "slice_length": d.of(4),
+    }
+    also = {
+        "drive": ("sequence", "sequences", "poses", "/etc"),
+        "camera": ("image_9",),
+        "cameras": ("camera", "image_7"),
+        "drives": ("sequences",),
+        "slice_len": ("slices",),
+    }
+    moved = lambda **given: with_motion(drive(), cache=None, **given)  # noqa: E731
+    yield KITTI.arguments("read_kitti_drive", wrong=one, also=also)
+    yield Subject(_replayed, wrong=many, also=also, name="KITTIOdometryExperienceReplay")
+    yield Subject(moved, wrong={"height": d.POSITIVE.but("inf")}, name="with_motion")
+    yield Subject(list_kitti_drives, wrong={"root": d.of(".")}, also={"root": ("sequences",)})
+
+
+def targets() -> Iterator[Target]:
+    """All files and arguments."""
+    yield from _files()
+    yield from targets_of("kitti", *_arguments())

@@ -1,0 +1,68 @@
+"""Runs named cases of the borders in this process: each raises clearly, or has the result of its sound part.
+
+``make fuzz`` runs all of them, and drawn ones, each in a process of its own.
+"""
+
+import resource
+import warnings
+
+import pytest
+
+from benchmarks.reliability.case import MEMORY, verdict_on
+from benchmarks.reliability.fuzz import GOOD, all_targets
+
+FILES = ("kitti", "car", "lerobot", "ur5", "recordings", "corners", "logs", "models")
+TARGETS = all_targets(("filters_made", "sub_models", "around_filters", "readings", *FILES))
+#: Texts of which the letters are checked one by one, and differences of two arguments.
+OTHERS = ("num_cells", "channels", "hidden", "taper", "floor", "resampling")
+
+
+@pytest.fixture(autouse=True)
+def _as_in_a_case():
+    """Limits memory, which some files ask for without end, and hides warnings."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    with open("/proc/self/statm") as file:
+        held = int(file.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, before[1]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def judged(targets, root, monkeypatch):
+    """Yields verdicts on all named cases; each has a folder of its own."""
+    cases = [(target, what, value) for target in targets for what, value in target.wrong.named.items()]
+    for number, (target, what, value) in enumerate(cases):
+        folder = root / str(number)
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        yield target, what, value, verdict_on(target.case((what, value)), folder)
+
+
+@pytest.mark.parametrize("border", ["filters", "sub-models", "smoothers", "losses", "transforms"])
+def test_a_wrong_argument_is_named(border, tmp_path, monkeypatch):
+    """The message has its value, too."""
+    wrong, count = [], 0
+    targets = [target for target in TARGETS if target.border == border and target.name.endswith(")")]
+    for target, what, value, found in judged(targets, tmp_path, monkeypatch):
+        shown = not isinstance(value, int | float | str) or repr(value) in found.text or found.kind == "right"
+        fine = found.kind in GOOD and (shown or any(f"({name})" in target.name for name in OTHERS))
+        wrong += [] if fine else [f"{target.name}: {what}: {found}"]
+        count += 1
+    assert not wrong, "\n".join(wrong)
+    assert count > 70
+
+
+#: Parts of names by border, of which the others cost seconds.
+SOME = {"packages": ("export_step", "in its place", "its description"), "readings": ("sequence, reading", "rejects")}
+
+
+@pytest.mark.parametrize("border", [*FILES[:-1], "checkpoints", "pretrained", "training", *SOME])
+def test_damage_raises_clearly_or_gives_the_sound_part(border, tmp_path, monkeypatch):
+    targets = [target for target in TARGETS if target.border == border and not target.slow]
+    targets = [target for target in targets if any(part in target.name for part in SOME.get(border, ("",)))]
+    found = list(judged(targets, tmp_path, monkeypatch))
+    wrong = [f"{target.name}: {what}: {verdict}" for target, what, _, verdict in found if verdict.kind not in GOOD]
+    assert not wrong, "\n".join(wrong)
+    assert len(found) > 20
