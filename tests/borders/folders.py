@@ -8,6 +8,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.case import apart, workshop
 
@@ -36,3 +39,8 @@ def one_row(place: tuple[Any, ...]) -> bool:
 def bomb(data: bytes) -> bytes:
     """A picture that says that it is of 60,000 x 60,000 pixels."""
     return data[:16] + struct.pack(">II", 60000, 60000) + data[24:]
+
+
+def picture(size: tuple[int, int], suffix: str) -> d.Change:
+    """Writes a grey picture in a file's place."""
+    return lambda file: file.write_bytes(cv2.imencode(suffix, np.full((*size, 3), 7, np.uint8))[1].tobytes())

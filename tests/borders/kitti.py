@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-import torch
 from tensordict import TensorDict
 
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.damage import gone, instead, kept, put, renamed, same, written
 from benchmarks.reliability.documents import edited
 from benchmarks.reliability.target import Source, Subject, Target, targets_of
-from tests.borders.folders import SIZES, bomb, made, one_row
+from tests.borders.folders import SIZES, bomb, made, one_row, picture
 from torch_denkf.applications.car import (
     KITTIOdometryExperienceReplay,
     read_kitti_drive,
@@ -49,16 +47,11 @@ def _that_picture(result: TensorDict) -> bool:
     return bool((picture == picture[0]).all() and result["frame_valid"].all())
 
 
-def _times_masked(result: TensorDict) -> bool:
-    """Right where poses and pictures are as without damage, and frames of a wrong time are marked as missing.
-
-    A first time that is too early is a gap, after which no motion is known.
-    """
-    expected, seen = KITTI.reference(), result["frame_valid"].squeeze(-1)
-    gap = bool((result["time"].diff(dim=0) > 10).any())
-    poses = len(result) == FRAMES and torch.equal(result["state"][:, :3], expected["state"][:, :3])
-    pictures = poses and torch.equal(result["image"][seen], expected["image"][seen])
-    return d.finite(result) and pictures and (not bool(seen.all()) or gap)
+def _frame_masked(row: int, result: TensorDict) -> bool:
+    """Right where one frame counts as missing, and all else is as without damage."""
+    expected = KITTI.reference().clone()
+    expected["image"][row], expected["frame_valid"][row] = 0, False
+    return same(result, expected, rtol=1e-5, atol=1e-5)
 
 
 def _times_as_told(result: TensorDict) -> bool:
@@ -67,16 +60,10 @@ def _times_as_told(result: TensorDict) -> bool:
     return same(result["state"][:, :3], expected["state"][:, :3]) and same(result["image"], expected["image"])
 
 
-def _picture(size: tuple[int, int], suffix: str) -> d.Change:
-    return lambda file: file.write_bytes(cv2.imencode(suffix, np.full((*size, 3), 7, np.uint8))[1].tobytes())
-
-
 NAMES = ("0004.png", "-00004.png", "000004.PNG", "000999.png", "9" * 30 + ".png")
-PICTURES = (
-    d.SEALED | d.PLACES | d.of(*NAMES).each(renamed) | {"a JPEG": _picture(SIZE, ".jpg"), "a bomb": written(bomb)}
-)
+PICTURES = d.SEALED | d.PLACES | d.of(*NAMES).each(renamed) | {"a JPEG": picture(SIZE, ".jpg"), "a bomb": written(bomb)}
 NO_PICTURES = {
-    "another size": _picture((10, 10), ".png"),
+    "another size": picture((10, 10), ".png"),
     "the same number twice": lambda file: shutil.copy(file.with_name("000003.png"), file.with_name("4.png")),
 }
 POSES: dict[str, d.Change] = {
@@ -94,6 +81,22 @@ CALIBRATION = d.of((1, "0"), (1, "-700"), (6, "0"), (1, "1e300"), (0, "Q2:")).ea
 )
 
 
+#: Times of a single frame: far on, far back, none, two, repeated, back, hardly on.
+STAMPS = {
+    4: d.of(["1e300"], ["-1e300"], [], ["0.1", "0.2"], ["1e9"], ["0.309"], ["0.2"], ["0.3091"]),
+    0: d.of(["5.0"]),
+    FRAMES - 1: d.of(["0.0"]),
+}
+#: Clocks that are wrong throughout.
+CLOCKS = {
+    "stands": [0.5] * FRAMES,
+    "goes back": [-0.1 * row for row in range(FRAMES)],
+    "begins again": [0.1 * (row % 5) for row in range(FRAMES)],
+    "in units of 1e300 s": [1e-300 * row for row in range(FRAMES)],
+    "in nanoseconds": [1e8 * row for row in range(FRAMES)],
+}
+
+
 def _files() -> Iterator[Target]:
     picture, names = f"{IMAGES}/000004.png", ("000004.png", "4.png", *NAMES)
     without_times = dict.fromkeys(d.NOTHING.named, _times_as_told)
@@ -104,9 +107,12 @@ def _files() -> Iterator[Target]:
     yield from KITTI.document(TIME_FILE, skip=one_row)
     yield from KITTI.document(CALIBRATION_FILE, KITTI.like(), skip=one_row, loose=lambda place: place[0] != 2)
     pose = d.Wrong(POSES).each(lambda change: edited(put(4, change)))
-    time = d.of(["1e300"], ["-1e300"], [], ["0.1", "0.2"]).each(lambda line: edited(put(4, line)))
     yield KITTI.target("pose 4", pose, None, f"{DRIVE}.txt:5", POSE_FILE)
-    yield KITTI.target("time 4", time, _times_masked, "times.txt:5", TIME_FILE)
+    for row, values in STAMPS.items():
+        stamps = values.each(lambda line, row=row: edited(put(row, line)))
+        yield KITTI.target(f"time {row}", stamps, partial(_frame_masked, row), f"times.txt:{row + 1}", TIME_FILE)
+    clocks = d.Wrong(CLOCKS).each(lambda times: edited(lambda rows: [[repr(time)] for time in times]))
+    yield KITTI.target("clock", clocks, file=TIME_FILE)
     yield KITTI.target("calibration", CALIBRATION, file=CALIBRATION_FILE)
     masked = lambda result: kept(result, KITTI.reference())  # noqa: E731
     yield KITTI.target("picture", PICTURES, masked, names, picture, rights={"a JPEG": _that_picture})

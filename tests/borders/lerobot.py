@@ -7,20 +7,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as parquet
 import torch
 from tensordict import TensorDict
 
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.damage import NAN, gone, kept, put
+from benchmarks.reliability.damage import NAN, gone, kept, put, same
 from benchmarks.reliability.documents import edited
 from benchmarks.reliability.target import Source, Subject, Target, targets_of
 from tests.borders.folders import ALL_ROWS, SIZES, bomb, made, one_row
 from tests.data.lerobot.lerobot_folder import SIZE as SMALL
-from tests.data.lerobot.lerobot_folder import write_version_2, write_version_3
+from tests.data.lerobot.lerobot_folder import png, write_version_2, write_version_3
 from torch_denkf.data import LeRobotReplay
 
-LENGTHS = [6, 5, 7]
+LENGTHS = [6, 12, 7]
 INFO, EPISODES = "meta/info.json", "meta/episodes.jsonl"
 EPISODES_3 = "meta/episodes/chunk-000/file-000.parquet"
 DATA = "data/chunk-000/episode_000001.parquet"
@@ -35,12 +36,21 @@ def read_episodes(root: Path, **options: Any) -> TensorDict:
 
 #: Three episodes: of version 2 with pictures in the tables, of version 3 with a video.
 V2 = Source("lerobot", made("lerobot2", partial(write_version_2, lengths=LENGTHS, images="bytes")), read_episodes)
-V3 = Source("lerobot", made("lerobot3", lambda root: write_version_3(root, [LENGTHS[:2], LENGTHS[2:]])), read_episodes)
+V3 = Source("lerobot", made("lerobot3", lambda root: write_version_3(root, [[6, 5], [7]])), read_episodes)
 
 
 def _rows_kept(result: TensorDict) -> bool:
     """Right where rows are as without damage, or those of the damaged episode are marked; stamps are rounded."""
     return kept(result, V2.reference(), most=LENGTHS[1], rtol=1e-6)
+
+
+def _row_masked(key: str, result: TensorDict) -> bool:
+    """Right where row 2 of the damaged episode counts as missing in an entry, and all else is as without damage."""
+    expected, row = V2.reference().clone(), LENGTHS[0] + 2
+    expected["observed"][row] = False
+    if key == "pixels":
+        expected["pixels"][row] = 0
+    return same(result, expected, atol=1e-6)
 
 
 def _video_shown(result: TensorDict) -> bool:
@@ -60,7 +70,11 @@ def _planted(file: Path) -> None:
 
 
 #: Columns of vectors, and of numbers.
-VECTORS = {"all nan": lambda column: [[NAN] * len(cell) for cell in column], "text": lambda column: ["x"] * 5}
+VECTORS = {
+    "all nan": lambda column: [[NAN] * len(cell) for cell in column],
+    "text": lambda column: ["x"] * len(column),
+    "too wide": lambda column: [[*cell, 1.0] for cell in column],
+}
 SCALARS = {
     "text": lambda column: ["x"] * len(column),
     "backwards": lambda column: column[::-1],
@@ -100,8 +114,19 @@ def _files() -> Iterator[Target]:
     pictures = d.Wrong({path: {"bytes": None, "path": path} for path in elsewhere})
     pictures |= {"a bomb": lambda cell: {**cell, "bytes": bomb(cell["bytes"])}}
     cells = pictures.each(lambda value: edited(put((CAMERA, 2), value)))
-    yield V2.target("picture", cells, _rows_kept, (*words, CAMERA), DATA)
+    yield V2.target("picture", cells, partial(_row_masked, "pixels"), (*words, CAMERA), DATA)
     yield V2.target("picture of a file outside that is there", _planted, _rows_kept, (*words, "secret.png"), DATA)
+    pictures = {
+        "another size": put((CAMERA, 2), {"bytes": png(np.zeros((24, 32, 3), np.uint8)), "path": None}),
+        "none": put(CAMERA, lambda column: [None] * len(column)),
+    }
+    yield V2.target("pictures,", d.Wrong(pictures).each(edited), None, "episode_000001.parquet", DATA)
+    stamps = d.of(0.1, 0.05, NAN, -1.0, 1e6).each(lambda value: edited(put(("timestamp", 2), value)))
+    yield V2.target("stamp 2", stamps, partial(_row_masked, "time"), file=DATA)
+    yield V2.target("none a", d.of("fps", "chunks_size").each(lambda key: edited(put(key, 0))), None, words, INFO)
+    twice = {EPISODES: lambda rows: [*rows, rows[0]], EPISODES_3: ROWS["a row more"]}
+    for source, (file, change) in zip((V2, V3), twice.items(), strict=True):
+        yield source.target(f"an episode twice in {Path(file).name}", edited(change), file=file)
     yield V2.target("rows", d.Wrong(ROWS).each(edited), None, words, DATA)
     for name in ("", "data", "meta"):
         yield V2.target(f"no {name or 'root'}", gone, None, ("info.json", "data", "meta"), name)

@@ -22,7 +22,7 @@ from benchmarks.reliability.damage import INF, NAN, put
 from benchmarks.reliability.documents import edited
 from benchmarks.reliability.target import Source, Subject, Target, targets_of
 from tests.borders.folders import ALL_ROWS, made
-from tests.data.lerobot.lerobot_folder import write_version_2, write_version_3
+from tests.data.lerobot.lerobot_folder import pictures, write_version_2, write_version_3, write_video
 from tests.data.recordings.own_files import SIZE, write_csv, write_images
 from torch_denkf.data import Images, LeRobotReplay, Recording, RecordingReplay, Table
 from torch_denkf.fusion import message_rows
@@ -241,6 +241,7 @@ def _lost(pattern: str) -> d.Change:
     return lambda root: [file.unlink() for file in sorted(root.glob(pattern))[1:]]
 
 
+VIDEO = "videos/chunk-000/observation.images.top/episode_000001.mkv"
 INFO, EPISODES = "meta/info.json", "meta/episodes.jsonl"
 LOST = {"videos": _lost("videos/**/*.mkv"), "tables": _lost("data/**/*.parquet")}
 #: A changed file, and the word that tells of it.
@@ -254,6 +255,11 @@ CONTRADICTIONS: dict[str, tuple[str, d.Change, str]] = {
     "totals of text": (INFO, edited(put("total_episodes", "many")), "total_episodes"),
     "actions": (INFO, _renamed("actions"), "actions"),
     "commands": (INFO, _renamed("observation.command"), "observation.command"),
+    "a video of another size": (
+        VIDEO,
+        lambda file: write_video(file, pictures(1, 9, (24, 32)), "FFV1"),
+        Path(VIDEO).name,
+    ),
     "videos that are missing": ("", LOST["videos"], "episodes"),
     "tables that are missing": ("", LOST["tables"], "episodes"),
 }

@@ -19,7 +19,7 @@ from benchmarks.reliability import damage as d
 from benchmarks.reliability.damage import INF, NAN, gone, kept, put, renamed, same, spoiled
 from benchmarks.reliability.documents import edited
 from benchmarks.reliability.target import Source, Subject, Target, targets_of
-from tests.borders.folders import ALL_ROWS, SIZES, made, one_row
+from tests.borders.folders import ALL_ROWS, SIZES, made, one_row, picture
 from tests.data.lerobot.lerobot_folder import SIZE as SMALL
 from tests.data.recordings.own_files import write_csv, write_images, write_video
 from torch_denkf.applications.car.kitti.trajectories import write_trajectory
@@ -63,6 +63,7 @@ def _shown(result: TensorDict, camera: str = "images") -> bool:
     return d.finite(result) and equal and pictures and not bool(result["pixels"][~seen].any()) and len(result) >= 10
 
 
+CELLS = d.of("nan", "one", "", "inf", "1_1", "1e39", "x,1")  # the last but one is infinite in float32
 TIMES = d.Wrong({"back": "0.05", "the same": "0.3", "an hour on": "3600.4", "1e300": "1e300", "negative": "-3"})
 TABLES: dict[str, d.Change] = {
     "no header": lambda rows: rows[1:],
@@ -73,6 +74,7 @@ TABLES: dict[str, d.Change] = {
     "sorted backwards": lambda rows: [rows[0], *rows[:0:-1]],
     "an open quote": put((5, 0), '"'.__add__),
     "a line of a megabyte": put(5, ["9" * (1 << 20)]),
+    "only times": lambda rows: [row[:1] for row in rows],
     "an empty line": put((5, 0), "\n".__add__),
 }
 IMAGE_FILES = {
@@ -81,6 +83,7 @@ IMAGE_FILES = {
     "a frame twice": lambda file: file.with_suffix(".jpg").write_bytes(file.read_bytes()),
     "a pipe": lambda file: os.mkfifo(file.with_name("0.55.png")),
     "a link to nowhere": lambda file: file.with_name("0.55.png").symlink_to("nowhere"),
+    "another size": picture((5, 7), ".png"),
     "no folder": lambda file: gone(file.parent),
     "no images": lambda file: [gone(one) for one in file.parent.iterdir()],
 }
@@ -128,8 +131,17 @@ def _files() -> Iterator[Target]:
     yield from OWN.document("table.csv", None, ("table",), skip=names, but=("'--1'",))
     yield from OWN.document(parquet_file, None, ("table",), skip=one_row, options=named)
     # An hour's gap in a table is one: readings are as they stand there.
-    times = TIMES.each(lambda value: edited(put((5, 0), value)))
-    yield OWN.target("time goes on by", times, file="table.csv", rights={"an hour on": d.finite})
+    times = (TIMES | d.of("1_0", "inf")).each(lambda value: edited(put((5, 0), value)))
+    yield OWN.target(
+        "time goes on by", times, None, ("table.csv:6", "table.csv:7"), "table.csv", rights={"an hour on": d.finite}
+    )
+    cells = CELLS.each(lambda value: edited(put((2, 1), value)))
+    yield OWN.target("x in line 3", cells, None, "table.csv:3", "table.csv")
+    columns = {"lists": lambda column: [[value] for value in column], "text": lambda column: ["x" for _ in column]}
+    changes = d.Wrong(columns).each(lambda change: edited(put("x", change)))
+    yield OWN.target("column x", changes, None, parquet_file, parquet_file, named)
+    later = edited(lambda rows: [rows[0], *([f"1{row[0]}", *row[1:]] for row in rows[1:])])
+    yield OWN.target("times of another clock", later, None, "start", "table.csv", video)
     lines, rights = d.Wrong(TABLES).each(edited), dict.fromkeys(("an empty name", "an empty line"), OWN.like())
     yield OWN.target("table.csv's lines", lines, None, ("table.csv", "table"), "table.csv", rights=rights)
     # A video has no checksum: of a flipped byte a picture may be wrong, and nothing can tell.
@@ -156,8 +168,19 @@ def _trajectory(**given: Any) -> Any:
     return write_trajectory("path.txt", **{"trajectory": torch.zeros(5, 3), **layout, **given})
 
 
+def _two(columns: list[str], stream: str, name: str) -> list[Recording]:
+    """Two recordings of the same file, which do not go together."""
+    first, second = Table(own() / "table.csv", ["x"]), Table(own() / "table.csv", columns)
+    return [Recording(state=first), Recording(name=name, **{stream: second})]
+
+
+TWO = {"names": (["x"], "state", "table"), "columns": (["y"], "state", "b"), "streams": (["x"], "imu", "b")}
+TAKEN = ("time", "_row", "_reset", "reward", "recorded", "belief", "state_observed")
+
+
 def _made(streams: Any) -> Any:
-    return RecordingReplay(streams) if isinstance(streams, list) else Recording(**streams)
+    streams = streams() if callable(streams) else streams
+    return RecordingReplay(streams, **ALL_ROWS) if isinstance(streams, list) else Recording(**streams)
 
 
 def _arguments() -> Iterator[Subject]:
@@ -166,6 +189,7 @@ def _arguments() -> Iterator[Subject]:
         "time": d.of("stamp", 3),
         "unit": d.of("h", 3),
         "sample": d.of("first", 3),
+        "origin": d.of({"z": 1.0}, {"x": NAN}, {"x": "far"}, {"x": [1.0, 2.0]}, 5.0),
         "tolerance": d.POSITIVE.but("inf"),
     }
     replay = {
@@ -183,20 +207,24 @@ def _arguments() -> Iterator[Subject]:
     streams = {
         "none": {},
         "text": {"state": "table.csv"},
+        **{f"{what} told apart": partial(_two, *options) for what, options in TWO.items()},
         "two cameras": {name: Images(name, rate=1.0) for name in "ab"},
-        "a name that is taken": {"reward": Table("table.csv")},
+        **{f"{name}, a name that is taken": {name: Table("table.csv")} for name in TAKEN},
         "a name that is no text": {"name": 3, "state": Table("table.csv")},
         "no recordings": [],
         "recordings of text": ["table.csv"],
     }
-    words = {"streams": ("state", "camera", "reward", "name", "recordings", "Recording")}
+    words = {"streams": ("state", "camera", *TAKEN, "name", "recordings", "Recording")}
     images = lambda **given: Images(own() / "images", **given)  # noqa: E731
     replayed = lambda **given: read_own(own(), replay=given)  # noqa: E731
     in_memory = lambda **given: rows_in_memory(**given)  # noqa: E731
     yield OWN.arguments("Table", wrong=table, also=dict.fromkeys(table, ("table.csv",)))
     slices = dict.fromkeys(("clock", "slice_len"), ("rows", "slices"))
     yield Subject(replayed, wrong=replay, also=slices, name="RecordingReplay")
-    yield Subject(images, wrong={"start": d.FINITE, "rate": d.POSITIVE.but("inf")}, name="Images")
+    videos = lambda **given: Video(own() / "run.mkv", **given).read(SMALL, None, False)  # noqa: E731
+    times = d.of([*range(12, 0, -1)], [0.0, NAN, *range(2, 12)], [*range(11)])
+    yield Subject(images, wrong={"start": d.FINITE, "rate": d.POSITIVE}, name="Images")
+    yield Subject(videos, wrong={"times": times, "start": d.FINITE, "sample": d.of("linear")}, name="Video")
     yield Subject(in_memory, wrong={"fps": d.POSITIVE}, name="recording_from_rows")
     yield Subject(_trajectory, wrong=path, name="write_trajectory")
     yield Subject(_made, wrong={"streams": d.Wrong(streams)}, also=words, name="Recording")

@@ -141,23 +141,6 @@ def test_videos_that_are_missing(tmp_path):
     assert_close(data[:]["pixels"], torch.from_numpy(shown).float() / 255)
 
 
-@pytest.mark.parametrize(
-    ("episodes", "match"),
-    [
-        ([], r"episodes holds numbers of episodes, such as \[0, 2\].*got \[\]"),
-        (1, "episodes holds numbers of episodes.*got 1"),
-        ("0", "episodes holds numbers of episodes.*got '0'"),
-        ([0, 7], r"episodes names \[7\], but .*episodes.jsonl lists 0, 1"),
-        (["0"], r"episodes names \['0'\], but"),
-        ([[0]], r"episodes names \[\[0\]\], but"),
-    ],
-)
-def test_episodes_that_are_not_there(tmp_path, episodes, match):
-    write_version_2(tmp_path, [3, 3])
-    with pytest.raises(ValueError, match=match):
-        open_all(tmp_path, episodes=episodes)
-
-
 @pytest.mark.parametrize("cached", [False, True])
 def test_large_numbers(tmp_path, cached):
     """Counts encoders up to 2.1e9: float32 swallows steps of 7; behind an origin they are there."""
