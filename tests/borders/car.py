@@ -28,12 +28,14 @@ from torch_denkf.functional import sigma_points
 from torch_denkf.functional.unscented import unscented_moments, unscented_weights
 
 CALIBRATION = d.of((1.0, 1.0, 1.0), (0.0, 40.0, 35.0, 11.0), (NAN, 40.0, 35.0, 11.0), (-4.0, 40.0, 35.0, 11.0), "ab")
+#: Of pictures of another size.
+FAR = (718.0, 718.0, 607.0, 185.0)
+PICTURES = [*np.random.default_rng(0).integers(0, 256, (4, 24, 72, 3), np.uint8)]
 
 
 def _tracked(**given: Any) -> Any:
     car = models.LOADERS["car-odometry"](models.FOLDERS["car-odometry"])
-    frames = [np.full((24, 72, 3), 40 * k, np.uint8) for k in range(1, 5)]
-    settings: dict[str, Any] = {"frames": frames, "calibration": (41.7, 41.7, 35.5, 11.5), "fps": 10.0, **given}
+    settings: dict[str, Any] = {"frames": PICTURES, "calibration": (41.7, 41.7, 35.5, 11.5), "fps": 10.0, **given}
     if "times" in given:
         settings["fps"] = None
     return list(track(car, **settings))
@@ -51,10 +53,11 @@ def _no_moments(points: torch.Tensor) -> bool:
 
 
 def _arguments() -> Iterator[Subject]:
-    eye, frame = torch.eye(2), np.zeros((24, 72, 3), np.uint8)
+    eye, frame = torch.eye(2), PICTURES[0]
     frames = {
         "none": [],
         "one": [frame],
+        "one that is seen": [frame, None],
         "another size": [frame, frame[:10], frame],
         "floats": [frame / 255.0] * 3,
         "five channels": [np.zeros((24, 72, 5), np.uint8)] * 3,
@@ -64,10 +67,11 @@ def _arguments() -> Iterator[Subject]:
         "frames": d.Wrong(frames),
         "times": d.of([3.0, 2.0, 1.0, 0.0], [0.0] * 4, [0.0, NAN, 0.2, 0.3], [0.0, 0.1], ["a", "b", "c", "d"])
         | {"a gap of a day": [0.0, 0.1, 86400.0, 86400.1]},
-        **dict.fromkeys(("fps", "height"), d.POSITIVE),
-        "pitch": d.FINITE | {"a right angle": 1.57},
+        "fps": d.POSITIVE,
+        "height": d.POSITIVE | {"in cm": 165},
+        "pitch": d.FINITE | {"a right angle": 1.57, "degrees": 2.0},
         "black_level": d.of(-1, 300, "x"),
-        "calibration": CALIBRATION,
+        "calibration": CALIBRATION | d.of(FAR),
     }
     covariances = {
         "negative": torch.stack([eye, -eye]),
@@ -81,7 +85,12 @@ def _arguments() -> Iterator[Subject]:
     camera = lambda: {"calibration": (40.0, 40.0, 35.0, 11.0)}  # noqa: E731
     batch = lambda: {"mean": torch.zeros(2, 2), "cov": eye.expand(2, 2, 2)}  # noqa: E731
     yield Subject(car_filter, wrong=models.CAR)
-    yield Subject(_tracked, wrong=tracked, also={"frames": ("frame",), "times": ("time",)}, name="track")
+    yield Subject(
+        _tracked,
+        wrong=tracked,
+        also={"frames": ("frame",), "times": ("time",), "calibration": ("principal point",)},
+        name="track",
+    )
     yield Subject(CanonicalCamera, lambda: {"focal": 40.0})
     yield Subject(OpticalFlow, camera, flow, {"calibration": CALIBRATION})
     yield Subject(Updates, wrong=updates, also=dict.fromkeys(updates, ("Updates",)))

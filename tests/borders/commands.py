@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 from hypothesis import strategies as st
@@ -42,10 +43,14 @@ def run(words: Sequence[str]) -> str:
     def again(message: str) -> int:
         raise
 
-    command_module._mistake = again  # of this process alone, as what follows
-    warnings.simplefilter("default")
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with (
+        patch.object(command_module, "_mistake", again),
+        warnings.catch_warnings(),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        warnings.simplefilter("default")
         code = main(list(words))
     if code:
         raise Refused(err.getvalue() + out.getvalue())
@@ -152,6 +157,8 @@ OWN: dict[tuple[str, str], d.Wrong] = {
     ("plot", "path"): d.of("nowhere", "kitti"),
     ("collect-ur5", "size"): d.of("0", "-4", "4 4 4", "x"),
     ("collect-ur5", "frames"): WHOLE,
+    ("render-kitti", "frames"): AT_LEAST_ONE | d.of("1"),
+    ("render-kitti", "focal"): POSITIVE | d.of("718.856"),
     ("demo", "root"): d.of("kitti"),
     ("demo", "drive"): d.of("town"),
     ("demo", "height"): d.of("x"),

@@ -156,7 +156,7 @@ def _arguments() -> Iterator[Subject]:
         "split": d.CHOICE.but("empty"),
         **dict.fromkeys(("batch_size", "num_slices"), d.COUNT),
         "slice_len": d.COUNT.without("fraction") | {"beyond the drive": 1000},
-        "cameras": d.of("third", ["image_7"], []),
+        "cameras": d.of("third", ["image_7"], [], "image_2", ["image_2", "image_2"]),
         "flow": d.Wrong({"text": "yes", "no flow": lambda drive: drive}),
         "slice_length": d.of(4),
     }

@@ -352,5 +352,5 @@ def targets() -> Iterator[Target]:
     for border, subjects in {"training": _training, "pretrained": _pretrained, "packages": _packages}.items():
         yield from targets_of(border, *subjects())
     names = d.of("walker", "../../etc", "/etc", "", "a\0b", 3)
-    also = {"name_or_folder": ("config.json", "trained filter")}
+    also = {"name_or_folder": ("config.json", "car-odometry, imu, quadruped, reacher, ur5-table")}
     yield from targets_of("pretrained", Subject(from_pretrained, wrong={"name_or_folder": names}, also=also), said=True)
