@@ -124,6 +124,8 @@ def _files() -> Iterator[Target]:
     stamps = d.of(0.1, 0.05, NAN, -1.0, 1e6).each(lambda value: edited(put(("timestamp", 2), value)))
     yield V2.target("stamp 2", stamps, partial(_row_masked, "time"), file=DATA)
     yield V2.target("none a", d.of("fps", "chunks_size").each(lambda key: edited(put(key, 0))), None, words, INFO)
+    much = edited(put((1, "length"), 10**12))
+    yield V2.target("an episode of 1e12 rows", much, file=EPISODES)
     twice = {EPISODES: lambda rows: [*rows, rows[0]], EPISODES_3: ROWS["a row more"]}
     for source, (file, change) in zip((V2, V3), twice.items(), strict=True):
         yield source.target(f"an episode twice in {Path(file).name}", edited(change), file=file)

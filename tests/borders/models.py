@@ -155,6 +155,15 @@ CHANGES: dict[str, d.Change] = {
     "no weights": lambda tensors: {},
     "a weight of whole numbers": lambda tensors: {name: value.long() for name, value in tensors.items()},
 }
+#: Changes of a description by hand.
+EDITED: dict[str, d.Change] = {
+    "another setting": put(("settings", "ensemble_size"), 3),
+    "another seed": put(("training", "seed"), 1),
+    "another version": put(("versions", "torch"), "1.0"),
+    "one entry more": put("note", "better"),
+    **{f"without {name}": put(name, MISSING) for name in ("versions", "checksum")},
+    "a checksum of numbers": put("checksum", 3),
+}
 HEADERS = d.of(0, 1 << 40, (1 << 63) + 5).each(
     lambda size: signed(written(lambda data: struct.pack("<Q", size) + data[8:]))
 )
@@ -171,6 +180,7 @@ def _of_pretrained(name: str) -> Iterator[Target]:
         yield folder.target(f"{file} in its place", d.PLACES, file=file, within=4)
     known, loose = ("format", "builder", "settings", "sha256"), lambda place: place[0] == "settings"
     yield from folder.document(CONFIG, right, skip=lambda place: place[0] not in known, loose=loose, then=signed)
+    yield folder.target("description", d.Wrong(EDITED).each(edited), None, "checksum", CONFIG)
     for setting, values in SETTINGS[name].items():
         wrong = values.each(lambda value, setting=setting: signed(edited(put(("settings", setting), value))))
         yield folder.target(setting, wrong, None, (CONFIG, setting), CONFIG)

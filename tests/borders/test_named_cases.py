@@ -13,7 +13,7 @@ from benchmarks.reliability.case import MEMORY, verdict_on
 from benchmarks.reliability.fuzz import GOOD, all_targets
 
 FILES = ("kitti", "car", "lerobot", "ur5", "recordings", "corners", "logs", "models", "commands")
-TARGETS = all_targets(("filters_made", "sub_models", "around_filters", "readings", *FILES))
+TARGETS = all_targets(("filters_made", "sub_models", "around_filters", "readings", "noises", "legged", *FILES))
 #: Texts of which the letters are checked one by one, and differences of two arguments.
 OTHERS = ("num_cells", "channels", "hidden", "taper", "floor", "resampling")
 
@@ -58,12 +58,13 @@ def test_a_wrong_argument_is_named(border, tmp_path, monkeypatch):
 #: What is run of borders of which the rest costs seconds: the names of its targets.
 SOME = {
     "packages": r"export_step|in its place|its description|graph|hostile|called, observation",
+    "noises": r"(variances|covariance|hidden)$",
     "readings": "sequence, reading|rejects",
     "commands": r"^[\w-]+ ",  # options, without files
 }
 
 
-@pytest.mark.parametrize("border", [*FILES[:-2], "checkpoints", "pretrained", "training", *SOME])
+@pytest.mark.parametrize("border", [*FILES[:-2], "checkpoints", "pretrained", "training", "legged robots", *SOME])
 def test_damage_raises_clearly_or_gives_the_sound_part(border, tmp_path, monkeypatch):
     targets = [target for target in TARGETS if target.border == border and not target.slow]
     targets = [target for target in targets if re.search(SOME.get(border, ""), target.name)]
