@@ -51,7 +51,7 @@ from torch_denkf.modules import (
 from torch_denkf.monitoring import BlackIsMissing
 from torch_denkf.objectives import DEnKFLoss, SensorLoss, TransitionLoss
 from torch_denkf.plots import belief_video, plot_bands
-from torch_denkf.training import FilterTrainer, Stage, choose_for_coverage, hold_last
+from torch_denkf.training import FilterTrainer, Stage, choose, hold_last
 
 
 def write_folder(root: Path, episodes: int, rows: int) -> None:
@@ -185,15 +185,15 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
     # One factor on all noise, with which the 90 % intervals hold 90 %.
     runs = readings.draw(torch.Generator().manual_seed(0), shortest)
 
-    def coverage() -> torch.Tensor:
+    def from_level() -> float:
         torch.manual_seed(0)
         with torch.no_grad():
             beliefs = behind.sequence(runs.copy())["belief"]
-        return interval_coverage(beliefs["mean"], beliefs["var"], runs["state"], level=0.9).mean()
+        return abs(interval_coverage(beliefs["mean"], beliefs["var"], runs["state"], level=0.9).mean().item() - 0.9)
 
     noises = [module for module in denkf.modules() if isinstance(module, ScaledNoise)]
     candidates = (0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0, 2.4, 2.8, 3.3, 4.0)
-    factor = choose_for_coverage(candidates, lambda by: [setattr(noise, "factor", by) for noise in noises], coverage)
+    factor = choose(candidates, lambda by: [setattr(noise, "factor", by) for noise in noises], from_level)
     print(f"noise times {factor}, chosen on {len(held_out.episodes)} episodes that the sensor has not seen")
 
 

@@ -49,7 +49,6 @@ from torch_denkf.modules import (
     NoisyTransition,
     Select,
     StochasticMLP,
-    as_process_noise,
 )
 from torch_denkf.plots import plot_bands
 from torch_denkf.training import hold_last
@@ -122,7 +121,7 @@ def make_filter(data: RecordingReplay) -> Filter:
             ),
             "camera_noise": DiagonalNoise(1, r=0.2 * scale[:1], loc=loc[:1], scale=scale[:1]),
             "encoder_noise": ConstantNoise([0.05], trainable=True, in_key="encoder", out_key="encoder_noise"),
-            "transition": NoisyTransition(transition, as_process_noise(pushes, initial)),
+            "transition": NoisyTransition(transition, pushes),
             "h_camera": Select([0]),
             "by_camera": EnsembleAnalysis("etkf", belief_prefix="middle"),
             "h_encoder": Select([1], in_key=("middle", "ensemble"), out_key="encoder_predicted"),

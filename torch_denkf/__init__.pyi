@@ -41,7 +41,6 @@ from .envs.replay import ReplayEnv
 from .filters import (
     DPF,
     EKF,
-    PFM,
     UKF,
     DEnKF,
     Filter,
@@ -118,7 +117,6 @@ __all__ = [
     "ObservationLoss",
     "OccludingBox",
     "OpticalFlow",
-    "PFM",
     "ParticleFilter",
     "ParticleSmoother",
     "RTSSmoother",

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from benchmarks.arms.arms import SIDE, Arm
 from torch_denkf import modules as m
-from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.moments import ensemble_mean, ensemble_var
 from torch_denkf.submodel import Sensor
 
 PIXELS = 0.25, 0.1  # mean and standard deviation of a pixel

@@ -19,7 +19,7 @@ from benchmarks.attitude.filters import GivenNoise, attitude_filter, inertial_fi
 from benchmarks.attitude.pictures import draw
 from benchmarks.attitude.task import DT, Sensors, simulated, tilt_error, walking
 from benchmarks.common.arguments import made_by, parse
-from benchmarks.common.tables import Columns, head, line, write_page
+from benchmarks.common.tables import head, line, records, write_page, write_table
 from torch_denkf.functional import crps_gaussian
 from torch_denkf.functional.manifolds import SO3, rotate, rotation_matrix
 from torch_denkf.modules import DiagonalNoise, SubModel
@@ -36,12 +36,7 @@ REST_NOISES = (1.0, 2.0, 3.0, 5.0)
 GYRO_NOISES = {"simulated": Sensors().gyro_noise, "iCub": 5e-3}
 LEVEL = 0.9  # of the intervals
 SCORES = ("tilt", "largest", "full", "claimed", "nees", "held", "ms")
-COLUMNS = Columns(
-    names=("data", "reads", "filter", "setting", *SCORES),
-    text=("data", "reads", "filter"),
-    whole=(),
-    order=lambda row: (row["data"], row["reads"], row["filter"], row.get("setting", 0.0)),
-)
+KEYS = ("data", "reads", "filter")
 IMU, PLACE = "gyro, accelerometer", "and that it stays about a place"
 COMPASS, FEET = "and a magnetometer", "and the standing foot"
 READS = [IMU, PLACE, COMPASS, f"{PLACE}, {COMPASS}", FEET]
@@ -316,7 +311,7 @@ def main() -> None:
         logs["iCub"] = partial(walking, study.icub), STEADY
     rows: list[dict] = []
     if study.only:
-        rows = COLUMNS.read(study.out / "attitude.csv")
+        rows = records(study.out / "attitude.csv")
         settings = {
             row["reads"]: row["setting"]
             for row in rows
@@ -334,13 +329,13 @@ def main() -> None:
         for row in library_rows(name, prepared(data), scored, *options, study.smoke, study.only):
             if not row:
                 continue
-            rows = [other for other in rows if any(other[key] != row[key] for key in COLUMNS.text)] + [row]
+            rows = [other for other in rows if any(other[key] != row[key] for key in KEYS)] + [row]
             numbers = {key: f"{row[key]:.3g}" for key in SCORES}
             print(name, row["reads"], row["filter"], numbers, flush=True)
     rows.sort(key=lambda row: (row["data"] == "iCub", READS.index(row["reads"])))
     if study.out is not None:
         study.out.mkdir(parents=True, exist_ok=True)
-        COLUMNS.write(rows, study.out / "attitude.csv")
+        write_table(rows, study.out / "attitude.csv", (*KEYS, "setting"))
         if "iCub" in logs and not study.only:
             mahonys = [row for row in rows if row["data"] == "simulated" and row["filter"].startswith("Mahony")]
             pull = min(mahonys, key=lambda row: row["tilt"])["setting"]

@@ -16,7 +16,7 @@ from benchmarks.broad.peers import GAINS, PACKAGES, gradient_filter, has, vqf
 from benchmarks.broad.pictures import draw
 from benchmarks.broad.task import Trial, first_orientation, read_trials, scores, simulated_trial
 from benchmarks.common.arguments import made_by, parse
-from benchmarks.common.tables import Columns, head, line, pick, write_page
+from benchmarks.common.tables import head, line, pick, write_page, write_table
 from torch_denkf.applications.imu.filter import ImuFilter, ImuSettings
 from torch_denkf.applications.imu.log import Orientations, at_readings, imu_rows
 from torch_denkf.deployment.files import write_text
@@ -26,12 +26,6 @@ from torch_denkf.smoothers import RTSSmoother
 NUMBERS = Path(__file__).parent / "numbers.json"
 HELD = ("heading", "inclination")
 SCORES = ("total", "heading", "inclination", "heading_held", "inclination_held", "heading_std")
-COLUMNS = Columns(
-    names=("trial", "kind", "method", "numbers", *SCORES),
-    text=("trial", "kind", "method", "numbers"),
-    whole=(),
-    order=lambda row: (row["trial"], METHODS.index(row["method"])),
-)
 OWN, SMOOTH, SIX, VQF, VQF_SIX = "imu", "smoother (RTS) of imu", "imu, 6 axes", "VQF", "VQF, 6 axes"
 MOVED = ", latency removed"  # moved on by the learned latency; all others are as stamped
 METHODS = (
@@ -223,10 +217,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 total = next(row["total"] for row in pick(rows, trial=trial.name, method=OWN + MOVED))
                 if worst is None or total > worst[0]:
                     worst = total, trial, own[OWN]
-    rows.sort(key=COLUMNS.order)
+    rows.sort(key=lambda row: (row["trial"], METHODS.index(row["method"])))
     if study.out is not None:
         study.out.mkdir(parents=True, exist_ok=True)
-        COLUMNS.write(rows, study.out / "broad.csv")
+        write_table(rows, study.out / "broad.csv", ())
         write_text(study.out / "broad.json", json.dumps(rows, indent=1) + "\n")
         assert worst is not None
         draw(worst[1], worst[2], vqf(worst[1])[0] if has(VQF) else None, study.out / "broad.png")

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from benchmarks.common.recipes import Recipe
 from torch_denkf.filters import Filter
-from torch_denkf.training import FilterTrainer, Stage, choose, choose_for_coverage
+from torch_denkf.training import FilterTrainer, Stage, choose
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 
@@ -53,7 +53,7 @@ def fit_filter(
     if error is not None:
         inflation = choose(inflations, apply, error)
     elif coverage is not None:
-        inflation = choose_for_coverage(inflations, apply, coverage)
+        inflation = choose(inflations, apply, lambda: float((coverage() - 0.9).abs().sum()))
     else:
         raise TypeError("fit_filter chooses the inflation by coverage or by error; pass one of them")
     if trainer.processes.is_main:

@@ -10,9 +10,10 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from benchmarks.fusion.task import Task, add_features, delayed, fused_sensors
-from torch_denkf.applications.car import UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 from torch_denkf.applications.car.kitti.files import read_poses
+from torch_denkf.applications.car.modules.unicycle_noise import UnicycleNoise
 from torch_denkf.applications.car.odometry.filter import VELOCITIES
 from torch_denkf.applications.car.odometry.streams import Drive, read_sensor
 from torch_denkf.applications.car.unicycle import unicycle_move

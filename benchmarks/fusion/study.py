@@ -15,19 +15,14 @@ from tensordict import TensorDict
 
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.jobs import compute
-from benchmarks.common.tables import Columns, head, line, pick, report
+from benchmarks.common.tables import head, line, pick, report
 from benchmarks.fusion.arm import arm_task
 from benchmarks.fusion.car import car_task
 from benchmarks.fusion.task import FAULTS, Task, delayed, faulty, without
 from benchmarks.fusion.training import make_weights, train
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
-COLUMNS = Columns(
-    names=("task", "method", "sensors", "condition", "seed", "error", "error_without", "error_ratio"),
-    text=("task", "method", "sensors", "condition"),
-    whole=("seed",),
-    order=lambda row: (row["task"], row["condition"], row["sensors"], row["method"], row["seed"]),
-)
+ORDER = ("task", "condition", "sensors", "method", "seed")  # of the rows
 METHODS = ("plain", "weights")
 SECONDS = 3.0  # that a sensor fails
 WINDOW, BATCH = 200, 36  # steps of a training window, and windows in an update
@@ -168,4 +163,4 @@ def main() -> None:
     runs = [(name, seed) for seed in range(study.seeds) for name in tasks]
     jobs = {study.out / "parts" / f"{name}-{seed}.json": partial(job, name, seed, study) for name, seed in runs}
     found = compute(jobs, study.processes, "fusion")
-    report(study.out, COLUMNS, found, page(found, study), "fusion")
+    report(study.out, found, page(found, study), "fusion", ORDER)

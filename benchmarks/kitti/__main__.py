@@ -11,7 +11,7 @@ from pathlib import Path
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import report
 from benchmarks.kitti.study import Study, make_jobs, rows_of, run_jobs
-from benchmarks.kitti.tables import COLUMNS, markdown
+from benchmarks.kitti.tables import COLUMNS, IDENTITY, markdown
 from benchmarks.kitti.training import Budget
 from torch_denkf.applications.car import write_drives
 from torch_denkf.deployment.files import write_text
@@ -40,7 +40,7 @@ def main() -> None:
     run_jobs(jobs, study.processes)
     rows = rows_of(study.out)
     header = f"`{command('kitti')}`: {(time.time() - begun) / 60:.0f} min, {study.processes} process(es)"
-    report(study.out, COLUMNS, rows, markdown(rows, header))
+    report(study.out, rows, markdown(rows, header), order=IDENTITY, columns=COLUMNS)
 
 
 if __name__ == "__main__":

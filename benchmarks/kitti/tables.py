@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
-from benchmarks.common.tables import Columns, head, line
+from benchmarks.common.tables import head, line
 from benchmarks.kitti.streams import CONDITIONS
 
 IDENTITY = ("filter", "sensor", "drive", "condition", "window", "seed")
@@ -18,12 +18,7 @@ _VELOCITY = ("rmse_v_m_per_s", "mae_v_m_per_s", "rmse_theta_dot_deg_per_s", "mae
 _BELIEF = ("crps_v_m_per_s", "crps_theta_dot_deg_per_s", "nll", "nees", "spread_skill")
 _OTHERS = ("pathlength_m_per_m", "pathlength_deg_per_m", "devkit_t_rel_percent", "devkit_r_rel_deg_per_m", "blind")
 _COST = ("parameters", "ms_per_step")
-COLUMNS = Columns(
-    (*IDENTITY, *_ERRORS, *_VELOCITY, *_BELIEF, *_OTHERS, *_COST),
-    text=IDENTITY[:4],
-    whole=IDENTITY[4:],
-    order=lambda row: tuple(row[key] for key in IDENTITY),
-)
+COLUMNS = (*IDENTITY, *_ERRORS, *_VELOCITY, *_BELIEF, *_OTHERS, *_COST)
 FAIRNESS = (
     "In each fold and seed all filters start from the same sensor's weights and learn from the same windows of its "
     "readings, with as many updates and steps back-propagated, at the same rate; each then trains its own copy of the "
@@ -41,7 +36,7 @@ FLOOR = ("floor", "truth")  # a filter and its sensor
 
 def by_drive(rows: Iterable[dict]) -> pd.DataFrame:
     """Returns numbers by filter, sensor, condition, window and drive: means of its cameras, then medians of seeds."""
-    frame = pd.DataFrame(rows, columns=COLUMNS.names)
+    frame = pd.DataFrame(rows, columns=COLUMNS)
     frame["drive"] = frame["drive"].str.split("/").str[0]
     keys = ["filter", "sensor", "condition", "window", "drive"]
     return frame.groupby([*keys, "seed"]).mean().groupby(keys).median()

@@ -24,7 +24,7 @@ from benchmarks.common.arguments import made_by
 from benchmarks.common.jobs import once, read_rows
 from benchmarks.common.plots import draw_frontier
 from benchmarks.common.scores import processor_ms
-from benchmarks.common.tables import Columns, head, line, write_page
+from benchmarks.common.tables import head, line, write_page, write_table
 from benchmarks.lorenz96.learned import FORCING, Lorenz96, evaluate, tapers
 from benchmarks.lorenz96.schemes import VARIABLES, simulate
 from torch_denkf.filters import EKF, UKF, DEnKF, Filter, ParticleFilter
@@ -49,12 +49,6 @@ GAUSSIAN_INFLATIONS = (1.02, 1.05, 1.1, 1.2, 1.3, 1.5)
 KERNELS = (0.25, 0.5, 1.0, 2.0)
 SCHEMES = {"DEnKF, stochastic": "perturbed", "DEnKF, etkf": "etkf", "DEnKF, sakov": "sakov"}
 SHOWN = 2.0  # a filter that errs by more has lost its system: its readings err by 1
-COLUMNS = Columns(
-    ("filter", "members", "setting", "validation_rmse", "rmse", "ms_per_step", "eager_ms_per_step"),
-    text=("filter", "setting"),
-    whole=("members",),
-    order=lambda row: (row["filter"], row["members"]),
-)
 Make = Callable[[], Filter]
 
 
@@ -159,7 +153,7 @@ class Frontier:
             print(line(*(f"{v:.3g}" if isinstance(v, float) else v for v in rows[-1].values())), flush=True)
         write_page(self._page(rows, time.perf_counter() - began), None if self.smoke else self.out)
         if not self.smoke:
-            COLUMNS.write(rows, self.out.with_suffix(".csv"))
+            write_table(rows, self.out.with_suffix(".csv"), ("filter", "members"))
             label = "root mean square error of the belief's mean"
             draw_frontier(rows, self.out.with_suffix(".png"), error="rmse", label=label, limit=SHOWN)
 

@@ -1,11 +1,9 @@
-"""Dropout masks that are balanced over the members against independent ones: ``python -m benchmarks.members.masks``."""
+"""Balanced dropout masks against independent ones, in the reacher's filter: ``python -m benchmarks.members.masks``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import torch
 
@@ -19,49 +17,38 @@ MASKS = ("random", "balanced")
 
 @dataclass(frozen=True)
 class Masks:
-    """Compares balanced and random dropout masks in filters whose noise is dropout."""
+    """Compares balanced and random dropout masks in the library's filter whose noise is dropout."""
 
     out: Path | None = None  # folder for masks.md
-    runs: Path = Path("runs/members")  # with the manipulator's trained motion, made where missing
-    tasks: tuple[Literal["reacher", "manipulator", "ur5"], ...] = ("reacher", "manipulator", "ur5")
     members: tuple[int, ...] = (32, 64, 128, 256, 512)
     draws: int = 4  # of the filter's noise
-    demos: int = 200  # of the UR5
-    updates: int = 8000  # of the manipulator's motion
 
 
 def main() -> None:
     """Writes the table."""
-    study = parse(Masks)
-    makers = {
-        "reacher": tasks.reacher,
-        "manipulator": partial(tasks.manipulator, study.runs / "manipulator", updates=study.updates),
-        "ur5": partial(tasks.ur5, study.runs / "ur5", study.demos),
-    }
+    study, task = parse(Masks), tasks.reacher()
     lines = [
         "# Balanced masks",
         "",
-        "Error of the velocities in rad/s, of the UR5's joints in degrees, mean and standard deviation over "
+        "Error of the velocities in rad/s, mean and standard deviation over "
         f"{study.draws} draws of the noise, and share of the truth within the 90 % intervals. No localisation. Weights "
         "are the same.",
         "",
         *head("task", "members", *(word for masks in MASKS for word in (f"{masks} masks", "held"))),
     ]
-    for name in study.tasks:
-        task = makers[name]()
-        for members in study.members:
-            cells = []
-            for masks in MASKS:
-                filter = task.make(members, None)
-                for module in filter.modules():
-                    if isinstance(module, StochasticMLP):
-                        module.balanced = masks == "balanced"
-                scores = [task.test(filter, seed) for seed in range(study.draws)]
-                error = torch.tensor([score.error for score in scores])
-                held = sum(score.held for score in scores) / len(scores)
-                cells += [f"{error.mean():.4f} ± {error.std():.4f}", f"{held:.1%}"]
-            lines.append(line(name, members, *cells))
-            print(lines[-1], flush=True)
+    for members in study.members:
+        cells = []
+        for masks in MASKS:
+            filter = task.make(members, None)
+            for module in filter.modules():
+                if isinstance(module, StochasticMLP):
+                    module.balanced = masks == "balanced"
+            scores = [task.test(filter, seed) for seed in range(study.draws)]
+            error = torch.tensor([score.error for score in scores])
+            held = sum(score.held for score in scores) / len(scores)
+            cells += [f"{error.mean():.4f} ± {error.std():.4f}", f"{held:.1%}"]
+        lines.append(line(task.name, members, *cells))
+        print(lines[-1], flush=True)
     lines += ["", *made_by("members.masks")]
     write_page("\n".join(lines) + "\n", None if study.out is None else study.out / "masks.md")
 

@@ -10,17 +10,12 @@ from pathlib import Path
 
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.plots import plt, save
-from benchmarks.common.tables import Columns, head, line, pick, write_page
+from benchmarks.common.tables import head, line, pick, records, write_page, write_table
 from benchmarks.members import tasks
 from benchmarks.members.tasks import Score, Task
 
 PLAIN, BELIEVED = "plain", "significance"
-COLUMNS = Columns(
-    names=("task", "filter", "members", "threshold", "error", "held", "seconds"),
-    text=("task", "filter"),
-    whole=("members",),
-    order=lambda row: (row["task"], row["filter"], row.get("members", 0)),
-)
+ORDER = ("task", "filter", "members")  # of the rows
 TITLES = {"walks": "ten walks", "lorenz96": "Lorenz-96", "ur5": "UR5 arm"}  # others are titled by their name
 
 
@@ -144,7 +139,7 @@ def main() -> None:
         study = replace(study, members=(8,), thresholds=(1.0,), tasks=("walks", "lorenz96"))
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="members-")))
     file = None if study.out is None else study.out / "members.csv"
-    rows = COLUMNS.read(file) if file is not None and file.exists() else []
+    rows = [] if file is None else records(file)
     for name in study.tasks:
         task = made(study, name)
         for row in rows_of(task, study, rows):
@@ -152,7 +147,7 @@ def main() -> None:
             print(row, flush=True)
             if file is not None:
                 file.parent.mkdir(parents=True, exist_ok=True)
-                COLUMNS.write(rows, file)
+                write_table(rows, file, ORDER)
     write_page(page(rows, study), None if study.out is None else study.out / "members.md")
     if study.out is not None:
         draw(rows, study.out / "members.png")

@@ -11,7 +11,7 @@ import pandas as pd
 import torch
 
 from benchmarks.common.arguments import command, parse
-from benchmarks.common.tables import Columns, head, line, report
+from benchmarks.common.tables import head, line, report
 from torch_denkf.applications.car import write_drives
 from torch_denkf.applications.car.kitti.clock import read_times
 from torch_denkf.applications.car.kitti.drive import choose_camera, list_kitti_drives
@@ -27,12 +27,7 @@ from torch_denkf.deployment.files import write_text
 
 WINDOW = 100  # steps of an end point error; half of a shorter drive
 ERRORS = ["translation_m_per_m", "rotation_deg_per_m"]
-COLUMNS = Columns(
-    names=("drive", "height_m", "frames", "window", *ERRORS, "devkit_percent", "devkit_deg_per_100m", "scale"),
-    text=("drive",),
-    whole=("frames", "window"),
-    order=lambda row: (row["height_m"], row["drive"]),
-)
+COLUMNS = ("drive", "height_m", "frames", "window", *ERRORS, "devkit_percent", "devkit_deg_per_100m", "scale")
 
 
 @dataclass(frozen=True)
@@ -85,7 +80,7 @@ def track(study: Study, root: Path, drive: str, height: float) -> dict:
 
 def page(rows: Sequence[dict]) -> str:
     """A table of all drives at the first height, and the means at each."""
-    table = pd.DataFrame(rows, columns=COLUMNS.names)
+    table = pd.DataFrame(rows, columns=COLUMNS)
     table["devkit"] = table["devkit_percent"].map("{:.2f}".format).replace("nan", "")
     table["devkit_turn"] = table["devkit_deg_per_100m"].map("{:.2f}".format).replace("nan", "")
     first = table["height_m"][0]
@@ -114,7 +109,7 @@ def main() -> None:
         raise SystemExit("--root is missing: the folder with 'sequences' and 'poses' (or --smoke)")
     drives = study.drives or list_kitti_drives(study.root)
     rows = [track(study, study.root, drive, height) for height in study.heights for drive in drives]
-    report(study.out, COLUMNS, rows, page(rows))
+    report(study.out, rows, page(rows), "odometry", ("height_m", "drive"), COLUMNS)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.descent import minimise
-from benchmarks.common.tables import Columns, head, line, pick, report
+from benchmarks.common.tables import head, line, pick, records, report, write_table
 from benchmarks.outliers.filters import UPDATES, known, learned, lstm
 from benchmarks.outliers.task import SHARE, SKIP, best, recordings
 from torch_denkf import Filter
@@ -26,12 +26,7 @@ from torch_denkf.objectives import DEnKFLoss, GaussianLoss
 SCALE = [0.02, 0.1]  # m, m/s: about the standard deviation of what is known at best
 HALF = NormalDist().inv_cdf(0.95)
 SCORES = ("rmse_x", "rmse_v", "crps_x", "crps_v", "held")
-COLUMNS = Columns(
-    names=("model", "filter", "update", "draw", *SCORES, "ms"),
-    text=("model", "filter", "update"),
-    whole=("draw",),
-    order=lambda row: (row["model"], row["filter"], row["update"], row["draw"]),
-)
+KEYS = ("model", "filter", "update", "draw")
 
 
 @dataclass(frozen=True)
@@ -155,13 +150,13 @@ def main() -> None:
         study = replace(study, out=None, runs=2, particles=500, training=4, draws=1, trainings=1, updates=(2, 2))
     torch.set_num_threads(1)
     file = None if study.out is None else study.out / "outliers.csv"
-    rows = COLUMNS.read(file) if file is not None and file.exists() else []
-    rows = [{**dict.fromkeys(COLUMNS.text, ""), **row} for row in rows]  # what is empty is not read
-    there = {tuple(row[name] for name in COLUMNS.names[:4]) for row in rows}
+    found = [] if file is None else records(file)
+    rows = [{**dict.fromkeys(KEYS, ""), **row} for row in found]  # what is empty is not read
+    there = {tuple(row[key] for key in KEYS) for row in rows}
     for name, job in planned(study, recordings(study.runs, 0)).items():
         if name not in there:
-            rows.append({**dict(zip(COLUMNS.names, name, strict=False)), **job()})
+            rows.append({**dict(zip(KEYS, name, strict=True)), **job()})
             print(rows[-1], flush=True)
             if file is not None:
-                COLUMNS.write(rows, file)
-    report(study.out, COLUMNS, rows, page(rows, study), "outliers")
+                write_table(rows, file, KEYS)
+    report(study.out, rows, page(rows, study), "outliers", KEYS)

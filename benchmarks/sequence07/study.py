@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.common.arguments import made_by, parse
-from benchmarks.common.tables import Columns, head, line, report
+from benchmarks.common.tables import head, line, report
 from benchmarks.sequence07.filters import BIAS, POSE, SPACE, car_filter, pose_of, prepared
 from benchmarks.sequence07.pictures import draw
 from benchmarks.sequence07.task import CONDITIONS, ROWS, chained, naive, readings, truth
@@ -30,12 +30,6 @@ HELD = tuple(f"held_{step}" for step in STEPS)
 DRAWS = 5  # of an ensemble
 SPREADS = ("translation_spread", "rotation_spread")  # standard deviation over draws
 SCORES = ("translation", "rotation", *HELD, "ms", *SPREADS)
-COLUMNS = Columns(
-    names=("condition", "filter", *SCORES),
-    text=("condition", "filter"),
-    whole=(),
-    order=lambda row: 0,  # as they were made
-)
 
 
 @dataclass(frozen=True)
@@ -231,6 +225,6 @@ def main() -> None:
             paths[row["condition"], row["filter"]], claims[row["condition"], row["filter"]] = path, claim
     for row in rows:
         print({key: f"{value:.3g}" if isinstance(value, float) else value for key, value in row.items()}, flush=True)
-    report(study.out, COLUMNS, rows, page(rows, count), "sequence07")
+    report(study.out, rows, page(rows, count), "sequence07")
     if study.out is not None:
         draw(paths, claims, poses, STEPS, study.out / "sequence07.png")

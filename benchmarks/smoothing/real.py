@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.common.arguments import made_by
-from benchmarks.common.tables import Columns, head, line
+from benchmarks.common.tables import head, line
 from benchmarks.smoothing import gaussian
 from benchmarks.smoothing.gaussian import Series
 from benchmarks.smoothing.recordings import Group, Task, tasks
@@ -20,15 +20,10 @@ from torch_denkf.smoothers import EnKS, EnRTS, RTSSmoother
 
 LAG = 10
 SENSOR = ("rmse_sensor", "sensor_error_acf1", "sensor_error_acf10")  # size, and correlation 1 and LAG steps later
-COLUMNS = Columns(
-    names=(
-        *("task", "group", "recording", "quantity", "method", "members", "lag", "draws"),
-        *("rmse_filter", "rmse_smoother"),
-        *SENSOR,
-    ),
-    text=("task", "group", "recording", "quantity", "method"),
-    whole=("members", "lag", "draws"),
-    order=lambda row: tuple(str(row.get(key, "")) for key in COLUMNS.names[:6]),
+COLUMNS = (
+    *("task", "group", "recording", "quantity", "method", "members", "lag", "draws"),
+    *("rmse_filter", "rmse_smoother"),
+    *SENSOR,
 )
 BELIEF, SMOOTHED = ("belief", "mean"), ("smoothed", "mean")
 
@@ -156,7 +151,7 @@ def page(rows: Sequence[dict]) -> str:
         "",
         *head("task", "recordings", "quantity", "method", "members", "filter", "smoother", "less"),
     ]
-    table, keys = pd.DataFrame(rows, columns=COLUMNS.names), ["task", "group", "quantity", "method", "members"]
+    table, keys = pd.DataFrame(rows, columns=COLUMNS), ["task", "group", "quantity", "method", "members"]
     table["less"] = 1 - table["rmse_smoother"] / table["rmse_filter"]
     means = table.groupby(keys, sort=False, dropna=False)[["rmse_filter", "rmse_smoother", "less", *SENSOR]].mean()
     for row in means.reset_index().itertuples():

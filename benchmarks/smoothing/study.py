@@ -12,17 +12,12 @@ import pandas as pd
 
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.jobs import compute
-from benchmarks.common.tables import Columns, head, line, report
+from benchmarks.common.tables import head, line, report
 from benchmarks.smoothing import against_dapper, ours, real
 from benchmarks.smoothing.cases import CASES
 
 ERRORS = ("rmse_filter", "rmse_smoother", "dapper_rmse_filter", "dapper_rmse_smoother")
-COLUMNS = Columns(
-    names=("system", "method", "lag", "seed", *ERRORS),
-    text=("system", "method"),
-    whole=("lag", "seed"),
-    order=lambda row: (row["system"], row["method"], row.get("lag", 1000), row["seed"]),
-)
+COLUMNS = ("system", "method", "lag", "seed", *ERRORS)
 
 
 @dataclass(frozen=True)
@@ -50,7 +45,7 @@ def page(rows: Sequence[dict], study: Study) -> str:
         "",
         *head("system", "method", "lag", "members", "filter", "smoother", "DAPPER's", "DAPPER's smoother"),
     ]
-    table = pd.DataFrame(rows, columns=COLUMNS.names)
+    table = pd.DataFrame(rows, columns=COLUMNS)
     for case in CASES:
         lag = table["lag"].isna() if case.lag is None else table["lag"] == case.lag
         found = table.loc[lag & (table["system"] == case.system) & (table["method"] == case.method), list(ERRORS)]
@@ -74,7 +69,7 @@ def main() -> None:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="smoothing-")), cycles=26, seeds=2)
     if study.real:
         rows = compute(real.jobs(study.root, study.out, study.smoke), study.processes, "smoothing")
-        report(study.out, real.COLUMNS, rows, real.page(rows), "smoothing_real")
+        report(study.out, rows, real.page(rows), "smoothing_real", real.COLUMNS[:6], real.COLUMNS)
         return
     seeds, parts = list(range(study.seeds)), study.out / "parts"
     jobs: dict[Path, partial] = {
@@ -86,7 +81,7 @@ def main() -> None:
                 file = parts / f"{case.name}-dapper-{seed}.json"
                 jobs[file] = partial(against_dapper.rows, case, seed, study.cycles)
     rows = joined(compute(jobs, study.processes, "smoothing"))
-    report(study.out, COLUMNS, rows, page(rows, study), "smoothing")
+    report(study.out, rows, page(rows, study), "smoothing", COLUMNS[:4], COLUMNS)
 
 
 def joined(rows: Sequence[dict]) -> list[dict]:

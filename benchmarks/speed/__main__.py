@@ -30,9 +30,8 @@ PAIRS = (
     "packaged_step",
     "one_row",
     "log_of_attitude",
-    "training_step",  # and these are commands of their own
-    "transform_cost",
-    "scaling",
+    "training_step",
+    "transform_cost",  # which is a command of its own, too
 )
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 #: How many processes, one after the other, measure a pair: a ratio that jumps from run to run is their median.
@@ -100,13 +99,12 @@ def measured(name: str, seconds: float) -> list[dict]:
 
 
 def smoke() -> None:
-    """The commands of their own, tiny, and a pair that needs no other package."""
-    from benchmarks.speed import against_textbook, scaling, training_step, transform_cost
+    """Pairs that need no other package, tiny."""
+    from benchmarks.speed import against_textbook, training_step, transform_cost
 
-    for options in (scaling.Scaling, training_step.TrainingStep, transform_cost.TransformCost):
-        options(smoke=True)()
+    transform_cost.TransformCost(smoke=True)()
     os.environ["SPEED_COMPILE"] = "0"
-    for row in against_textbook.rows(0.1):
+    for row in (*training_step.rows(0.1, 1, 2, 2), *against_textbook.rows(0.1)):
         print(row)
 
 

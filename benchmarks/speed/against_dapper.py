@@ -11,8 +11,9 @@ import torch
 
 from benchmarks.common.lorenz96 import lorenz96_step
 from benchmarks.speed.pairs import Row, against
-from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.functional import analyse
 from torch_denkf.functional.inflation import inflate
+from torch_denkf.functional.moments import ensemble_mean, ensemble_var
 
 CYCLES, SETTLED = 400, 100  # the error is averaged over the cycles after these
 SCHEMES = {"perturbed": ("PertObs", 40, 1.06), "sakov": ("DEnKF", 40, 1.01)}

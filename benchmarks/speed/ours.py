@@ -10,7 +10,8 @@ from torch import Tensor
 
 from benchmarks.speed.workload import MEMBERS, STEPS, make_filter, make_frames, start
 from torch_denkf.filters import DEnKF, Filter
-from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.functional import analyse
+from torch_denkf.functional.moments import ensemble_mean, ensemble_var
 
 #: Steps in one compiled graph.
 CHUNK = 20

@@ -19,7 +19,7 @@ from benchmarks.ur5.recipes import UR5Recipe
 from benchmarks.ur5.sensors import MEMBERS
 from benchmarks.ur5.study import Base, Study, members_of, sensor_rows, size_row, trained
 from benchmarks.ur5.training import INFLATIONS, with_missing
-from torch_denkf.training import choose_for_coverage
+from torch_denkf.training import choose
 
 SCHEMES = ("sensor", "perturbed", "sakov")  # of the DEnKF's update; "etkf" takes no localisation
 SHOWN = 3.0  # degrees, in the picture
@@ -64,7 +64,8 @@ def _inflation(base: Base, recipe: UR5Recipe, saved: dict) -> float:
     """Chooses the inflation of a recipe's update, by the validation demos' coverage."""
     model, readings = read_filter(recipe, recipe.build(), saved), with_missing(recipe, base.codes("validation"))
     apply = partial(recipe.set_inflation, model)
-    return choose_for_coverage(INFLATIONS, apply, lambda: coverage(run_filter(recipe, model, readings)))
+    off = lambda: float((coverage(run_filter(recipe, model, readings)) - 0.9).abs().sum())  # noqa: E731
+    return choose(INFLATIONS, apply, off)
 
 
 def members(study: Study) -> list[Path]:

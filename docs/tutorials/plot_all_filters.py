@@ -23,7 +23,7 @@ from tensordict import TensorDict
 
 from torch_denkf.baselines import BackpropKF, LSTMFilter
 from torch_denkf.filters import DPF, EKF, UKF, DEnKF, KalmanFilter, ParticleFilter
-from torch_denkf.functional import crps_ensemble, crps_gaussian, crps_weighted
+from torch_denkf.functional import crps_ensemble, crps_gaussian
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
@@ -34,7 +34,6 @@ from torch_denkf.modules import (
     LocalEnsembleAnalysis,
     MomentPrior,
     NoisyTransition,
-    as_process_noise,
 )
 from torch_denkf.objectives import GaussianLoss, MixtureLoss
 
@@ -90,7 +89,7 @@ def ensemble(analysis) -> DEnKF:
 likelihood = LearnedLikelihood(
     1, 1, num_cells=(32, 32), encoding_key="reading", observation_key="reading", scale=[NOISE]
 )
-windy = NoisyTransition(motion, as_process_noise(wind, particles))
+windy = NoisyTransition(motion, wind)
 filters = {
     "KalmanFilter, at rest": KalmanFilter(
         at_rest,
@@ -148,7 +147,7 @@ def crps(out: TensorDict) -> torch.Tensor:
     """Of the belief, whatever it is made of, ``[*B, 2]``."""
     belief, truth, names = out["belief"], out["state"], set(out["belief"].keys())
     if "log_weight" in names:
-        return crps_weighted(belief["ensemble"], belief["log_weight"], truth)
+        return crps_ensemble(belief["ensemble"], truth, belief["log_weight"])
     if "ensemble" in names:
         return crps_ensemble(belief["ensemble"], truth)
     return crps_gaussian(belief["mean"], belief["var"], truth)
@@ -193,6 +192,6 @@ plt.show()
 # a smooth motion, a belief with one bump                  ``EKF`` or ``UKF``
 # a network for motion or sensor, images, many components  ``DEnKF``; ``"etkf"`` for readings used as they are
 # a field of thousands of components                       ``DEnKF`` with ``LocalEnsembleAnalysis``
-# beliefs with several bumps, few dimensions               ``ParticleFilter``; its learned kin ``DPF`` and ``PFM``
+# beliefs with several bumps, few dimensions               ``ParticleFilter``, or the learned ``DPF``
 # no idea of the motion, many recordings                   ``LSTMFilter``, as a rival
 # =======================================================  =========================================================

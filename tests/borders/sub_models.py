@@ -18,9 +18,10 @@ from benchmarks.reliability.target import Subject, Target, targets_of
 from tests.borders.filters_made import EYE, IMAGE_SHAPE, SIGMA
 from torch_denkf import modules as m
 from torch_denkf._arguments import _signature
-from torch_denkf.applications.car import FlowSensor, UnicycleMotion, UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car import FlowSensor, UnicycleMotion, UnicycleTransition
 from torch_denkf.applications.car.modules.member_gain import MemberGain
 from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, with_history
+from torch_denkf.applications.car.modules.unicycle_noise import UnicycleNoise
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.baselines.lstm_cell import LSTMUpdate, with_memory
 from torch_denkf.functional.manifolds import SE2

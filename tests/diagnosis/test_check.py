@@ -6,7 +6,8 @@ from tensordict.nn import TensorDictSequential
 from torch import nn
 
 from torch_denkf.diagnosis import check_analysis
-from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.functional import analyse
+from torch_denkf.functional.moments import ensemble_mean, ensemble_var
 from torch_denkf.modules import (
     EKFAnalysis,
     EnsembleAnalysis,

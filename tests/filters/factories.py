@@ -6,7 +6,8 @@ from torch import nn
 
 from torch_denkf.compilation import need_compiler
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter
-from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.functional import analyse
+from torch_denkf.functional.moments import ensemble_mean, ensemble_var
 from torch_denkf.modules import EnsembleAnalysis, GaussianPrior, Initial, StochasticMLP, Transition, Update
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation

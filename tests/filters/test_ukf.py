@@ -7,8 +7,9 @@ from torch import nn
 
 from tests.filters.factories import assert_equal, linear_kalman
 from tests.filters.gaussian_for_tests import BELIEF, INFO, linear_filter, linear_frames
-from torch_denkf.applications.car import UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation
+from torch_denkf.applications.car.modules.unicycle_noise import UnicycleNoise
 from torch_denkf.filters import UKF
 from torch_denkf.modules import CholeskyNoise, ConstantNoise, GaussianAround, Select, StochasticMLP
 

@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from tests.functional.checks import assert_compiled_is_eager, assert_raises
-from torch_denkf.functional import analyse, crps_ensemble, energy_score, ensemble_mean, kalman_predict, kalman_update
+from torch_denkf.functional import analyse, crps_ensemble, kalman_predict, kalman_update
 from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
-from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.moments import ensemble_cov, ensemble_mean
+from torch_denkf.functional.scores import energy_score
 
 SCHEMES = ["sensor", "perturbed", "etkf", "sakov"]
 SPACES = ["observation", "ensemble"]

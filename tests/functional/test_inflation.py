@@ -5,9 +5,8 @@ from functools import partial
 import pytest
 import torch
 
-from torch_denkf.functional import ensemble_mean
 from torch_denkf.functional.inflation import random_rotation, relax_to_prior_spread
-from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.moments import ensemble_cov, ensemble_mean
 
 # Few operations on numbers of size 1 in double precision.
 EXACT = {"rtol": 1e-12, "atol": 1e-12}

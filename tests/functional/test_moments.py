@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.functional.moments import ensemble_anomalies, ensemble_cov
+from torch_denkf.functional.moments import ensemble_anomalies, ensemble_cov, ensemble_mean, ensemble_var
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])

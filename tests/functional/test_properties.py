@@ -11,9 +11,6 @@ from torch_denkf.functional import (
     analyse,
     crps_ensemble,
     crps_gaussian,
-    energy_score,
-    ensemble_mean,
-    ensemble_var,
     kalman_predict,
     kalman_update,
     sigma_points,
@@ -21,7 +18,8 @@ from torch_denkf.functional import (
 )
 from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.functional.inflation import inflate, relax_to_prior_spread
-from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.moments import ensemble_cov, ensemble_mean, ensemble_var
+from torch_denkf.functional.scores import energy_score
 from torch_denkf.functional.unscented import unscented_moments, unscented_weights
 from torch_denkf.functional.weighted import weighted_mean
 

@@ -7,14 +7,8 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
-from torch_denkf.functional import (
-    crps_ensemble,
-    crps_weighted,
-    ensemble_var,
-    soft_resample,
-    systematic_resample,
-    transport_resample,
-)
+from torch_denkf.functional import crps_ensemble, soft_resample, systematic_resample, transport_resample
+from torch_denkf.functional.moments import ensemble_var
 from torch_denkf.functional.resampling import effective_sample_size, jitter_copies
 from torch_denkf.functional.weighted import weighted_mean, weighted_median, weighted_var
 
@@ -63,7 +57,7 @@ def test_crps_of_rational_weights_is_that_of_repeated_particles(batch):
     repeated = particles.repeat_interleave(counts, -2)
     log_weights = (counts / 8).log().expand(*batch, 4)
     expected = crps_ensemble(repeated, target, fair=False)
-    torch.testing.assert_close(crps_weighted(particles, log_weights, target), expected)
+    torch.testing.assert_close(crps_ensemble(particles, target, log_weights), expected)
 
 
 # ------------------------------------------------------------------------------------------------ each scheme
@@ -156,7 +150,7 @@ def test_no_gradient_through_hard_resampling():
 
 NORMAL = torch.randn(2, 4, S, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 DERIVED = {
-    "weighted CRPS": lambda x, w: crps_weighted(x, w, NORMAL[:, 0]),
+    "weighted CRPS": lambda x, w: crps_ensemble(x, NORMAL[:, 0], w),
     "transport": lambda x, w: transport_resample(x, w, epsilon=0.3, iterations=10)[0],
     "jitter": lambda x, w: jitter_copies(x[:, [0, 0, 1, 3]], x, w, NORMAL, factor=0.8),
 }

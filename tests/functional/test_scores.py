@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from torch_denkf.functional import crps_ensemble, crps_gaussian, energy_score
+from torch_denkf.functional import crps_ensemble, crps_gaussian
+from torch_denkf.functional.scores import energy_score
 
 BATCHES = [(), (3,), (2, 3)]
 # Sums of a few dozen numbers of size 1 in double precision.

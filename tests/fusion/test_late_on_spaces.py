@@ -21,7 +21,8 @@ from tests.filters.test_spaces import (
 from tests.smoothers.small_angles import PROCESS, SMALL, STARTS, assert_small_differences, linear, readings, rotating
 from torch_denkf.functional.manifolds import SO3
 from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
-from torch_denkf.modules import EKFTransition, GaussianAround, UKFTransition, as_process_noise
+from torch_denkf.modules import EKFTransition, GaussianAround, UKFTransition
+from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.monitoring import Gated
 
 DELAY = 3
@@ -36,7 +37,7 @@ def _double(float64):
 def fused(kind, parts, std, q, r, *, space=None, reading_space=None, **sensor):
     """A filter of one sensor."""
     start = GaussianAround(std, state_key="start", space=space)
-    motion = TRANSITIONS[kind](parts[0], as_process_noise(q, start), space=space)
+    motion = TRANSITIONS[kind](parts[0], as_process_noise(q, start.state_dim), space=space)
     sensor = {"observed_key": "observed", "reading_space": reading_space, "delay": DELAY, **sensor}
     return FusedFilter(motion, {"pose": FusedSensor(parts[2], r, **sensor)}, initial=start)
 

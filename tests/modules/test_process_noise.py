@@ -6,7 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.applications.car import UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car import UnicycleTransition
+from torch_denkf.applications.car.modules.unicycle_noise import UnicycleNoise
 from torch_denkf.modules import CholeskyNoise, ConstantNoise, MappedNoise
 
 FORECAST = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}

@@ -9,7 +9,8 @@ from torch import nn
 
 from tests.filters.gaussian_for_tests import directional_check
 from tests.functional.checks import assert_raises
-from torch_denkf.applications.car import UnicycleMotion, UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
+from torch_denkf.applications.car.modules.unicycle_noise import UnicycleNoise
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.modules import ConstantNoise, LearnedTransition, StochasticMLP
 

@@ -6,7 +6,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from tests.filters.factories import linear_denkf
-from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.functional import analyse
+from torch_denkf.functional.moments import ensemble_mean, ensemble_var
 from torch_denkf.imperfect import RejectReadings
 from torch_denkf.modules import EnsembleAnalysis, Update
 from torch_denkf.monitoring import Gated

@@ -5,7 +5,8 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
-from torch_denkf.applications.car import UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car import UnicycleTransition
+from torch_denkf.applications.car.modules.unicycle_noise import UnicycleNoise
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional import kalman_predict, kalman_update
 from torch_denkf.fusion import FusedFilter, FusedSensor

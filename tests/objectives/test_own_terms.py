@@ -7,7 +7,8 @@ from torch import nn
 from tests.filters.factories import S, linear_kalman, toy_denkf
 from tests.objectives.denkf_for_tests import CLOSE
 from tests.objectives.problem_for_tests import problem, stepped
-from torch_denkf.objectives import DEnKFLoss, FilterLoss, GaussianLoss, MixtureLoss, Term
+from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, Term
+from torch_denkf.objectives.filter_loss import FilterLoss
 
 
 class Absolute(Term):

@@ -5,9 +5,7 @@ from contextlib import nullcontext
 import pytest
 import torch
 
-from torch_denkf.metrics import interval_coverage
-from torch_denkf.modules import EnsembleAnalysis
-from torch_denkf.training import choose, choose_for_coverage, hold_last
+from torch_denkf.training import choose, hold_last
 
 # ------------------------------------------------------------------------------------------------------- one number
 
@@ -28,28 +26,6 @@ def test_a_setting_that_fails_never_wins():
         choose([1.0, 2.0], tried.append, lambda: float("nan") if tried[-1] == 1.0 else float("inf"))
     with pytest.raises(ValueError, match="none of the candidates"):
         choose([], tried.append, lambda: 0.0)
-
-
-@pytest.mark.parametrize("spread", [0.5, 1.0, 1.25])
-def test_the_factor_that_a_gaussian_was_made_with_is_found(spread):
-    truth = spread * torch.randn(20_000, 2)
-    analysis = EnsembleAnalysis("sensor")
-
-    def coverage():
-        variance = torch.full_like(truth, analysis.inflation**2)
-        return interval_coverage(torch.zeros_like(truth), variance, truth, level=0.9)
-
-    candidates = [0.5, 0.75, 1.0, 1.25, 1.5]
-    assert choose_for_coverage(candidates, lambda factor: setattr(analysis, "inflation", factor), coverage) == spread
-    assert analysis.inflation == spread
-
-
-def test_distances_of_all_dimensions_count():
-    """0.9 on average, but from 0.8 and 1.0: further off than 0.88 in both."""
-    covered = {1.0: torch.tensor([0.8, 1.0]), 2.0: torch.tensor([0.88, 0.88])}
-    now = []
-    assert choose_for_coverage([1.0, 2.0], now.append, lambda: covered[now[-1]]) == 2.0
-    assert choose_for_coverage([1.0, 2.0], now.append, lambda: covered[now[-1]].mean()) == 1.0
 
 
 # -------------------------------------------------------------------------------------------------------- hold last

@@ -10,9 +10,9 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torch_denkf.functional import ensemble_mean, kalman_update
+from torch_denkf.functional import kalman_update
 from torch_denkf.functional.gaussian import GaussianUpdate
-from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.moments import ensemble_cov, ensemble_mean
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.running import in_sequences, random_parts, reads
 from torch_denkf.submodel import Update, role

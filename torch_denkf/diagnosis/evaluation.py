@@ -11,7 +11,7 @@ from torch import Tensor
 from torch_denkf.beliefs import Ensemble, Particles, kinds_of
 from torch_denkf.diagnosis.errors import entry_of
 from torch_denkf.filters import Filter
-from torch_denkf.functional import crps_ensemble, crps_gaussian, crps_weighted
+from torch_denkf.functional import crps_ensemble, crps_gaussian
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.metrics.calibration import ensemble_interval_coverage, interval_coverage
 from torch_denkf.metrics.consistency import NEES, nees
@@ -119,7 +119,7 @@ def evaluate(
         covered = ensemble_interval_coverage(members, truth, level=level, space=space)
         crps, cov = crps_ensemble(away, error), ensemble_cov(away) if away.shape[-2] > len(dims) else None
     elif isinstance(kind, Particles):
-        crps = crps_weighted(away, held["log_weight"], error)
+        crps = crps_ensemble(away, error, held["log_weight"])
         cov = away.mT @ (held["log_weight"].exp().unsqueeze(-1) * away)
     else:
         crps = crps_gaussian(torch.zeros_like(error), var, error)

@@ -14,7 +14,7 @@ from torch_denkf.filters.parts import FilterParts, ReadingOptions
 from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
 
-__all__ = ["DPF", "PFM", "MixtureParticleFilter", "ParticleFilter"]
+__all__ = ["DPF", "MixtureParticleFilter", "ParticleFilter"]
 
 
 class ParticleFilter(Filter):
@@ -248,7 +248,3 @@ class MixtureParticleFilter(ParticleFilter):
             initial=initial,
             **kwargs,
         )
-
-
-#: The short name.
-PFM = MixtureParticleFilter

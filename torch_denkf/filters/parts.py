@@ -119,7 +119,8 @@ class FilterParts:
                 check_module(name, module)
         check_kind("visibility", visibility)
         check_kind("sensor_error", sensor_error)
-        q = None if process_noise is None else as_process_noise(process_noise, initial)
+        start = role(initial, Initial)
+        q = None if process_noise is None else as_process_noise(process_noise, start.state_dim)
         if sensor_error is not None:
             transition, observation, q, initial = sensor_error.augmented(
                 transition, observation, q, initial, reading_space

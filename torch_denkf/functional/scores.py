@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_ensemble, check_shape
+from torch_denkf.functional.weighted import check_particles
 
 
-def crps_ensemble(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Tensor:
+def crps_ensemble(ensemble: Tensor, target: Tensor, log_weights: Tensor | None = None, *, fair: bool = True) -> Tensor:
     """Continuous ranked probability score of each component: ``E|x − y| − 1/2 E|x − x'|``.
 
     Sorting makes the double sum over pairs a single one: O(E log E) time, O(E) memory.
@@ -22,6 +23,8 @@ def crps_ensemble(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Ten
     Args:
         ensemble: X, ``[*B, E, S]``, in the state's units.
         target: the truth y, ``[*B, S]``, in the state's units.
+        log_weights: of weighted particles, normalised, ``[*B, E]``: the score is that of the weighted empirical
+            distribution, ``Σ wⁱ|xⁱ − y| − 1/2 Σ Σ wⁱwʲ|xⁱ − xʲ|``, for which ``fair`` has no meaning.
         fair: average ``|x − x'|`` over the E (E − 1) pairs of different members, which makes the score an
             unbiased estimate of that of the distribution they come from; otherwise over all E², which is
             the score of the empirical distribution.
@@ -30,16 +33,23 @@ def crps_ensemble(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Ten
         The scores, ``[*B, S]``, in the state's units.
 
     Raises:
-        ValueError: if the shapes do not fit, or if ``fair`` and there are fewer than two members.
+        ValueError: if the shapes do not fit, or if ``fair`` and there are fewer than two members without weights.
 
     Examples:
         >>> import torch
         >>> crps_ensemble(torch.tensor([[0.0], [2.0]]), torch.tensor([1.0]), fair=False)
         tensor([0.5000])
+        >>> crps_ensemble(torch.tensor([[0.0], [2.0]]), torch.tensor([0.0]), torch.tensor([0.75, 0.25]).log())
+        tensor([0.1250])
     """
-    size = _check(ensemble, target, fair)
+    size = _check(ensemble, target, fair and log_weights is None)
     # Differences to the target before sorting: no digits are lost where the mean dwarfs the spread.
-    error = (ensemble - target.unsqueeze(-2)).sort(-2).values
+    error, order = (ensemble - target.unsqueeze(-2)).sort(-2)
+    if log_weights is not None:
+        check_particles(ensemble, log_weights)
+        weight = log_weights.exp().unsqueeze(-1).expand_as(error).gather(-2, order)
+        below = weight.cumsum(-2)  # the weight of all that is not above, itself included
+        return (weight * (error.abs() - (2 * below - weight - 1) * error)).sum(-2)
     rank = torch.arange(size, dtype=error.dtype, device=error.device)
     weights = (2 * rank - (size - 1)) / (size * (size - 1 if fair else size))
     return error.abs().mean(-2) - weights @ error
@@ -82,6 +92,8 @@ def energy_score(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Tens
     Args:
         ensemble: X, ``[*B, E, S]``.
         target: the truth y, ``[*B, S]``.
+        log_weights: of weighted particles, normalised, ``[*B, E]``: the score is that of the weighted empirical
+            distribution, ``Σ wⁱ|xⁱ − y| − 1/2 Σ Σ wⁱwʲ|xⁱ − xʲ|``, for which ``fair`` has no meaning.
         fair: average over pairs of different members, as in :func:`crps_ensemble`.
 
     Returns:

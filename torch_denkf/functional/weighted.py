@@ -1,4 +1,4 @@
-"""Moments and the CRPS of weighted particles: the ensemble's, where each member counts with its own weight."""
+"""Moments of weighted particles: the ensemble's, where each member counts with its own weight."""
 
 from __future__ import annotations
 
@@ -125,37 +125,6 @@ def weighted_innovation(
     spread = (anomalies * log_weights.exp().unsqueeze(-1)).mT @ anomalies * (size / (size - 1))
     _, nis, log_det = solve_for_gain(spread + noise.diag_embed(), innovation.unsqueeze(-1), innovation)
     return innovation, nis, log_det
-
-
-def crps_weighted(particles: Tensor, log_weights: Tensor, target: Tensor) -> Tensor:
-    """Continuous ranked probability score of weighted particles: Σ wⁱ|xⁱ − y| − 1/2 Σ Σ wⁱwʲ|xⁱ − xʲ|.
-
-    It is the score of the weighted empirical distribution (Gneiting & Raftery 2007, eq. 21), for equal weights
-    ``crps_ensemble(..., fair=False)``; weights leave no fair variant. Sorting makes it O(E log E).
-
-    Args:
-        particles: X, ``[*B, E, S]``, in the state's units.
-        log_weights: log wⁱ, normalised, ``[*B, E]``.
-        target: the truth y, ``[*B, S]``, in the state's units.
-
-    Returns:
-        The scores, ``[*B, S]``, in the state's units.
-
-    Raises:
-        ValueError: if the shapes do not fit.
-
-    Examples:
-        >>> import torch
-        >>> crps_weighted(torch.tensor([[0.0], [2.0]]), torch.tensor([0.75, 0.25]).log(), torch.tensor([0.0]))
-        tensor([0.1250])
-    """
-    check_particles(particles, log_weights)
-    check_shape("target", target, (*particles.shape[:-2], particles.shape[-1]), "[*B, S]")
-    # Differences to the target before sorting: no digits are lost where the mean dwarfs the spread.
-    error, order = (particles - target.unsqueeze(-2)).sort(-2)
-    weight = log_weights.exp().unsqueeze(-1).expand_as(error).gather(-2, order)
-    below = weight.cumsum(-2)  # the weight of all that is not above, itself included
-    return (weight * (error.abs() - (2 * below - weight - 1) * error)).sum(-2)
 
 
 def check_particles(particles: Tensor, log_weights: Tensor, min_size: int = 1) -> None:

@@ -28,10 +28,10 @@ from torch_denkf.modules import (
     NoisyTransition,
     UKFAnalysis,
     UKFTransition,
-    as_process_noise,
 )
 from torch_denkf.modules.ensemble import EnsembleUpdate
 from torch_denkf.modules.gaussian import GaussianAnalysis, GaussianTransition
+from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.running import check_module, writes
 from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, with_past
 from torch_denkf.smoothers.past_moments import CrossTransition
@@ -249,7 +249,8 @@ def _moving(transition, process_noise, initial, gaussian):
     """Returns the transition with its process noise."""
     if process_noise is None:
         return transition
-    noise, space = as_process_noise(process_noise, initial), role(initial, Initial).space
+    start = role(initial, Initial)
+    noise, space = as_process_noise(process_noise, start.state_dim), start.space
     made = EKFTransition if gaussian else NoisyTransition
     return made(transition, noise, space=space)
 

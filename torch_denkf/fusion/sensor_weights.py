@@ -10,9 +10,9 @@ from tensordict import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.functional.manifolds import Space
+from torch_denkf.functional.moments import ensemble_mean, ensemble_var
 from torch_denkf.fusion.parts import StateObservation
 from torch_denkf.modules.spaces import narrowed_mask
 from torch_denkf.modules.tensors import mean_of_members

@@ -171,7 +171,8 @@ class FadingBias(nn.Module):
         Raises:
             ValueError: if the state or the reading lives in a space of other than numbers and angles.
         """
-        space = role(initial, Initial).space
+        start = role(initial, Initial)
+        space = start.space
         if space is not None:
             raise ValueError(
                 f"sensor_error is for states of plain numbers, not for {space}: put the biases into the state, "
@@ -182,7 +183,7 @@ class FadingBias(nn.Module):
                 f"sensor_error is added to readings of numbers and angles, not to points of {reading_space}."
             )
         nothing = torch.zeros_like(self.std[0]).detach()
-        of_state = as_process_noise(nothing if process_noise is None else process_noise, initial)
+        of_state = as_process_noise(nothing if process_noise is None else process_noise, start.state_dim)
         return (
             BiasedTransition(transition, self),
             BiasedObservation(observation, self),

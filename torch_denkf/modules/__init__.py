@@ -14,7 +14,7 @@ from torch_denkf.modules.local_analysis import LocalEnsembleAnalysis
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise, ScaledNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
-from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise, as_process_noise
+from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
 from torch_denkf.modules.stochastic import StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
@@ -51,7 +51,6 @@ __all__ = [
     "GaussianAround",
     "CholeskyNoise",
     "MappedNoise",
-    "as_process_noise",
     "EKFTransition",
     "EKFAnalysis",
     "UKFTransition",

@@ -8,11 +8,11 @@ from typing import Any, Literal, Unpack
 import torch
 
 from torch_denkf._checks import check_choice, check_values
-from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.functional import analyse
 from torch_denkf.functional.draws import exact_draws, is_exact
 from torch_denkf.functional.inflation import inflate, relax_to_prior_spread
 from torch_denkf.functional.manifolds import Space, is_flat
-from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.moments import ensemble_cov, ensemble_mean, ensemble_var
 from torch_denkf.modules.ensemble import EnsembleOptions, EnsembleUpdate
 from torch_denkf.modules.spaces import mean_and_tangents
 from torch_denkf.modules.tensors import as_floating, check_dims

@@ -8,9 +8,10 @@ from typing import Any, Unpack
 import torch
 
 from torch_denkf._checks import check_count, check_values
-from torch_denkf.functional import ensemble_mean, ensemble_var, letkf, neighbours
+from torch_denkf.functional import letkf, neighbours
 from torch_denkf.functional.inflation import relax_to_prior_spread
 from torch_denkf.functional.localisation import Neighbours, neighbours_of_taper
+from torch_denkf.functional.moments import ensemble_mean, ensemble_var
 from torch_denkf.modules.ensemble import EnsembleOptions, EnsembleUpdate
 from torch_denkf.modules.tensors import check_untrained, mean_of_members
 

@@ -16,7 +16,7 @@ from torch_denkf.functional.linalg import as_covariance, semidefinite_root
 from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules.noise import ConstantNoise
-from torch_denkf.modules.process_noise import NoiseThrough
+from torch_denkf.modules.process_noise import NoiseThrough, as_process_noise
 from torch_denkf.modules.tensors import check_dims
 from torch_denkf.running import check_module, reads, run_module, runs_as_written
 from torch_denkf.submodel import Call, Entries, Transition
@@ -34,10 +34,10 @@ class NoisyTransition(Transition):
     Args:
         transition: forecasts an ensemble, ``("belief", "ensemble")`` to ``("forecast", "ensemble")``; its keys are
             kept.
-        noise: writes Q: variances ``[*B, N]`` or a covariance ``[*B, N, N]``, with N the number of ``dims``, e.g.
-            ``ConstantNoise([0.1, 0.0], in_key=("belief", "mean"), out_key=("forecast", "noise"))`` or a module of
-            :mod:`torch_denkf.modules.process_noise`. It may read the belief's (weighted) mean at ``mean_key`` and,
-            unless ``before``, the forecast's at ``forecast_mean_key``, which are worked out for it.
+        noise: standard deviations ``[N]``, with N the number of ``dims``, or a module that writes Q: variances
+            ``[*B, N]`` or a covariance ``[*B, N, N]``, see :mod:`torch_denkf.modules.process_noise`. It may read the
+            belief's (weighted) mean at ``mean_key`` and, unless ``before``, the forecast's at ``forecast_mean_key``,
+            which are worked out for it.
         dims: state dimensions that the noise acts on, in the order of Q; ``None`` for all.
         before: True adds the noise to the state *before* it moves. What moves with these dimensions then moves with
             their noise, such as the pose of a vehicle with its velocities.
@@ -58,9 +58,9 @@ class NoisyTransition(Transition):
 
     Example:
         >>> from tensordict import TensorDict
-        >>> from torch_denkf.modules import ConstantNoise, LearnedTransition
+        >>> from torch_denkf.modules import LearnedTransition
         >>> still = LearnedTransition(nn.Linear(2, 2))
-        >>> noisy = NoisyTransition(still, ConstantNoise([0.1], in_key=("belief", "ensemble")), dims=[1])
+        >>> noisy = NoisyTransition(still, [0.1], dims=[1])
         >>> td = TensorDict({("belief", "ensemble"): torch.zeros(100, 2)})
         >>> noisy(td)["forecast", "ensemble"].std(0) > 0.05
         tensor([False,  True])
@@ -71,7 +71,7 @@ class NoisyTransition(Transition):
     def __init__(
         self,
         transition: TensorDictModuleBase,
-        noise: TensorDictModuleBase,
+        noise: TensorDictModuleBase | Sequence[float] | torch.Tensor,
         dims: Sequence[int] | None = None,
         *,
         before: bool = False,
@@ -82,6 +82,7 @@ class NoisyTransition(Transition):
         draws: Literal["exact", "random"] = "exact",
     ):
         check_module("transition", transition)
+        noise = as_process_noise(noise, None if dims is None else len(dims), "noise")
         check_module("noise", noise)
         self_made = {unravel_key(mean_key), unravel_key(forecast_mean_key)}
         needed, optional = reads(transition)

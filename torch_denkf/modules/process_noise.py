@@ -26,7 +26,7 @@ from torch_denkf.modules.tensors import (
     register_matrix,
     variance_and_floor,
 )
-from torch_denkf.submodel import Call, Entries, Initial, SubModel, role
+from torch_denkf.submodel import Call, Entries, SubModel
 
 __all__ = ["CholeskyNoise", "MappedNoise", "NoiseThrough", "as_process_noise"]
 
@@ -34,34 +34,36 @@ _BELIEF_MEAN, _FORECAST_NOISE = ("belief", "mean"), ("forecast", "noise")
 
 
 def as_process_noise(
-    noise: TensorDictModuleBase | Sequence[float] | torch.Tensor | float, initial: TensorDictModuleBase
+    noise: TensorDictModuleBase | Sequence[float] | torch.Tensor | float,
+    size: int | None,
+    name: str = "process_noise",
 ) -> TensorDictModuleBase:
     """Returns a module that writes Q: the given one, or one of standard deviations ``[S]`` or one for all dimensions.
 
     Args:
         noise: the module, or standard deviations in the state's units; 0 for a dimension without noise.
-        initial: the initial belief, which knows S where ``noise`` is one number.
+        size: S, where it is known; needed where ``noise`` is one number.
+        name: of the argument, for messages.
 
     Raises:
         ValueError: if S is not known, or a standard deviation is negative.
 
     Example:
-        >>> from torch_denkf.modules import GaussianPrior
-        >>> q = as_process_noise(0.5, GaussianPrior([0.0, 0.0], [1.0, 1.0]))
+        >>> q = as_process_noise(0.5, 2)
         >>> from tensordict import TensorDict
         >>> q(TensorDict({("belief", "mean"): torch.zeros(2)}))["forecast", "noise"]
         tensor([0.2500, 0.2500])
     """
     if isinstance(noise, nn.Module):
         return noise
-    std, size = as_floating(noise, "process_noise"), role(initial, Initial).state_dim
-    check_values("process_noise, a standard deviation,", std, least=0)
+    std = as_floating(noise, name)
+    check_values(f"{name}, a standard deviation,", std, least=0)
     if std.ndim > 1 or (std.ndim == 1 and size is not None and len(std) != size):
         known = f"[S] = [{size}]" if size is not None else "[S]"
-        raise ValueError(f"process_noise must be {known}, a standard deviation for each; got {list(std.shape)}")
+        raise ValueError(f"{name} must be {known}, a standard deviation for each; got {list(std.shape)}")
     if std.ndim == 0:
         if size is None:
-            raise ValueError("process_noise is one number, and the initial belief does not say for how many: give [S].")
+            raise ValueError(f"{name} is one number, and the initial belief does not say for how many: give [S].")
         std = std.expand(size)
     return ConstantNoise(std, in_key=_BELIEF_MEAN, out_key=_FORECAST_NOISE)
 

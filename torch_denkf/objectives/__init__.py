@@ -1,12 +1,11 @@
 """Training objectives, torchrl loss modules: of whole filters, and of their parts alone."""
 
-from torch_denkf.objectives.filter_loss import FilterLoss, Term
+from torch_denkf.objectives.filter_loss import Term
 from torch_denkf.objectives.parts import ObservationLoss, SensorLoss, TransitionLoss
 from torch_denkf.objectives.whole import DEnKFLoss, GaussianLoss, MixtureLoss
 
 __all__ = [
     "DEnKFLoss",
-    "FilterLoss",
     "GaussianLoss",
     "MixtureLoss",
     "ObservationLoss",

@@ -12,9 +12,10 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf import beliefs
-from torch_denkf.functional import crps_ensemble, crps_gaussian, crps_weighted, energy_score
+from torch_denkf.functional import crps_ensemble, crps_gaussian
 from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.functional.linalg import as_covariance
+from torch_denkf.functional.scores import energy_score
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules import StochasticMLP
 from torch_denkf.objectives._labels import Labels, Targets, check_row_mask, mean_of
@@ -239,7 +240,7 @@ def score_mixture(
         The scores, ``[*]``.
     """
     if score == "crps":
-        return mean_of(crps_weighted(errors, log_weights, torch.zeros_like(errors[..., 0, :])), mask)
+        return mean_of(crps_ensemble(errors, torch.zeros_like(errors[..., 0, :]), log_weights), mask)
     # In the state's own units the density is one of the scaled state, divided by all scales.
     width = std if scale is None else std * scale
     constant = torch.where(mask, width.log() + 0.5 * math.log(2 * math.pi), 0).sum(-1)

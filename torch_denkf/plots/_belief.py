@@ -9,9 +9,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.moments import ensemble_cov, ensemble_mean, ensemble_var
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 
 TensorOrKey: TypeAlias = Tensor | NestedKey | None

@@ -1,6 +1,6 @@
 """Training of filters, in stages; then their one number."""
 
-from torch_denkf.training.calibration import choose, choose_for_coverage, hold_last
+from torch_denkf.training.calibration import choose, hold_last
 from torch_denkf.training.distributed import Processes
 from torch_denkf.training.kin import take_weights
 from torch_denkf.training.logs import RunLogs
@@ -13,7 +13,6 @@ __all__ = [
     "RunLogs",
     "Stage",
     "choose",
-    "choose_for_coverage",
     "hold_last",
     "take_weights",
 ]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-__all__ = ["choose", "choose_for_coverage", "hold_last"]
+__all__ = ["choose", "hold_last"]
 
 
 @torch.no_grad()
@@ -17,8 +17,9 @@ def choose(candidates: Sequence[float], apply: Callable[[float], object], error:
     Args:
         candidates: the values to try.
         apply: sets a value; it is called for each candidate, and at last with the best one.
-        error: what the setting costs on held-out data, lower is better. Draw its random numbers from the same seed
-            each time, so that candidates differ in nothing else.
+        error: what the setting costs on held-out data, lower is better, such as ``abs(coverage - 0.9)`` of
+            :func:`~torch_denkf.metrics.interval_coverage`. Draw its random numbers from the same seed each time, so
+            that candidates differ in nothing else.
 
     Returns:
         the best candidate, which is set; of equally good ones the first. An error of NaN never wins. A warning says
@@ -47,39 +48,6 @@ def choose(candidates: Sequence[float], apply: Callable[[float], object], error:
         warnings.warn(f"the best of {list(candidates)} is the last; candidates beyond it may be better", stacklevel=3)
     apply(best)
     return best
-
-
-def choose_for_coverage(
-    candidates: Sequence[float],
-    apply: Callable[[float], object],
-    coverage: Callable[[], torch.Tensor],
-    level: float = 0.9,
-) -> float:
-    """Chooses the setting with which a filter's intervals hold the share of the truth that they state.
-
-    Args:
-        candidates: values to try, e.g. of an inflation.
-        apply: sets a value, see :func:`choose`.
-        coverage: the share of held-out true values inside intervals of ``level``: ``[]``, or ``[D]`` for each
-            dimension (:func:`torch_denkf.metrics.interval_coverage`); their distances from ``level`` are added up.
-        level: of the intervals, between 0 and 1.
-
-    Returns:
-        the best candidate, which is set.
-
-    Raises:
-        ValueError: if ``level`` is not between 0 and 1, if there are no candidates, or none has a finite coverage.
-
-    Example:
-        >>> from torch_denkf.metrics import interval_coverage
-        >>> truth, variance = 2.0 * torch.randn(10_000, 1), torch.ones(10_000, 1)
-        >>> coverage = lambda: interval_coverage(torch.zeros(10_000, 1), variance, truth, level=0.9)
-        >>> choose_for_coverage([1.0, 4.0, 9.0], variance.fill_, coverage)
-        4.0
-    """
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"level is a share between 0 and 1; got {level}.")
-    return choose(candidates, apply, lambda: float((coverage() - level).abs().sum()))
 
 
 def hold_last(

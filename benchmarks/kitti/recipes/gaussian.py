@@ -8,8 +8,8 @@ import torch
 
 from benchmarks.kitti.recipes._base import KITTIRecipe, register
 from benchmarks.kitti.streams import LONGEST
-from torch_denkf.applications.car import UnicycleNoise
 from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition
+from torch_denkf.applications.car.modules.unicycle_noise import UnicycleNoise
 from torch_denkf.modules import (
     CholeskyNoise,
     DiagonalNoise,

@@ -6,7 +6,6 @@ from .kitti.replay import KITTIOdometryExperienceReplay
 from .metrics.odometry import dead_reckoning
 from .modules.flow_sensor import FlowSensor
 from .modules.unicycle import UnicycleMotion, UnicycleTransition
-from .modules.unicycle_noise import UnicycleNoise
 from .odometry.tracking import track
 from .optical_flow import OpticalFlow
 
@@ -16,7 +15,6 @@ __all__ = [
     "KITTIReplayEnv",
     "OpticalFlow",
     "UnicycleMotion",
-    "UnicycleNoise",
     "UnicycleTransition",
     "dead_reckoning",
     "read_kitti_drive",

@@ -20,7 +20,7 @@ from torch_denkf.functional import crps_ensemble
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.objectives import DEnKFLoss
 from torch_denkf.pretrained.folders import save_pretrained
-from torch_denkf.training import Stage, choose_for_coverage
+from torch_denkf.training import Stage, choose
 from torch_denkf.training.parts import train_part
 from torch_denkf.training.trainer import FilterTrainer
 
@@ -201,12 +201,12 @@ def _train_filter(
     stage = Stage("filter", loss, sample, updates, lr=4e-3, validate=error)
     FilterTrainer(behind, [stage], out=out, validate_every=max(updates // 6, 1), **trainer).fit()
 
-    def coverage() -> Tensor:
+    def from_level() -> float:
         out = _believe(behind, held_out)
         parts = (out["belief", "mean"], out["belief", "var"], out["state"])
-        return interval_coverage(*(part.flatten(0, 1) for part in parts), level=0.9).mean()
+        return abs(float(interval_coverage(*(part.flatten(0, 1) for part in parts), level=0.9).mean()) - 0.9)
 
-    choose_for_coverage(_INFLATIONS, lambda factor: setattr(model, "inflation", factor), coverage)
+    choose(_INFLATIONS, lambda factor: setattr(model, "inflation", factor), from_level)
 
 
 @torch.no_grad()

@@ -23,3 +23,17 @@ def test_factors_are_lognormal_quantiles_that_stay_with_their_members(float64):
         assert float(factor[0, :, dim].neg().exp().mean()) == pytest.approx(1.0, abs=1e-12)
     # Dimensions are shuffled apart: of 50 pairs, a correlation is 0 +- 0.14.
     assert abs(float(torch.corrcoef(factor[0].T)[0, 1])) < 0.42
+
+
+def test_an_offset_lasts_and_comes_once_for_each_step_of_a_pair(float64):
+    gain = MemberGain([1e-9, 1e-9], ensemble_size=32, offset_std=[0.0, 0.2], in_key="y")
+    samples, steps = torch.rand(3, 32, 2), torch.tensor([[1], [0], [3]])
+    with torch.no_grad():
+        once = gain(TensorDict({"y": samples}, [3]))["y"] - samples
+        out = gain(TensorDict({"y": samples, "steps": steps}, [3]))["y"] - samples
+    torch.testing.assert_close(out, steps.unsqueeze(-1) * once, rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(once[..., 0], torch.zeros(3, 32), rtol=0, atol=1e-7)
+    assert float(once[0, :, 1].mean()) == pytest.approx(0.0, abs=1e-8)
+    assert float(once[0, :, 1].std(correction=0)) == pytest.approx(0.2, rel=1e-6)
+    with pytest.raises(ValueError, match=r"offset_std must be \[O\] = \[1\]"):
+        MemberGain([0.1], offset_std=[0.1, 0.2])

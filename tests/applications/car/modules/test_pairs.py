@@ -6,8 +6,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 
 from tests.filters.factories import random_draws
-from torch_denkf.applications.car import UnicycleMotion, UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, with_history
+from torch_denkf.applications.car.modules.unicycle_noise import UnicycleNoise
 from torch_denkf.filters import EKF, DEnKF
 from torch_denkf.imperfect import RejectReadings
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select

@@ -1,4 +1,4 @@
-"""A gain of what each member predicts to be read, drawn once."""
+"""A gain and an offset of what each member predicts to be read, drawn once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf._checks import check_count, check_values
+from torch_denkf._checks import check_count, check_shape, check_values
 from torch_denkf.modules.tensors import as_standard_deviations
 from torch_denkf.submodel import SubModel
 
@@ -16,7 +16,7 @@ __all__ = ["MemberGain"]
 
 
 class MemberGain(SubModel):
-    r"""Multiplies what each member predicts by a factor of its own: :math:`\hat y^i c e^{\sigma z^i}`.
+    r"""Gives what each member predicts a factor and an offset of its own: :math:`\hat y^i c e^{\sigma z^i} + n b^i`.
 
     A camera that is mounted a little lower reads all speeds a little too high, today and tomorrow. Drawn again for each
     frame, such an error averages out over time, and the filter becomes too sure of itself; or its noise model takes the
@@ -27,16 +27,22 @@ class MemberGain(SubModel):
     that of the gains' inverses must be 1, so :math:`c = \frac{1}{E} \sum_i e^{-\sigma z^i}`. Without it the speed would
     be too high by the factor c, about :math:`e^{\sigma^2 / 2}`, and the path too long.
 
+    The offsets :math:`b^i` are normal quantiles, too, in another order. They are the doubt about an error that lasts,
+    but does not grow with what is read, as of a turn rate. A pair of frames n steps apart has it n times.
+
     Args:
         std: standard deviation :math:`\sigma` of the logarithm of the factor, for each observation dimension ``[O]``,
             before training; it is learned.
         ensemble_size: E.
+        offset_std: standard deviation of the offset ``[O]``, in the observation's units; by default zero.
         seed: of the order in which the members take the quantiles, for each dimension its own.
         in_key: what the members predict, ``[*B, E, O]``.
         out_key: where to write them, by default in their place.
+        steps_key: optional n ``[*B, 1]``, 1 where the key is not there.
 
     Raises:
-        ValueError: if a standard deviation is not positive, or there is another number of members.
+        ValueError: if a standard deviation is not positive, if that of an offset is negative, or if there is another
+            number of members.
 
     Source:
         The "consider" parameters of Schmidt (1966), which a filter doubts but does not estimate, as an ensemble.
@@ -54,11 +60,14 @@ class MemberGain(SubModel):
         std: Sequence[float] | torch.Tensor,
         *,
         ensemble_size: int = 32,
+        offset_std: Sequence[float] | torch.Tensor | None = None,
         seed: int = 0,
         in_key: NestedKey = ("forecast", "observation"),
         out_key: NestedKey | None = None,
+        steps_key: NestedKey = "steps",
     ):
-        super().__init__(nn.Identity(), [in_key], [in_key if out_key is None else out_key])
+        out_keys = [in_key if out_key is None else out_key]
+        super().__init__(nn.Identity(), [in_key], out_keys, optional_keys=[steps_key])
         std = as_standard_deviations("std", std)
         check_values("std, a standard deviation,", std, above=0)
         check_count("ensemble_size", ensemble_size, least=2)
@@ -69,13 +78,19 @@ class MemberGain(SubModel):
         quantiles = quantiles / quantiles.square().mean().sqrt()  # few quantiles spread less than the distribution
         orders = [torch.randperm(ensemble_size, generator=generator) for _ in std]
         self.register_buffer("quantiles", torch.stack([quantiles[order] for order in orders], -1))
+        offset_std = torch.zeros_like(std) if offset_std is None else as_standard_deviations("offset_std", offset_std)
+        check_shape("offset_std", offset_std, tuple(std.shape), "[O]")
+        self.register_buffer("offset_std", offset_std)
+        orders = [torch.randperm(ensemble_size, generator=generator) for _ in std]
+        self.register_buffer("places", torch.stack([quantiles[order] for order in orders], -1))
 
-    def compute(self, predicted):
-        """Returns the predictions, each with its member's gain; the mean of the gains' inverses is 1."""
+    def compute(self, predicted, steps=None):
+        """Returns the predictions, each with its member's gain, whose inverses' mean is 1, and with its offset."""
         if predicted.shape[-2:] != self.quantiles.shape:
             raise ValueError(
                 f"MemberGain was made for predictions [*B, {self.quantiles.shape[0]}, {self.quantiles.shape[1]}], "
                 f"ensemble_size by the entries of std; {self.in_keys[0]!r} has shape {list(predicted.shape)}."
             )
         inverse = (-self.log_std.exp() * self.quantiles).exp()
-        return predicted * (inverse.mean(-2) / inverse)
+        offset = self.offset_std * self.places
+        return predicted * (inverse.mean(-2) / inverse) + (offset if steps is None else steps.unsqueeze(-1) * offset)

@@ -17,7 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_values
-from torch_denkf.functional import ensemble_var
+from torch_denkf.functional.moments import ensemble_var
 from torch_denkf.modules.around import AroundInitial, AugmentedBelief, Wrapper
 from torch_denkf.modules.tensors import register_constant
 from torch_denkf.running import check_module, reads

@@ -10,7 +10,7 @@ from torch import nn
 
 from torch_denkf.applications.car.modules.pairs import within_pair
 from torch_denkf.applications.car.unicycle import unicycle_move
-from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.moments import ensemble_mean, ensemble_var
 from torch_denkf.modules.tensors import register_location_and_scale
 from torch_denkf.modules.transition import MemberNetwork
 from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
