@@ -313,6 +313,7 @@ def _training() -> Iterator[Subject]:
     }
     stage = {
         "name": d.of("../x", "", 3),
+        "updates": d.COUNT,
         "lr": d.POSITIVE,
         "weight_decay": d.NOT_NEGATIVE.but("inf"),
         "schedule": d.of("weekly", 3),

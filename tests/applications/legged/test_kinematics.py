@@ -82,7 +82,11 @@ def test_joints_come_in_the_order_that_is_named(float64):
     assert torch.equal(plain.velocities(angles, angles), other.velocities(turned, turned))
 
 
-def test_joints_that_move_the_imu_raise():
-    model, *_ = model_of("odd")
+def test_what_is_not_there_is_said():
+    model, feet, imu = model_of("odd")
+    with pytest.raises(KeyError, match=r"no site or body 'toe'. Its sites: \['imu', 'left'\]"):
+        LegKinematics(model, ["toe"], imu)
+    with pytest.raises(KeyError, match="'c' moves 'left'"):
+        LegKinematics(model, feet, imu, joints=["a", "b", "d"])
     with pytest.raises(ValueError, match=r"Joints \['d'\] move 'right'"):
         LegKinematics(model, ["left"], "right")
