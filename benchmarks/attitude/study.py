@@ -279,7 +279,7 @@ def page(rows: list[dict], study: Study) -> str:
         "standard deviation of a velocity that is read to be zero, in m/s. The library's filters have one setting, "
         "chosen on simulated runs that are not in the table. All settings of the baselines are in it.",
         "",
-        "Ensembles draw exactly; rows with *significance* are of random draws, and of a study before.",
+        "Ensembles draw exactly.",
         "",
         "Milliseconds are those of the processor for a step of all runs at once, without compilation, one thread.",
         "",
