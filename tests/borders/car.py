@@ -15,11 +15,7 @@ from benchmarks.reliability.target import Subject, Target, targets_of
 from tests.borders import models
 from tests.borders.around_filters import STRETCHES
 from tests.borders.kitti import drive
-from torch_denkf.applications.car import (
-    KITTIReplayEnv,
-    OpticalFlow,
-    track,
-)
+from torch_denkf.applications.car import KITTIReplayEnv, OpticalFlow, track
 from torch_denkf.applications.car.kitti.gaps import bridge_gaps
 from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.applications.car.odometry.training import Updates

@@ -15,12 +15,7 @@ from benchmarks.reliability.damage import gone, instead, kept, put, renamed, sam
 from benchmarks.reliability.documents import edited
 from benchmarks.reliability.target import Source, Subject, Target, targets_of
 from tests.borders.folders import SIZES, bomb, made, one_row, picture
-from torch_denkf.applications.car import (
-    KITTIOdometryExperienceReplay,
-    read_kitti_drive,
-    with_motion,
-    write_drives,
-)
+from torch_denkf.applications.car import KITTIOdometryExperienceReplay, read_kitti_drive, with_motion, write_drives
 from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 
 DRIVE, FRAMES, SIZE = "town", 10, (24, 72)

@@ -25,8 +25,10 @@ from tensordict import TensorDict
 
 from benchmarks.reliability.case import Case, apart, forked, judge
 from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
-from tests.borders import kitti, lerobot, recordings, ur5
+from tests.borders import kitti, ur5
 from tests.borders.folders import made
+from tests.borders.lerobot import V2, read_episodes
+from tests.borders.recordings import own, read_own
 from tests.filters.factories import linear_denkf
 from tests.training.problem import make_trainer
 from torch_denkf.applications.car import with_motion
@@ -147,13 +149,9 @@ WORKS: dict[str, Work] = {
     "cache of a drive": read(_drive, killed=True, alone=False),
     "cache of a drive's motion": read(_motion),
     "cache of demos": read(lambda folder: ur5.read_demos(large_demos(), cache=folder), killed=True),
-    "cache of a LeRobot recording": read(
-        lambda folder: lerobot.read_episodes(lerobot.V2.sound(), size=(200, 300), cache=folder)
-    ),
+    "cache of a LeRobot recording": read(lambda folder: read_episodes(V2.sound(), size=(200, 300), cache=folder)),
     "cache of pictures": read(
-        lambda folder: recordings.read_own(
-            recordings.own(), camera="images", replay={"cache": folder, "size": (300, 300)}
-        )
+        lambda folder: read_own(own(), camera="images", replay={"cache": folder, "size": (300, 300)})
     ),
     "checkpoint": read(_checkpoint, ("last.pt",), alone=False),
     "trainer": Work(_train, _trained, _CHECKPOINTS, killed=True, alone=True),
@@ -305,7 +303,7 @@ def disk_jobs() -> Rows:
     """
     if os.geteuid() != 0:
         raise PermissionError("small disks are mounted, which needs root; leave out the part 'disks'")
-    for sound in (recordings.own, lerobot.V2.sound, large_drive, large_demos):
+    for sound in (own, V2.sound, large_drive, large_demos):
         sound()
     kinds, tried = {"full": True, "read-only": False}, {name: work for name, work in WORKS.items() if work.words}
     alone = {f"{name}, {kind} disk": partial(on_disk, name, full) for name in tried for kind, full in kinds.items()}

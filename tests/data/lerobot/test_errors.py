@@ -12,14 +12,7 @@ import pyarrow.parquet as parquet
 import pytest
 import torch
 
-from tests.data.lerobot.lerobot_folder import (
-    SIZE,
-    joints,
-    png,
-    write_info,
-    write_version_2,
-    write_version_3,
-)
+from tests.data.lerobot.lerobot_folder import SIZE, joints, png, write_info, write_version_2, write_version_3
 from torch_denkf.data import LeRobotReplay
 from torch_denkf.data import parquet as parquet_reader
 from torch_denkf.data.pictures import decode_picture

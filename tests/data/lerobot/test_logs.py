@@ -13,14 +13,7 @@ from torch.testing import assert_close
 
 from benchmarks.reliability.damage import put
 from benchmarks.reliability.documents import edited
-from tests.data.lerobot.lerobot_folder import (
-    SIZE,
-    actions,
-    joints,
-    pictures,
-    write_version_2,
-    write_version_3,
-)
+from tests.data.lerobot.lerobot_folder import SIZE, actions, joints, pictures, write_version_2, write_version_3
 from tests.data.lerobot.test_errors import edit_table
 from torch_denkf.data import LeRobotReplay
 
