@@ -74,8 +74,6 @@ POSES: dict[str, d.Change] = {
 CALIBRATION = d.of((1, "0"), (1, "-700"), (6, "0"), (1, "1e300"), (0, "Q2:")).each(
     lambda one: edited(put((2, one[0]), one[1]))
 )
-
-
 #: Times of a single frame: far on, far back, none, two, repeated, back, hardly on.
 STAMPS = {
     4: d.of(["1e300"], ["-1e300"], [], ["0.1", "0.2"], ["1e9"], ["0.309"], ["0.2"], ["0.3091"]),
@@ -127,6 +125,7 @@ def _files() -> Iterator[Target]:
 
 
 def drive() -> TensorDict:
+    """Returns the rows of the drive."""
     return KITTI.reference().clone()
 
 

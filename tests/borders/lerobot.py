@@ -116,14 +116,15 @@ def _files() -> Iterator[Target]:
     cells = pictures.each(lambda value: edited(put((CAMERA, 2), value)))
     yield V2.target("picture", cells, partial(_row_masked, "pixels"), (*words, CAMERA), DATA)
     yield V2.target("picture of a file outside that is there", _planted, _rows_kept, (*words, "secret.png"), DATA)
-    pictures = {
-        "another size": put((CAMERA, 2), {"bytes": png(np.zeros((24, 32, 3), np.uint8)), "path": None}),
-        "none": put(CAMERA, lambda column: [None] * len(column)),
+    frames = {
+        "one of another size": put((CAMERA, 2), {"bytes": png(np.zeros((24, 32, 3), np.uint8)), "path": None}),
+        "none that is there": put(CAMERA, lambda column: [None] * len(column)),
     }
-    yield V2.target("pictures,", d.Wrong(pictures).each(edited), None, "episode_000001.parquet", DATA)
+    yield V2.target("frames", d.Wrong(frames).each(edited), None, "episode_000001.parquet", DATA)
     stamps = d.of(0.1, 0.05, NAN, -1.0, 1e6).each(lambda value: edited(put(("timestamp", 2), value)))
     yield V2.target("stamp 2", stamps, partial(_row_masked, "time"), file=DATA)
-    yield V2.target("none a", d.of("fps", "chunks_size").each(lambda key: edited(put(key, 0))), None, words, INFO)
+    zeros = d.of("fps", "chunks_size").each(lambda key: edited(put(key, 0)))
+    yield V2.target("zero as", zeros, None, words, INFO)
     much = edited(put((1, "length"), 10**12))
     yield V2.target("an episode of 1e12 rows", much, file=EPISODES)
     twice = {EPISODES: lambda rows: [*rows, rows[0]], EPISODES_3: ROWS["a row more"]}

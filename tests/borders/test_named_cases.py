@@ -13,8 +13,11 @@ from benchmarks.reliability.case import MEMORY, verdict_on
 from benchmarks.reliability.fuzz import GOOD, all_targets
 from benchmarks.reliability.hostile import MARK
 
-FILES = ("kitti", "car", "lerobot", "ur5", "recordings", "corners", "logs", "models", "commands")
-TARGETS = all_targets(("filters_made", "sub_models", "around_filters", "readings", "noises", *FILES))
+#: Modules of borders, where they have other names.
+MODULES = {"filters": "filters_made", "sub-models": "sub_models"}
+MODULES |= dict.fromkeys(("smoothers", "losses", "transforms"), "around_filters")
+MODULES |= dict.fromkeys(("checkpoints", "pretrained", "training", "packages"), "models")
+WHOLE = ("kitti", "car", "lerobot", "ur5", "recordings", "corners", "logs", "pretrained", "training")
 #: Texts of which the letters are checked one by one, and differences of two arguments.
 OTHERS = ("num_cells", "channels", "hidden", "taper", "floor", "resampling", "noise", "limits")
 
@@ -32,8 +35,10 @@ def _as_in_a_case():
     resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-def judged(targets, root, monkeypatch):
-    """Yields verdicts on all named cases; each has a folder of its own."""
+def judged(border, part, root, monkeypatch):
+    """Yields verdicts on named cases of targets with this in their names; each has a folder of its own."""
+    targets = [target for target in all_targets([MODULES.get(border, border)]) if target.border == border]
+    targets = [target for target in targets if re.search(part, target.name) and not target.slow]
     cases = [(target, what, value) for target in targets for what, value in target.wrong.named.items()]
     for number, (target, what, value) in enumerate(cases):
         folder = root / str(number)
@@ -48,8 +53,7 @@ def judged(targets, root, monkeypatch):
 def test_a_wrong_argument_is_named(border, tmp_path, monkeypatch):
     """The message has its value, too."""
     wrong, count = [], 0
-    targets = [target for target in TARGETS if target.border == border and target.name.endswith(")")]
-    for target, what, value, found in judged(targets, tmp_path, monkeypatch):
+    for target, what, value, found in judged(border, r"\)$", tmp_path, monkeypatch):
         shown = not isinstance(value, int | float | str) or repr(value) in found.text or found.kind == "right"
         fine = found.kind in GOOD and (shown or any(f"({name})" in target.name for name in OTHERS))
         wrong += [] if fine else [f"{target.name}: {what}: {found}"]
@@ -68,11 +72,9 @@ SOME = {
 }
 
 
-@pytest.mark.parametrize("border", [*FILES[:-2], "pretrained", "training", *SOME])
+@pytest.mark.parametrize("border", [*WHOLE, *SOME])
 def test_damage_raises_clearly_or_gives_the_sound_part(border, tmp_path, monkeypatch):
-    targets = [target for target in TARGETS if target.border == border and not target.slow]
-    targets = [target for target in targets if re.search(SOME.get(border, ""), target.name)]
-    found = list(judged(targets, tmp_path, monkeypatch))
+    found = list(judged(border, SOME.get(border, ""), tmp_path, monkeypatch))
     wrong = [f"{target.name}: {what}: {verdict}" for target, what, _, verdict in found if verdict.kind not in GOOD]
     assert not wrong, "\n".join(wrong)
     assert len(found) > 20

@@ -1,4 +1,4 @@
-"""Files of corners that are damaged, or hold another camera's, gyro's or clock's numbers: told of by the entry."""
+"""Files of corners. Damaged ones are cases of tests/borders/corners.py."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Damaged drives in KITTI's layout: refused by file and line, or kept as far as they are sound, and counted."""
+"""Times of a drive in KITTI's layout: gaps and jitter. Wrong ones are cases of tests/borders/kitti.py."""
 
 import math
 import warnings
@@ -67,7 +67,7 @@ def test_no_pair_is_bridged_over_a_gap(root):
 
 
 def test_jitter_counts_as_a_steady_rate(root):
-    """As before: cameras are triggered, and their stamps are written a little later."""
+    """Cameras are triggered, and their stamps are written a little later."""
     regular, rng = read(root), np.random.default_rng(0)
     set_times(root, 0.1 * np.arange(ROWS) + rng.uniform(-0.01, 0.01, ROWS))
     with warnings.catch_warnings():
