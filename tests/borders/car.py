@@ -97,5 +97,5 @@ def _arguments() -> Iterator[Subject]:
 
 
 def targets() -> Iterator[Target]:
-    """All arguments."""
+    """Yields all arguments."""
     yield from targets_of("car", *_arguments())

@@ -21,7 +21,7 @@ from torch_denkf.applications.car.corners.motion import CornerNoise, corner_moti
 
 
 def sound_entries() -> dict[str, np.ndarray]:
-    """A drive of eight rows and six corners that all see."""
+    """Returns a drive of eight rows and six corners that all see."""
     random = np.random.default_rng(0)
     left = np.stack([600 + 100 * random.normal(size=(6, 8)), 180 + 20 * random.normal(size=(6, 8))])
     return {
@@ -57,7 +57,7 @@ BAD_ENTRIES: dict[str, tuple[str, Callable[[np.ndarray], Any]]] = {
 
 
 def read_corners(root: Path, **options: Any) -> Any:
-    """All rows, as a user replays them."""
+    """Returns all rows, as a user replays them."""
     rows, camera = read_corner_drive(root / "drive.npz", **options)
     replay = corner_replay({"drive": rows.exclude("came_from")}, split="all", cache=None)[:]
     before, after = (camera.corners(rows["corners"][:, :, row]).float() for row in (0, 1))

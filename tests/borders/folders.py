@@ -37,7 +37,7 @@ def one_row(place: tuple[Any, ...]) -> bool:
 
 
 def bomb(data: bytes) -> bytes:
-    """A picture that says that it is of 60,000 x 60,000 pixels."""
+    """Returns a picture that says that it is of 60,000 x 60,000 pixels."""
     return data[:16] + struct.pack(">II", 60000, 60000) + data[24:]
 
 

@@ -24,7 +24,7 @@ IMAGES, TIME_FILE, CALIBRATION_FILE = f"{SEQUENCE}/image_2", f"{SEQUENCE}/times.
 
 
 def read_drive(root: Path, drive: Any = DRIVE, **options: Any) -> TensorDict:
-    """A drive, as a user reads it."""
+    """Returns a drive, as a user reads it."""
     return read_kitti_drive(root, drive, **{"size": SIZE, "cache": None, **options})
 
 

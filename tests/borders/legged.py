@@ -48,7 +48,7 @@ _ROBOT = f"""<mujoco><option timestep=".0025"/><worldbody><geom type="plane" siz
 
 @cache
 def model() -> mujoco.MjModel:
-    """A robot of two legs, each with a hinge and a slide."""
+    """Returns a robot of two legs, each with a hinge and a slide."""
     return mujoco.MjModel.from_xml_string(_ROBOT)
 
 
@@ -78,7 +78,7 @@ def run(kind: str, rows: TensorDict) -> TensorDict:
 
 
 def filtered(filter: Any, rows: TensorDict | None = None) -> TensorDict:
-    """Beliefs of a log, behind a rejection that raises."""
+    """Returns beliefs of a log, behind a rejection that raises."""
     torch.manual_seed(0)
     readings = dict.fromkeys(("imu", "joints", "joint_rates"), "contact")
     with torch.no_grad():
@@ -87,7 +87,7 @@ def filtered(filter: Any, rows: TensorDict | None = None) -> TensorDict:
 
 
 def learned_loss(rows: TensorDict) -> Tensor:
-    """A loss of a network of contacts, whose gradients are taken."""
+    """Returns a loss of a network of contacts, whose gradients are taken."""
     torch.manual_seed(0)
     loss = LearnedContacts(model(), **NAMES, rows=2, num_cells=(4,)).loss(rows)
     loss.backward()

@@ -30,7 +30,7 @@ VIDEO = f"videos/{CAMERA}/chunk-000/file-000.mkv"
 
 
 def read_episodes(root: Path, **options: Any) -> TensorDict:
-    """All rows, as a user reads them."""
+    """Returns all rows, as a user reads them."""
     return LeRobotReplay(root, **{"size": SMALL, **ALL_ROWS, **options})[:]
 
 
@@ -40,7 +40,7 @@ V3 = Source("lerobot", made("lerobot3", lambda root: write_version_3(root, [[6, 
 
 
 def _rows_kept(result: TensorDict) -> bool:
-    """Right where rows are as without damage, or those of the damaged episode are marked; stamps are rounded."""
+    """Tells whether rows are as without damage, or those of the damaged episode are marked; stamps are rounded."""
     return kept(result, V2.reference(), most=LENGTHS[1], rtol=1e-6)
 
 
@@ -54,7 +54,7 @@ def _row_masked(key: str, result: TensorDict) -> bool:
 
 
 def _video_shown(result: TensorDict) -> bool:
-    """Right where every row that counts as seen shows its own picture, but for a codec's rounding."""
+    """Tells whether every row that counts as seen shows its own picture, except for a codec's rounding."""
     expected = V3.reference()
     seen = result["observed"].squeeze(-1)
     numbers = [key for key in expected.keys(True, True) if key != "pixels" and key != "observed"]

@@ -1,4 +1,4 @@
-"""Logs whose files are sound and whose numbers are not: times of another clock, fixes that repeat, numbers too large.
+"""Logs whose files are valid and whose values are not: times of another clock, fixes that repeat, numbers too large.
 
 What is wrong with them is a warning or an error, which names the file or sensor; warnings are raised here.
 """
@@ -44,12 +44,12 @@ def told(act: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def target(name: str, words: tuple[str, ...], act: Callable[..., Any], wrong: d.Wrong, right: Any = None) -> Target:
-    """Values that a log is made of."""
+    """Returns values that a log is made of."""
     return Target("logs", name, words, told(act), wrong, right)
 
 
 def replayed(folder: Path, streams: dict[str, dict[str, Any]], **columns: np.ndarray) -> Any:
-    """Rows of a table, of which streams take columns."""
+    """Returns rows of a table, of which streams take columns."""
     file = write_csv(folder / "run.csv", **columns)
     tables = {name: Table(file, **options) for name, options in streams.items()}
     return RecordingReplay(Recording(**tables), split="all", cache=None)[:]
@@ -68,7 +68,7 @@ def moved(place: int | slice, by: float) -> d.Change:
 
 
 def bursts(of: int) -> d.Change:
-    """Times at which packets of so many readings come."""
+    """Returns times at which packets of so many readings come."""
     number = np.arange(ROWS)
     return lambda times: times[number // of * of] - 2e-4 * (of - 1 - number % of)
 
@@ -150,7 +150,7 @@ def _held(streams: dict[str, dict[str, Any]]) -> Callable[[int, Path], Any]:
 
 
 def _dropped(result: Any) -> bool:
-    """Right where a fix counts once, in the row in which it comes."""
+    """Tells whether a fix counts once, in the row in which it comes."""
     fix = result["gps"].flatten()
     new = torch.cat([torch.ones(1, dtype=torch.bool), fix.diff() != 0])
     return len(result) == ROWS and bool((result["gps_observed"].flatten() == new).all())
@@ -215,7 +215,7 @@ def _of_messages() -> Iterator[Target]:
 
 @told
 def read(root: Path, **options: Any) -> Any:
-    """All rows, as a user reads them; warnings are errors."""
+    """Returns all rows, as a user reads them; warnings are errors."""
     return LeRobotReplay(root, **{"size": (12, 16), **ALL_ROWS, **options})[:]
 
 
@@ -280,7 +280,7 @@ CHOICES = {
 
 
 def _whole(result: Any) -> bool:
-    """Right where the episodes that are there are read: the first one."""
+    """Tells whether the episodes that are there are read: the first one."""
     return len(result) == 40 and bool(result["observed"].all())
 
 
@@ -299,6 +299,6 @@ def _of_recordings() -> Iterator[Target]:
 
 
 def targets() -> Iterator[Target]:
-    """Times, numbers, repeats, what drives, single messages, and recordings that contradict themselves."""
+    """Yields times, numbers, repeats, what drives, single messages, and recordings that contradict themselves."""
     for kind in (_of_numbers, _of_messages, _of_recordings):
         yield from kind()

@@ -1,4 +1,4 @@
-"""Files of models: checkpoints, and trainings that go on from them; trained filters in folders; packaged steps."""
+"""Files of models: checkpoints, and trainings that continue from them; trained filters in folders; packaged steps."""
 
 from __future__ import annotations
 
@@ -214,7 +214,7 @@ def _called(folder: Path, entries: dict[str, Any] | None = None) -> Any:
 
 
 def _as_by_hand(result: Any) -> bool:
-    """Right where the step returns what the filter's own does."""
+    """Tells whether the step returns what the filter's own does."""
     out = linear_kalman().step(TensorDict({tuple(name.split(".")): value for name, value in ENTRIES.items()}))
     expected = {f"belief.{name}": out["belief", name] for name in ("mean", "cov", "var")}
     return same({name: result[name] for name in expected}, expected, atol=1e-5)

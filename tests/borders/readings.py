@@ -51,7 +51,7 @@ def step(filter: Filter, frames: TensorDict, front: Front) -> TensorDict:
 
 
 def sequence(filter: Any, frames: TensorDict, front: Front) -> TensorDict:
-    """Filters, or smooths, a sequence."""
+    """Filters or smooths a sequence."""
     smoothed = [key for key in getattr(filter, "out_keys", ()) if key[0] == "smoothed"]
     keys = getattr(filter, "smoothed_keys", None) or smoothed or filter.belief_keys
     return filter.sequence(front(frames.copy())).select(*keys)
@@ -76,7 +76,7 @@ def fed(
     way: str,
     front: Front = lambda frames: frames,
 ) -> Source:
-    """Frames, and a filter that reads them in one way; a warning of a NaN in a sequence is as good as an error."""
+    """Runs a filter on frames in one way; a warning of NaN in a sequence counts as an error."""
 
     def read(rows: TensorDict, *, double: bool = False) -> TensorDict:
         torch.manual_seed(0)
@@ -90,7 +90,7 @@ def fed(
 
 
 def both(first: Change, then: Change) -> Change:
-    """One change after another."""
+    """Applies one change after another."""
 
     def change(frames: TensorDict) -> TensorDict:
         for one in (first, then):
@@ -102,7 +102,7 @@ def both(first: Change, then: Change) -> Change:
 
 
 def unobserved(*at: Any, width: int = 0) -> Change:
-    """A mask that is False in a place; of so many components, which then have masks of their own."""
+    """Returns a mask that is False in a place; of so many components, which then have masks of their own."""
 
     def change(frames: TensorDict) -> None:
         mask = frames["observed"]
@@ -184,7 +184,7 @@ WIDE_MASK = d.Wrong({"too wide": lambda mask: mask.expand(*mask.shape[:-1], 5)})
 
 
 def large(source: Source, change: Change, result: TensorDict) -> bool:
-    """Right where a reading is treated as missing, or all is finite and as in double precision."""
+    """Tells whether a reading is treated as missing, or all is finite and as in double precision."""
     if source.like(unobserved(*AT))(result):
         return True
 
@@ -202,7 +202,7 @@ def large(source: Source, change: Change, result: TensorDict) -> bool:
 
 
 def goes_on(source: Source, width: int, change: Change, result: TensorDict) -> bool:
-    """Right where only the row that is damaged is as if it had not been observed, or computed right."""
+    """Tells whether only the row that is damaged is as if it had not been observed, or computed right."""
     rows, near = [row for row in range(B) if row != AT[0]], {"rtol": 1e-5, "atol": 1e-5}
     hides = [unobserved(*AT)] + [unobserved(*AT, 0, width=width)] * (width == 2)  # a sensor's is hidden as a whole
     hidden = any(d.same(result[AT[0]], source.damaged(hide)[AT[0]], **near) for hide in hides)
@@ -229,7 +229,7 @@ def readings(one: Fed) -> Iterator[Target]:
 
 
 def poke(place: int, value: float) -> Change:
-    """A number in a belief's entry, of the first row."""
+    """Returns a number in a belief's entry, of the first row."""
     return lambda entry: torch.cat([spoiled(place / 41, value)(entry[:1]), entry[1:]])
 
 
@@ -240,7 +240,7 @@ NUMBERS = d.Wrong(
 
 
 def beliefs(one: Fed) -> Iterator[Target]:
-    """Steps from damaged beliefs; right where a filter does not read what is damaged, as an LSTM its last mean."""
+    """Runs steps from damaged beliefs; correct if the filter does not read the damaged entry."""
 
     def made() -> Filter:
         torch.manual_seed(0)
@@ -299,7 +299,7 @@ LAYOUTS: dict[str, tuple[tuple[str, ...], Use]] = {
 
 
 def laid_out(one: Fed, layouts: dict[str, tuple[tuple[str, ...], Use]]) -> Iterator[Target]:
-    """Frames and calls of a wrong layout."""
+    """Yields frames and calls of a wrong layout."""
     for what, (words, use) in layouts.items():
         read = lambda frames, use=use: use(one.make(), frames)  # noqa: E731
         yield Source(one.border, one.frames, read, one.name).target(

@@ -38,7 +38,7 @@ def _write_own(root: Path) -> None:
 
 
 def read_own(root: Path, *, camera: str = "", table: str = "table.csv", replay: Any = None, **options: Any) -> Any:
-    """All rows, as a user reads them."""
+    """Returns all rows, as a user reads them."""
     streams: dict[str, Any] = {"state": Table(root / table, **options)}
     if camera == "video":
         streams["camera"] = Video(root / "run.mkv", times=root / "stamps.csv")
@@ -52,7 +52,7 @@ OWN = Source("recordings", own, read_own)
 
 
 def _shown(result: TensorDict, camera: str = "images") -> bool:
-    """Right where each row that counts as seen shows its own picture, and all numbers are as without damage."""
+    """Tells whether each row that counts as seen shows its own picture, and all numbers are as without damage."""
     expected, places = OWN.reference(camera=camera), result["time"].squeeze(-1)
     if same(result, expected):
         return True
@@ -96,7 +96,7 @@ def _named(name: bytes, folder: Path) -> Any:
 
 
 def rows_in_memory(change: d.Change = lambda rows: None, fps: Any = 10.0) -> Any:
-    """Rows that are in memory."""
+    """Returns rows that are in memory."""
     state = torch.rand(12, 2, generator=torch.Generator().manual_seed(0))
     rows = TensorDict({"observation": {"image": torch.zeros(12, 3, 8, 8, dtype=torch.uint8), "state": state}}, [12])
     rows["episode"] = torch.arange(3).repeat_interleave(4)
@@ -105,7 +105,7 @@ def rows_in_memory(change: d.Change = lambda rows: None, fps: Any = 10.0) -> Any
 
 
 def _row_masked(result: TensorDict) -> bool:
-    """Right where the damaged row counts neither as seen nor in a loss, and all others are as without damage."""
+    """Tells whether the damaged row counts neither as seen nor in a loss, and all others are as without damage."""
     masks = ("observed", "state_observed", ("collector", "mask"))
     return all(not bool(result[mask][1].any()) for mask in masks) and kept(result, rows_in_memory())
 
@@ -163,7 +163,7 @@ def _files() -> Iterator[Target]:
 
 
 def _trajectory(**given: Any) -> Any:
-    """A path that is written for other programs."""
+    """Returns a path that is written for other programs."""
     layout = {"layout": "tum"} if "times" in given else {}
     return write_trajectory("path.txt", **{"trajectory": torch.zeros(5, 3), **layout, **given})
 

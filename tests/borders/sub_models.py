@@ -96,7 +96,7 @@ def of(
     also: Mapping[str, tuple[str, ...]] | None = None,
     **given: Any,
 ) -> Subject:
-    """A sub-model; arguments that have no default are those of ``GIVEN``, but for some."""
+    """Returns a sub-model; arguments that have no default are those of ``GIVEN``, except for some."""
     signature = _signature(make)[0] if isinstance(make, type) else inspect.signature(make)
     needed = [name for name, one in signature.parameters.items() if one.default is one.empty and name in GIVEN]
     sound = partial(copy.deepcopy, {**{name: GIVEN[name] for name in needed}, **given})
@@ -209,6 +209,6 @@ def _imperfect() -> Iterator[Subject]:
 
 
 def targets() -> Iterator[Target]:
-    """The arguments of all sub-models."""
+    """Yields the arguments of all sub-models."""
     for subjects in (_motions, _observations, _networks, _updates, _imperfect):
         yield from targets_of("sub-models", *subjects())

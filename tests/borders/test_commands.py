@@ -1,4 +1,4 @@
-"""Checks the words and files of commands: the message names the option or the file."""
+"""Arguments and files of commands: the error names the option or the file."""
 
 from torch_denkf.cli.main import main
 

@@ -25,12 +25,12 @@ DEMO, MANIFEST = "demo-000001.npz", "demos.jsonl"
 
 
 def read_demos(root: Path, **options: Any) -> TensorDict:
-    """All rows, as a user reads them."""
+    """Returns all rows, as a user reads them."""
     return UR5ExperienceReplay(root, **{**ALL_ROWS, **options})[:]
 
 
 def _warned(root: Path) -> tuple[TensorDict, list[str]]:
-    """The rows, and what was said."""
+    """Returns the rows, and what was said."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         result = read_demos(root)
@@ -43,7 +43,7 @@ LISTED = Source("ur5", demos, _warned)
 
 
 def _all_or_said(result: tuple[TensorDict, list[str]]) -> bool:
-    """Right where all demos are there, or the first ones, and a warning names the list that lacks the others."""
+    """Tells whether all demos are there, or the first ones, and a warning names the list that lacks the others."""
     rows, said = result
     first = same(rows, DEMOS.reference()[: len(rows)])
     return DEMOS.like()(rows) or (first and any(MANIFEST in message for message in said))

@@ -143,7 +143,7 @@ def test_readings_that_no_step_uses_may_be_anything(name):
 
 
 def test_a_step_is_exact_up_to_the_limit():
-    """K = 1/3 at P = 1 beside R = 2."""
+    """K = 1/3 at P = 1 and R = 2."""
     one = torch.eye(2)
     kf = KalmanFilter(one, one, process_noise_cov=0 * one, noise_cov=2 * one, mean=torch.zeros(2), cov=one)
     belief = kf.initialise(TensorDict({"observation": torch.zeros(3, 2)}, [3]))
@@ -151,7 +151,7 @@ def test_a_step_is_exact_up_to_the_limit():
     torch.testing.assert_close(kf.step(belief)["belief", "mean"], torch.full((3, 2), 6e17))
 
 
-def test_gradients_do_not_meet_what_was_rejected():
+def test_gradients_exclude_rejected_readings():
     """Also those of the sensor that would have read it: they are those of a masked frame."""
     expected, spoiled, _ = frames_of("sensor", 3, 12)
     gradients = []

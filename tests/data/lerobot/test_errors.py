@@ -110,7 +110,7 @@ def test_bombs_raise_before_they_are_unpacked(tmp_path):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_states_that_are_not_finite(tmp_path, value):
-    """Rows hold the last sound numbers (the first row the next), and count neither as seen nor in a loss."""
+    """Damaged rows repeat the last valid values (the first row the next ones), and are masked."""
     write_version_2(tmp_path, [12, 4], images="bytes")
     right = open_all(tmp_path)
     states = joints(0, 12)

@@ -19,7 +19,7 @@ POSES, TIMES = "poses/00.txt", "sequences/00/times.txt"
 
 @pytest.fixture
 def root(tmp_path):
-    """A drive of 20 frames at 1 m and 0.1 s."""
+    """Returns a drive of 20 frames at 1 m and 0.1 s."""
     return make(tmp_path, images=range(ROWS), poses=range(ROWS))
 
 

@@ -26,7 +26,7 @@ def test_options_out_of_range(root):
 
 
 def test_a_damaged_line(tmp_path):
-    """It dropped its demo; collecting goes on without it and makes it again."""
+    """A damaged line of the manifest raises; a collection skips it with a warning, and records that demo again."""
     write_folder(tmp_path, [make_demo(number, 8) for number in range(4)])
     lines = (tmp_path / MANIFEST).read_text().splitlines()
     (tmp_path / MANIFEST).write_text("\n".join([lines[0], '{"demo": 1, "fi', *lines[2:], ""]))
