@@ -30,7 +30,7 @@ NOISE, DT = ENCODER_STD, 0.02  # encoder noise, 0.05 rad; control step in s
 
 
 def make_filter(states: torch.Tensor) -> DEnKF:
-    """State [q1, q2, w1, w2] in rad and rad/s; learned dynamics, known observation of the positions."""
+    """Returns the state [q1, q2, w1, w2] in rad and rad/s; learned dynamics, known observation of the positions."""
     loc, scale = states.mean(0), states.std(0)
     return DEnKF(
         transition=LearnedTransition(
@@ -65,7 +65,7 @@ def train(denkf: DEnKF, rollouts: TensorDict, updates: int, length: int) -> None
 
 
 def compare(rollout: TensorDict) -> str:
-    """The filter's velocities against differences of the encoders, raw and smoothed over eleven steps."""
+    """Returns the filter's velocities against differences of the encoders, raw and smoothed over eleven steps."""
     truth, encoder = rollout["next", "state"], rollout["next", "encoder"]
     raw = encoder.diff(dim=0, prepend=encoder[:1]) / DT
     smooth = torch.stack([raw[max(0, t - 10) : t + 1].mean(0) for t in range(len(raw))])
@@ -83,7 +83,7 @@ def compare(rollout: TensorDict) -> str:
 
 
 def draw(rollout: TensorDict, file: Path) -> None:
-    """Draws the joint velocities over time, beside differences of the encoders."""
+    """Draws the joint velocities over time, next to differences of the encoders."""
     seen = rollout["next"]
     differences = seen["encoder"].diff(dim=0, prepend=seen["encoder"][:1]) / DT
     names, dots = ["joint 1, rad/s", "joint 2, rad/s"], {dim: differences[:, dim - 2] for dim in (2, 3)}

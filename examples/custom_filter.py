@@ -67,7 +67,7 @@ class Beacons(Transform):
 
 
 def make_env(boats: int, seed: int) -> TransformedEnv:
-    """The lake: constant velocity with a little drag and gusts of 0.3 m/s."""
+    """Returns the lake: constant velocity with a little drag and gusts of 0.3 m/s."""
     drift = torch.eye(4) + DT * torch.tensor([[0, 0, 1, 0], [0, 0, 0, 1], [-0.01, 0, -0.1, 0], [0, -0.01, 0, -0.1]])
     env = LinearGaussianEnv(
         drift, torch.eye(2, 4), [0.0, 0.0, 0.3, 0.3], [1.0, 1.0], initial_std=[5.0, 5.0, 1.0, 1.0],
@@ -78,7 +78,7 @@ def make_env(boats: int, seed: int) -> TransformedEnv:
 
 
 def make_filter(use_beacons: bool) -> Filter:
-    """Motion, the analysis of the beacons, then that of the GPS on what the beacons left."""
+    """Returns the motion, the analysis of the beacons, then that of the GPS on what the beacons left."""
     beacons = [
         VectorSensor(3, 2, ensemble_size=ENSEMBLE, scale=[10.0, 10.0], in_key="ranges"),
         DiagonalNoise(2, r=3.0, scale=[10.0, 10.0]),

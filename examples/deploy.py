@@ -77,14 +77,14 @@ def export(path: Path, compiled: bool) -> float:
 
 
 def joints(now: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """True angles and speeds ``[2]`` at a time in s."""
+    """Returns true angles and speeds ``[2]`` at a time in s."""
     amplitude, frequency, phase = (torch.tensor(value) for value in TRUTH)
     angle, rate = 2 * math.pi * frequency * now + phase, 2 * math.pi * frequency
     return amplitude * angle.sin(), amplitude * rate * angle.cos()
 
 
 def draw(shapes: dict[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
-    """Standard normal numbers."""
+    """Returns standard normal numbers."""
     return {name: torch.randn(shape) for name, shape in shapes.items()}
 
 

@@ -37,7 +37,7 @@ VELOCITIES = [3, 4]  # v in m/s and theta_dot in rad/s, of the state [x, y, thet
 
 
 def make_filter(data: KITTIOdometryExperienceReplay) -> DEnKF:
-    """Known motion of the pose, learned change of the velocities, and a sensor that reads them from optical flow."""
+    """Returns the filter: known motion of the pose, learned change of the velocities, read from optical flow."""
     dt = float(data[0]["dt"])
     loc, scale = data.statistics["velocity", "mean"], data.statistics["velocity", "std"]
     return DEnKF(
@@ -53,7 +53,7 @@ def make_filter(data: KITTIOdometryExperienceReplay) -> DEnKF:
 
 
 def train(denkf: DEnKF, data: KITTIOdometryExperienceReplay, out: Path, updates: tuple[int, int]) -> None:
-    """The sensor alone, then all of the filter through 16 steps; resumes where it was broken off."""
+    """The sensor alone, then all of the filter through 16 steps; resumes after an interruption."""
     scale = data.statistics["velocity", "std"]
     of_sensor = SensorLoss(denkf, observation_scale=scale)
     # The pose follows from the velocities: errors of an infinite scale do not count. nll moves the noise model.
@@ -112,12 +112,12 @@ def main() -> None:
         for name, path in (("DEnKF", belief), ("dead reckoning", reckoned)):
             error = kitti_endpoint_error(path[:, :3], truth[:, :3], window=window)
             print(f"  {name:<15}{error.translation.item():.3f}  {error.rotation.item():.3f}")
-        print(f"  the 90 % intervals hold {100 * holds[0]:.0f} % of v and {100 * holds[1]:.0f} % of theta_dot")
+        print(f"  90 % coverage: v {100 * holds[0]:.0f} %, theta_dot {100 * holds[1]:.0f} %")
         draw(seen, reckoned, args.out / f"{drive.drive}.png")
 
 
 def draw(seen, reckoned: torch.Tensor, file: Path) -> None:
-    """The path with its ensemble beside the truth and dead reckoning; the velocities with their 90 % bands."""
+    """Draws the path with its ensemble, the truth and dead reckoning; the velocities with their 90 % bands."""
     import matplotlib
 
     matplotlib.use("agg")

@@ -4,13 +4,13 @@
     python examples/lerobot.py --root FOLDER --camera top --state observation.state --joints 7:14
 
 Any folder of LeRobot 2.0, 2.1 or 3.0 will do. The sensor reads the joints from single pictures. Where commands were
-recorded, they drive the filter's motion, which is learned. The page prints errors on unseen episodes beside those of
+recorded, they drive the filter's motion, which is learned. The page prints errors on unseen episodes next to those of
 simpler ways, and leaves a picture and a video in --out. ``kitti.py``, ``ur5.py`` and ``own_recordings.py`` are the same
 page for other robots. Needs pyarrow: ``pip install "torch_denkf[lerobot,plots]"``.
 
 Without --root it takes a minute of one core. Unseen episodes, no pictures in one second of four, mean absolute error of
 two joints: 0.024 rad for the filter, 0.096 for the last reading, 0.047 for the filter without a camera, 0.47 for the
-mean pose; the 90 % intervals hold 88 %. A Unitree G1's right arm takes four minutes with --updates 1000 300 200:
+mean pose; 90 % coverage is 88 %. A Unitree G1's right arm takes four minutes with --updates 1000 300 200:
 0.0096 rad, 0.0447, 0.0091 (its commands say it all), 0.1415; 84 %. A drawn crane of two joints, 20 episodes at 15 Hz
 with pictures two rows late, takes 1.5 minutes: 0.86 degrees, 2.92, 1.86, 27.6; 90 %.
 """
@@ -94,7 +94,7 @@ def write_folder(root: Path, episodes: int, rows: int) -> None:
 
 
 def places_of(asked: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Places in the state of ``7:14``, ``3``, ``gripper`` or ``right_*``."""
+    """Returns places in the state of ``7:14``, ``3``, ``gripper`` or ``right_*``."""
     places: list[int] = []
     for each in asked:
         first, colon, last = each.partition(":")
@@ -112,29 +112,29 @@ def dead(rows: TensorDict) -> torch.Tensor:
 
 
 def fail(rows: TensorDict) -> TensorDict:
-    """Rows whose pictures do not arrive while the camera is dead."""
+    """Returns rows whose pictures do not arrive while the camera is dead."""
     return rows.set("observed", rows["observed"] & ~dead(rows))
 
 
 def go_black(rows: TensorDict) -> TensorDict:
-    """Rows whose pictures are black while the camera is dead. Nobody says so: it is seen in the pictures."""
+    """Returns rows whose pictures are black while the camera is dead. Nobody says so: it is seen in the pictures."""
     rows = BlackIsMissing()(rows.set("pixels", rows["pixels"] * ~dead(rows)[..., None, None]))
     return rows.set("observed", rows["seen"])
 
 
 def make_filter(data: LeRobotReplay) -> DEnKF:
-    """Learned motion, under the commands where there are any, and a sensor that reads the state from one picture."""
+    """Returns the filter: learned motion, driven by commands if there are any; a sensor that reads single images."""
     facts, row = data.statistics, data[0]
     loc, scale = facts["state", "mean"], facts["state", "std"].clamp_min(1e-3)  # a joint may never move
     joints, image, driven = len(loc), tuple(row["pixels"].shape), "action" in row
     commands = {"action_key": "action", "action_loc": facts["action", "mean"]} if driven else {}
     if driven:
         commands["action_scale"] = facts["action", "std"].clamp_min(1e-3)
-    # Linear: joints go after their commands, and stay where they are without. Widths such as (64, 64) in the place of
+    # Linear: joints go after their commands, and stay where they are without. Widths such as (64, 64) instead of
     # () learn other motions, too.
     motion = StochasticMLP(joints + (row["action"].shape[-1] if driven else 0), joints, (), output_gain=0.0)
     motion.requires_grad_(driven)
-    wind = (0.1 if driven else 0.3) * scale  # what moves joints in a step beside their commands, before training
+    wind = (0.1 if driven else 0.3) * scale  # process noise of the joints, before training
     wind = ConstantNoise(wind, trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return DEnKF(
         transition=LearnedTransition(motion, loc=loc, scale=scale, **commands),
@@ -172,7 +172,7 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
         Stage("sensor", of_sensor, data.draw, updates[0], weight_decay=0.02, lengths={0: 1}),
         Stage("motion", of_motion, data.draw, updates[1], lengths={0: 2}),
     ]
-    FilterTrainer(denkf, stages, out=out / "parts", **trainer).fit()  # goes on where it was broken off
+    FilterTrainer(denkf, stages, out=out / "parts", **trainer).fit()  # resumes after an interruption
 
     # The filter behind its sensor: the same modules, for readings that were made before.
     behind = Filter({name: denkf[name] for name in denkf.module if name != "sensor"}, initial=denkf.initial)
@@ -182,7 +182,7 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
     stage = Stage("filter", of_filter, readings.draw, updates[2], lr=4e-3)
     FilterTrainer(behind, [stage], out=out / "filter", **trainer).fit()
 
-    # One factor on all noise, with which the 90 % intervals hold 90 %.
+    # One factor on all noise, for a coverage of the 90 % intervals of 90 %.
     runs = readings.draw(torch.Generator().manual_seed(0), shortest)
 
     def from_level() -> float:
@@ -257,7 +257,7 @@ def main() -> None:
     mean, seen, readings, alone = data.statistics["state", "mean"], [], [], []
     for episode in unseen.episodes[:5]:
         seen.append(believe(denkf, unseen, episode))
-        # The same sensor without a filter: its last reading is held where there is none. The same filter, blind.
+        # The same sensor without a filter: its last reading is held if there is none. The same filter, blind.
         reading = seen[-1]["sensor", "ensemble"].mean(-2)
         readings.append(hold_last(reading, seen[-1]["observed"], mean))
         alone.append(believe(denkf, blind, episode)["belief", "mean"])
@@ -268,12 +268,12 @@ def main() -> None:
 
 
 def no_picture(rows: TensorDict) -> TensorDict:
-    """Rows of a robot without a camera."""
+    """Returns rows of a robot without a camera."""
     return rows.set("observed", torch.zeros_like(rows["observed"]))
 
 
 def believe(denkf: DEnKF, data: LeRobotReplay, episode: Episode) -> TensorDict:
-    """An episode as the robot would have seen it, with the belief in each row."""
+    """Returns an episode as the robot would have seen it, with the belief in each row."""
     env = TransformedEnv(ReplayEnv(data, episodes=episode.name))
     env.append_transform(DEnKFTransform(denkf, diagnostics=[("sensor", "ensemble")]))
     torch.manual_seed(0)
@@ -281,7 +281,7 @@ def believe(denkf: DEnKF, data: LeRobotReplay, episode: Episode) -> TensorDict:
 
 
 def report(seen: list[TensorDict], others: dict[str, list], mean: torch.Tensor, names: Sequence[str]) -> None:
-    """Prints mean absolute errors and what the intervals hold, joint by joint."""
+    """Prints mean absolute errors and coverage of the intervals, joint by joint."""
     rows = torch.cat([run.exclude("pixels") for run in seen])
     belief, truth = rows["belief", "mean"], rows["state"]
     ways = {"DEnKF": belief, **{name: torch.cat(runs) for name, runs in others.items()}, "mean pose": mean}

@@ -1,4 +1,4 @@
-"""Many machines on one page: workers collect, ranks learn a filter and a policy on what it believes.
+"""Many machines on one page: workers collect, ranks learn a filter and a policy on its belief.
 
     python examples/many_machines.py                                             # all in this process
     pip install "torch_denkf[ray]" && python examples/many_machines.py --collectors 2
@@ -104,7 +104,7 @@ def make_policy(denkf: DEnKF) -> tuple[TensorDictSequential, ProbabilisticActor,
 
 
 def make_collector(policy: TensorDictSequential, args: argparse.Namespace):
-    """A RayCollector, or the same in this process."""
+    """Returns a RayCollector, or the same in this process."""
     total = args.batches * args.frames
     if args.collectors == 0:
         return Collector(partial(make_env, policy[0]), policy, frames_per_batch=args.frames, total_frames=total)
@@ -129,7 +129,7 @@ def make_collector(policy: TensorDictSequential, args: argparse.Namespace):
 
 
 def windows(data: TensorDictBase, newest: int, oldest: int) -> tuple[TensorDictBase, TensorDictBase]:
-    """The rows of a batch as windows ``[N, WINDOW]``: those whose weights are new enough, and the others."""
+    """Returns the rows of a batch as windows ``[N, WINDOW]``: those whose weights are new enough, and the others."""
     keys = ("encoder", "action", "state", "is_init", "weights_number", BELIEF)
     rows = data.reshape(-1).select(*keys, ("next", "reward")).reshape(-1, WINDOW)
     age = newest - rows["weights_number"][:, 0, 0]
@@ -140,7 +140,7 @@ def windows(data: TensorDictBase, newest: int, oldest: int) -> tuple[TensorDictB
 
 
 def transitions(batch: TensorDictBase) -> TensorDict:
-    """Rows ``[N]`` for SAC: the belief of the next row stands beside each, but for the last of an episode."""
+    """Returns rows ``[N]`` for SAC: each with the belief of the next row, except the last of an episode."""
     first, second = batch[:, :-1], batch[:, 1:]
     rows = first.select(BELIEF, "action")
     rows["next"] = second.select(BELIEF).update({"reward": first["next", "reward"]})
@@ -161,7 +161,7 @@ class Learner:
         self.processes = processes
 
     def __call__(self, batch: TensorDictBase) -> float:
-        """One update of the filter by windows, and many of the policy by their rows; returns the filter's CRPS."""
+        """Updates the filter on windows and the policy on their rows; returns the filter's CRPS."""
         crps = self.descend(self.filter_loss(batch.exclude("belief", "next")), self.filter_optimiser)
         rows = transitions(batch)
         for part in torch.randperm(len(rows)).chunk(8):
@@ -170,7 +170,7 @@ class Learner:
         return crps
 
     def descend(self, terms: TensorDictBase, optimiser: torch.optim.Optimizer) -> float:
-        """One step of an optimiser, by the gradient of all ranks."""
+        """Returns one step of an optimiser, by the gradient of all ranks."""
         total = sum(value for name, value in terms.items() if name.startswith("loss_"))
         optimiser.zero_grad()
         total.backward()

@@ -35,7 +35,7 @@ class Coasting(Transition):
 
 
 def make_filter(members: int = 200) -> Filter:
-    """Two sensors, each with its own noise and analysis: a position in m and a speed in m/s."""
+    """Returns two sensors, each with its own noise and analysis: a position in m and a speed in m/s."""
     return Filter(
         {
             "transition": Coasting(),
@@ -93,7 +93,7 @@ def main() -> None:
     denkf, cart = make_filter(), Cart()
     sensors = ["encoder", "radar"]
     inside, steps, shown = torch.zeros(2), 0, 0.0
-    print("time    true position, speed    believed position, 90 %     speed, 90 %             readings")
+    print("time    true position, speed    estimated position, 90 %    speed, 90 %             readings")
     with torch.no_grad():  # otherwise a graph grows with every step
         belief = denkf.initialise({})
         while cart.time < (2.0 if args.smoke else args.seconds):
@@ -113,9 +113,7 @@ def main() -> None:
                 text = f"{true[0]:6.2f} m  {true[1]:5.2f} m/s     {position} m   {speed} m/s"
                 print(f"{cart.time:4.1f} s  {text}   {' '.join(readings) or 'none'}")
     holds = (100 * inside / steps).tolist()
-    print(
-        f"{steps} steps; the 90 % intervals hold {holds[0]:.0f} % of the positions and {holds[1]:.0f} % of the speeds"
-    )
+    print(f"{steps} steps; 90 % coverage: position {holds[0]:.0f} %, speed {holds[1]:.0f} %")
 
 
 if __name__ == "__main__":

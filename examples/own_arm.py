@@ -2,8 +2,8 @@
 
     python examples/own_arm.py             # pictures, filter and policy in runs/own-arm
 
-``Reach`` and ``XML`` stand for your arm: two joints; a camera of 60 x 60 pixels in each of 20 steps a second, encoders
-in every fourth; 30 % of both get lost, and nobody reads speeds. A scripted controller demonstrates. The filter learns
+``Reach`` and ``XML`` stand for your arm: two joints, a camera of 60 x 60 pixels at 20 Hz, encoders at 5 Hz. 30 % of
+both are missing, and no sensor reads speeds. A scripted controller demonstrates. The filter learns
 motion and camera from that, and what the camera is worth from demonstrations that it did not learn from. Then PPO
 learns to reach a goal, from the belief of the moment when its action runs, 0.1 s later. Needs OpenGL, no screen
 (``MUJOCO_GL=egl``). docs/how_to/own_arm.md has the numbers.
@@ -136,7 +136,7 @@ class Reach(control.Task):
 
 
 def make_env(count: int, seed: int, *transforms) -> TransformedEnv:
-    """Arms side by side, of which 30 % of the readings get lost."""
+    """Returns arms side by side, of which 30 % of the readings get lost."""
 
     def one() -> EnvBase:
         arm = control.Environment(mujoco.Physics.from_xml_string(XML), Reach(), STEPS * DT, control_timestep=DT)
@@ -162,7 +162,7 @@ def demonstrate(episodes: int, seed: int) -> TensorDict:
 
 
 def make_filter(facts: dict[str, list[float]], error: dict[str, list[float]], members: int = 32) -> FusedFilter:
-    """State [angles rad, speeds rad/s]; a learned motion, the camera, the encoders.
+    """Returns the state [angles rad, speeds rad/s]; a learned motion, the camera, the encoders.
 
     Args:
         facts: means and standard deviations of the demonstrations; plain numbers, for the filter's ``config.json``.
@@ -200,7 +200,7 @@ def make_filter(facts: dict[str, list[float]], error: dict[str, list[float]], me
 
 @torch.no_grad()
 def camera_errors(model: FusedFilter, rows: TensorDict, lasting: bool) -> dict[str, list[float]]:
-    """The camera's errors on rows ``[B, T]``, as white noise, or as what lasts from picture to picture beside some."""
+    """Estimates the camera's errors on rows ``[B, T]``: as white noise, or as white and coloured noise."""
     off = model["camera_sensor"](rows.copy())["sensor", "camera", "ensemble"].mean(-2) - rows["state"][..., :2]
     off = torch.where(rows["observed"], off, torch.nan)
     if not lasting:
@@ -212,7 +212,7 @@ def camera_errors(model: FusedFilter, rows: TensorDict, lasting: bool) -> dict[s
 def learn(
     rollouts: TensorDict, unseen: TensorDict, out: Path, updates: tuple[int, int, int]
 ) -> tuple[FusedFilter, dict]:
-    """Motion and camera on three quarters of the demonstrations; the camera's errors, then the whole, on the others.
+    """Trains motion and camera on three quarters of the demonstrations, error model and filter on the others.
 
     On pictures that it learned from the camera's errors are too small.
     """
@@ -244,7 +244,7 @@ def learn(
 
 
 def errors(model: FusedFilter, rollouts: TensorDict, *without: str) -> tuple[TensorDict, str]:
-    """Root mean squared errors of the belief on rollouts, maybe without a sensor."""
+    """Returns the root mean squared errors of the belief on rollouts, maybe without a sensor."""
     data = rollouts.exclude("next").clone()
     for key in without:
         data[key] = torch.zeros_like(data[key])
@@ -253,7 +253,7 @@ def errors(model: FusedFilter, rollouts: TensorDict, *without: str) -> tuple[Ten
     mean, var = out["belief", "mean"][..., :4], out["belief", "var"][..., :4]  # behind them, the camera's bias
     error = (mean - out["state"]).square().mean((0, 1)).sqrt()
     holds = interval_coverage(mean, var, out["state"], level=0.9).mean()
-    return out, f"{error[:2].mean():.3f} rad, {error[2:].mean():.2f} rad/s, 90 % intervals hold {100 * holds:.0f} %"
+    return out, f"{error[:2].mean():.3f} rad, {error[2:].mean():.2f} rad/s, 90 % coverage {100 * holds:.0f} %"
 
 
 def make_actor() -> ProbabilisticActor:
@@ -265,7 +265,7 @@ def make_actor() -> ProbabilisticActor:
 
 
 def late_env(model: FusedFilter, count: int, seed: int, key=("ahead", "belief", "mean")) -> TransformedEnv:
-    """Arms whose actions run late; the filter, and what the policy sees: a belief and the goal."""
+    """Returns arms whose actions run late; the filter, and what the policy sees: a belief and the goal."""
     keep = [("belief", "mean"), ("belief", "var")]
     belief = DEnKFTransform(model, ahead=BeliefAhead(model, LATE, keep=keep))
     return make_env(
@@ -299,7 +299,7 @@ def ppo(model: FusedFilter, actor: ProbabilisticActor, batches: int, arms: int =
 
 @torch.no_grad()
 def test(model: FusedFilter, actor: ProbabilisticActor, key, arms: int) -> float:
-    """The mean return where the policy sees another entry."""
+    """Returns the mean return where the policy sees another entry."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return late_env(model, arms, 1000, key).rollout(STEPS, actor)["next", "reward"].sum((1, 2)).mean().item()
 

@@ -9,8 +9,8 @@ rate of its own, here 10, 100 and 50 Hz, on one clock in s. The camera sees wher
 goes, with gaps. ``examples/kitti.py``, ``ur5.py`` and ``lerobot.py`` are the same page for other robots.
 
 Without --root it takes about a minute and a half of one core. Three unseen runs, 30 % of the frames missing: the filter
-is off by about 2 cm and 10 cm/s, the last readings by about 6 cm and 19 cm/s (root mean squared errors). The 90 %
-intervals hold 97 % of the positions and 88 % of the speeds.
+is off by about 2 cm and 10 cm/s, the last readings by about 6 cm and 19 cm/s (root mean squared errors). The
+coverage of the 90 % intervals is 97 % for the position and 88 % for the speed.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from torch_denkf.modules import (
 from torch_denkf.plots import plot_bands
 from torch_denkf.training import hold_last
 
-RATE = 20.0  # rows a second of the data set
+RATE = 20.0  # rows per second of the data set
 
 
 def make_recordings(root: Path, runs: int, seconds: float) -> None:
@@ -85,7 +85,7 @@ def make_recordings(root: Path, runs: int, seconds: float) -> None:
 
 
 def read(root: Path, **options) -> RecordingReplay:
-    """The runs of a folder on one clock. A hash of a run's name says for which split it is."""
+    """Returns the runs of a folder on one clock; a hash of a run's name decides its split."""
     runs = [
         Recording(
             name=video.stem,
@@ -99,11 +99,11 @@ def read(root: Path, **options) -> RecordingReplay:
 
 
 def make_filter(data: RecordingReplay) -> Filter:
-    """Learned motion; the camera's sensor and its analysis; then the encoder's, on what the camera left."""
+    """Returns learned motion; the camera's sensor and its analysis; then the encoder's, on what the camera left."""
     facts = data.statistics
     loc, scale = facts["state", "mean"], facts["state", "std"]
     transition = LearnedTransition(StochasticMLP(2, 2, output_gain=0.1), loc=loc, scale=scale)
-    pushes = (torch.tensor([0.01, 0.2]) * scale).tolist()  # what may change in a step beside the learned motion
+    pushes = (torch.tensor([0.01, 0.2]) * scale).tolist()  # what may change in a step in addition to the learned motion
     initial = FromSensor([0], mean=loc, std=scale, ensemble_size=32)
     encoder = {"observation_key": "encoder", "observed_key": "encoder_observed"}
     encoder |= {"predicted_key": "encoder_predicted", "noise_variance_key": "encoder_noise"}
@@ -132,7 +132,7 @@ def make_filter(data: RecordingReplay) -> Filter:
 
 
 def train(model: Filter, data: RecordingReplay, out: Path, updates: tuple[int, int]) -> None:
-    """The sensor alone, then all of the filter through 20 steps; resumes where it was broken off."""
+    """The sensor alone, then all of the filter through 20 steps; resumes after an interruption."""
     scale = data.statistics["state", "std"]
     loss = DEnKFLoss(model, state_scale=scale, observation_scale=scale[:1], nll=0.02)
     sensor = Stage("sensor", SensorLoss(model, observation_scale=scale[:1]), data.draw, updates[0], lengths={0: 8})
@@ -179,7 +179,7 @@ def main() -> None:
         error = 100 * (states - truth).square().mean((0, 1)).sqrt()
         print(f"  {name:<15}{error[0]:.1f}  {error[1]:.1f}")
     holds = 100 * interval_coverage(belief, seen["belief", "var"], truth, level=0.9)
-    print(f"  the 90 % intervals hold {holds[0]:.0f} % of the positions and {holds[1]:.0f} % of the speeds")
+    print(f"  90 % coverage: position {holds[0]:.0f} %, speed {holds[1]:.0f} %")
     draw(seen[0], reading[0], args.out / f"{unseen.episodes[0].name}.png")
 
 

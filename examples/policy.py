@@ -91,7 +91,7 @@ class LearningFilter:
 
 
 def make_actor(module: nn.Module, in_keys: list, *before: TensorDictModuleBase) -> ProbabilisticActor:
-    """A Gaussian torque in Nm, which the motor clamps; ``before`` writes what the module reads."""
+    """Returns a Gaussian torque in Nm, which the motor clamps; ``before`` writes what the module reads."""
     spread = AddStateIndependentNormalScale(1, init_value=0.7)  # 2 Nm at first
     nn.init.normal_(module[-1].weight, std=0.001)
     head = TensorDictModule(nn.Sequential(module, spread), in_keys, ["loc", "scale"])

@@ -77,7 +77,7 @@ def with_noise(drive: TensorDict, std: float) -> TensorDict:
 
 
 def make_filter(frames: TensorDict, dt: float) -> DEnKF:
-    """The paper's filter for visual odometry: known motion of the pose, learned change of the velocities."""
+    """Returns the paper's filter for visual odometry: known motion of the pose, learned change of the velocities."""
     velocity = frames["state"][:, VELOCITIES]
     loc, scale = velocity.mean(0), velocity.std(0)
     image_shape = tuple(frames["pixels"].shape[1:])
@@ -188,7 +188,7 @@ def track(denkf: DEnKF, drive: TensorDict, missing: float) -> TensorDict:
 
 
 def estimate(rollout: TensorDict, mean_velocity: torch.Tensor, dt: float) -> dict[str, torch.Tensor]:
-    """The states [T, 5] that the filter, the sensor alone and dead reckoning make of one drive."""
+    """Returns the states [T, 5] that the filter, the sensor alone and dead reckoning make of one drive."""
     start, readings, observed = rollout["state"][0, :3], rollout["sensor", "ensemble"].mean(1), rollout["observed"]
     held = hold_last(readings, observed, rollout["state"][0, VELOCITIES])
 
@@ -204,7 +204,7 @@ def estimate(rollout: TensorDict, mean_velocity: torch.Tensor, dt: float) -> dic
 
 
 def compare(rollouts: list[TensorDict], estimates: list[dict], window: int) -> str:
-    """A Markdown table of errors, averaged over the drives."""
+    """Returns a Markdown table of errors, averaged over the drives."""
     lines = [
         f"| | translation, m/m over {window} steps | rotation, deg/m | v, RMSE m/s | theta_dot, RMSE deg/s |",
         "|---|---|---|---|---|",
@@ -221,10 +221,8 @@ def compare(rollouts: list[TensorDict], estimates: list[dict], window: int) -> s
     belief, truth = together["belief"], together["state"]
     v, theta_dot = 100 * interval_coverage(belief["mean"], belief["var"], truth, level=0.9)[VELOCITIES]
     blind = 100 * (1 - torch.cat([r["observed"] for r in rollouts]).float().mean())
-    lines.append(
-        f"\nThe sensor is blind in {blind:.0f} % of the steps. The DEnKF's 90 % intervals hold {v:.0f} % of v and "
-    )
-    return "\n".join(lines) + f"{theta_dot:.0f} % of theta_dot."
+    lines.append(f"\nThe sensor is blind in {blind:.0f} % of the steps. 90 % coverage of the DEnKF: v {v:.0f} %, ")
+    return "\n".join(lines) + f"theta_dot {theta_dot:.0f} %."
 
 
 def draw(rollout: TensorDict, estimates: dict, dt: float, file: Path) -> None:

@@ -50,7 +50,7 @@ class Swing(nn.Module):
 
 
 def record(runs: int, steps: int) -> TensorDict:
-    """True states, and the encoder's readings of the angle."""
+    """Returns true states, and the encoder's readings of the angle."""
     swing, state, states = Swing(), START[0] + START[1] * torch.randn(runs, 2), []
     for _ in range(steps):
         states.append(state)
@@ -62,7 +62,7 @@ def record(runs: int, steps: int) -> TensorDict:
 
 
 def make_denkf(swing: Swing | None = None, members: int = 100) -> DEnKF:
-    """An ensemble filter of the pendulum."""
+    """Returns an ensemble filter of the pendulum."""
     return DEnKF(
         transition=LearnedTransition(swing or Swing(), residual=False),
         sensor=None,
@@ -75,7 +75,7 @@ def make_denkf(swing: Swing | None = None, members: int = 100) -> DEnKF:
 
 
 def make_ukf() -> UKF:
-    """An unscented Kalman filter of the pendulum."""
+    """Returns an unscented Kalman filter of the pendulum."""
     return UKF(
         LearnedTransition(Swing(), residual=False),
         None,
@@ -88,7 +88,7 @@ def make_ukf() -> UKF:
 
 
 def show(name: str, mean: Tensor, var: Tensor, truth: Tensor) -> None:
-    """Errors of angle and rate, and how often the 90 % intervals hold the truth."""
+    """Returns errors of angle and rate, and the coverage of the 90 % intervals."""
     error = mean - truth
     angle, rate = error.square().flatten(0, 1).mean(0).sqrt().tolist()
     inside = 100 * (error.abs() < 1.645 * var.sqrt()).float().mean().item()
@@ -104,7 +104,7 @@ def main() -> None:
     recordings = record(runs, steps)
     truth = recordings["state"]
 
-    print(f"{'RMSE over recordings':34s} angle       rate          90 % intervals hold")
+    print(f"{'RMSE over recordings':34s} angle       rate          90 % coverage")
     smoothers = {
         "DEnKF, EnKS, 5 steps ahead": EnKS(make_denkf(), lag=5),
         "DEnKF, EnRTS, 5 steps ahead": EnRTS(make_denkf(), lag=5),
@@ -130,7 +130,7 @@ def main() -> None:
     print(f"  the rate now is known to {now[..., 1].square().mean().sqrt():.3f} rad/s,")
     print(f"  that of 10 steps ago to  {then[..., 1].square().mean().sqrt():.3f} rad/s")
 
-    # A loss may score what is believed in hindsight: here it finds the length, which starts twice too large.
+    # A loss may score the smoothed belief: here it finds the length, which starts twice too large.
     swing = Swing(length=2.0)
     denkf = make_denkf(swing, members=30)
     loss = DEnKFLoss(denkf, state=0.0, transition=0.0, smoothed=1.0, smoother=partial(EnRTS, lag=10))

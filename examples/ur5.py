@@ -3,13 +3,13 @@
     python examples/ur5.py                  # demos that are collected here: MuJoCo, an expert that picks and pushes
     python examples/ur5.py --root DEMOS     # a folder that `denkf collect-ur5` filled,
 
-The camera sends a picture every seventh step, about. The sensor reads joints and place from it; the filter learns how
-commands move the arm, and goes on between pictures. ``examples/kitti.py``, ``lerobot.py`` and ``own_recordings.py`` are
+The camera sends an image about every seventh step. The sensor reads joints and position from it; the filter learns how
+commands move the arm, and predicts between images. ``examples/kitti.py``, ``lerobot.py`` and ``own_recordings.py`` are
 the same page for other robots. The full study, with every filter and disturbance, is ``python -m benchmarks.ur5``.
 
 Without --root it takes about four minutes of one core. 40 unseen demos with pictures in 10 % of the steps, mean
 absolute error: joints about 5 degrees and place 2.8 cm for the filter, 10 degrees and 2.8 cm for the last reading. The
-sensor has learned from few demos at 64 px, and the 90 % intervals hold 76 %. This arm follows its commands well: the
+sensor has learned from few demos at 64 px, and the 90 % coverage is 76 %. This arm follows its commands well: the
 last command alone is off by 1.4 degrees. The study, with a larger sensor and more demos, reaches 1.5 degrees from
 pictures alone.
 """
@@ -55,7 +55,7 @@ UNITS = [180 / math.pi] * 7 + [100.0] * 3  # the state is in rad and m
 
 
 def make_filter(data: UR5ExperienceReplay) -> DEnKF:
-    """Learned motion of the ten numbers under commands, and a sensor that reads all of them from one picture."""
+    """Returns the filter: learned motion of ten components under commands; a sensor that reads them from one image."""
     facts = data.statistics
     loc, scale = facts["state", "mean"], facts["state", "std"]
     image = tuple(data[0]["pixels"].shape)
@@ -81,7 +81,7 @@ def make_filter(data: UR5ExperienceReplay) -> DEnKF:
 
 
 def train(denkf: DEnKF, shots: UR5ExperienceReplay, data: UR5ExperienceReplay, out: Path, updates) -> None:
-    """The sensor on single pictures, then all of the filter through 32 steps; resumes where it was broken off."""
+    """The sensor on single pictures, then all of the filter through 32 steps; resumes after an interruption."""
     scale = data.statistics["state", "std"]
     of_sensor = SensorLoss(denkf, observation_scale=scale)
     of_filter = DEnKFLoss(denkf, state_scale=scale, observation_scale=scale, nll=0.02)
@@ -138,9 +138,7 @@ def main() -> None:
         print(f"  {name:<15}{error[:7].mean():.2f}  {error[7:].mean():.2f}")
     late = (rollout["action"] - truth[..., :7]).abs().mean() * UNITS[0]
     print(f"  {'last command':<15}{late:.2f}")
-    print(
-        f"  the 90 % intervals hold {holds[:7].mean():.0f} % of the joints and {holds[7:].mean():.0f} % of the places"
-    )
+    print(f"  90 % coverage: joints {holds[:7].mean():.0f} %, positions {holds[7:].mean():.0f} %")
     draw(seen[0], reading[0], args.out / f"{unseen.episodes[0].name}.png")
 
 

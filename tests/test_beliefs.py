@@ -32,7 +32,7 @@ def completed(given, wanted, **options):
         (("count",), Belief),
     ],
 )
-def test_the_names_that_are_carried_tell_the_kind(carried, kind):
+def test_kind_of_belief_from_carried_names(carried, kind):
     keys = names("ensemble", "mean", "cov", "var", "log_weight")
     (found,) = kinds_of([*keys, *names(*carried)], carry=names(*carried))
     assert type(found) is kind
@@ -106,7 +106,7 @@ def test_on_a_circle_the_mean_of_members_is_that_of_directions(float64):
     assert float(var) == pytest.approx(2 * (torch.pi - 3.1) ** 2)
 
 
-def test_what_does_not_follow_is_looked_for_where_the_belief_is_stored(float64):
+def test_independent_entries_are_read_from_the_stored_belief(float64):
     given = entries(ensemble=torch.randn(4, 2))
     age = torch.tensor([3.0])
     out = completed(given, names("mean", "age"), stored=entries(age=age, mean=torch.full((2,), torch.nan)))
@@ -116,13 +116,13 @@ def test_what_does_not_follow_is_looked_for_where_the_belief_is_stored(float64):
         completed(given, names("age"))
 
 
-def test_what_is_there_is_left_alone():
+def test_existing_entries_are_kept():
     given = entries(mean=torch.zeros(2), cov=torch.eye(2), var=torch.full((2,), 7.0))
     out = completed(given, names("mean", "cov", "var"))
     assert all(out[key] is value for key, value in given.items())
 
 
-def test_moments_beside_what_is_carried_belong_to_the_belief():
+def test_uncarried_moments_belong_to_the_belief():
     written = [*names("ensemble", "mean", "var", "cov", "gain"), ("info", "mean"), "mean"]
     assert summary_keys(names("ensemble"), written) == names("mean", "var", "cov")
 

@@ -77,7 +77,7 @@ _VARIABLE = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 @cache
 def _signature(owner: type) -> tuple[inspect.Signature, dict[str, str], bool]:
-    """Returns the signature without ``self``; what ``**options`` hold, by name; and whether these may be anything."""
+    """Returns the signature without ``self``, the names in ``**options``, and whether others are allowed."""
     function = inspect.unwrap(getattr(owner, "__init__"))  # noqa: B009  # mypy distrusts it on a type
     signature = inspect.signature(function)
     parameters = list(signature.parameters.values())[1:]
@@ -103,7 +103,7 @@ def _of_bases(owner: type) -> dict[str, str]:
 
 
 def _fields(kind: type) -> Iterator[tuple[str, str]]:
-    """Names and annotations of a TypedDict, as text."""
+    """Returns names and annotations of a TypedDict, as text."""
     for name, annotation in kind.__annotations__.items():
         yield name, getattr(annotation, "__forward_arg__", str(annotation))
 

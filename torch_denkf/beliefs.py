@@ -57,14 +57,14 @@ def moments_of(
 
 
 class Belief:
-    """A belief whose entries stand under one prefix; as it is, one of no known kind.
+    """A belief whose entries are stored under one prefix; as it is, one of no known kind.
 
     Args:
         prefix: of its entries, ``("belief",)`` for example.
         space: in which the state lives; ``None`` for plain numbers.
 
     Attributes:
-        carried: names of the entries that go on from step to step; the first holds points of the state's space.
+        carried: names of the entries that continue from step to step; the first holds points of the state's space.
         carry: their keys.
 
     Example:
@@ -102,7 +102,7 @@ class Belief:
         return value.isfinite().all()
 
     def flaws(self, entries: Mapping[NestedKey, Tensor]) -> list[str]:
-        """Names what is wrong with a belief whose numbers are finite."""
+        """Names the defects of a belief whose values are finite."""
         return []
 
     def limited(self, held: Mapping[str, Tensor], ceiling: float) -> dict[str, Tensor]:
@@ -209,7 +209,7 @@ def kinds_of(
     Args:
         keys: of entries of beliefs.
         space: in which the state lives; ``None`` for plain numbers.
-        carry: those that go on from step to step, which alone tell the kind where a prefix has any.
+        carry: those that continue from step to step, which alone tell the kind where a prefix has any.
     """
     groups: dict[tuple[str, ...], list[NestedKey]] = {}
     for key in keys:

@@ -49,7 +49,7 @@ def check_module(name: str, module: Any) -> None:
 
 
 def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> Entries:
-    """Runs a module on entries, and returns what it writes: a sub-model, a sequence, or any TensorDict module.
+    """Runs a module on entries, and returns its outputs: a sub-model, a sequence, or any TensorDict module.
 
     Another TensorDict module gets a TensorDict of what it names among its keys, so it sees the same in a step as in a
     sequence. So does a sub-model with a ``forward`` of its own, or with forward hooks.
@@ -80,7 +80,7 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
 def linearise(
     module: TensorDictModuleBase, entries: Entries, call: Call
 ) -> tuple[Entries, Tensor, tuple[Space, Space] | None] | None:
-    """Returns what a module says of itself, see :meth:`SubModel.linearised`; ``None`` where only autograd knows."""
+    """Returns a module's declared linearisation, see :meth:`SubModel.linearised`; ``None`` leaves it to autograd."""
     try:
         return _explained(module.linearised, module, entries, call) if runs_as_written(module) else None
     except NotImplementedError:  # a motion, or a measurement, without its optional gradient
@@ -102,7 +102,7 @@ def _explained(method: Callable[[Entries, Call], T], module: SubModel, entries: 
 
 
 def run_modules(modules: Iterable[tuple[str, TensorDictModuleBase]], entries: Entries, call: Call) -> Entries:
-    """Runs named modules one after the other, and returns what they write."""
+    """Runs named modules one after the other, and returns their outputs."""
     entries, written = dict(entries), {}
     for name, module in modules:
         out = run_module(module, entries, call.part(name))

@@ -70,7 +70,7 @@ def flat_noise(noise: Noise | TensorDictBase, *place: str) -> Entries:
 
 
 class SubModel(Checked, TensorDictModule):
-    """A part of a filter: a function of tensors, and the keys of what it reads and writes.
+    """A part of a filter: a function of tensors, with the keys of its inputs and outputs.
 
     A sub-class declares its keys in ``__init__`` and implements :meth:`compute`. Called on a TensorDict it reads and
     writes there like any TensorDict module; a filter calls :meth:`on_entries` on a dictionary instead: it costs less.
@@ -145,7 +145,7 @@ class SubModel(Checked, TensorDictModule):
         raise TypeError(f"{type(self).__name__} has no compute(): write it, see SubModel.")
 
     def jacobian(self, *values: Any) -> tuple[Tensor, Tensor] | None:
-        """Returns what :meth:`compute` does without noise, and its Jacobian by what it reads first, if it is known.
+        """Returns the result of :meth:`compute` without noise, and its Jacobian by the first input, if known.
 
         Otherwise automatic differentiation finds it, which takes ten times as long. A subclass that writes a new
         :meth:`compute` or the like, and no new Jacobian, has none.
@@ -161,7 +161,7 @@ class SubModel(Checked, TensorDictModule):
         return None
 
     def linearised(self, entries: Entries, call: Call) -> tuple[Entries, Tensor, tuple[Space, Space] | None] | None:
-        """Returns what :meth:`on_entries` does, the :meth:`jacobian`, and between whose tangents it leads, if known."""
+        """Returns the result of :meth:`on_entries`, the :meth:`jacobian`, and the spaces of its tangents, if known."""
         found = self.jacobian(*self.values(entries))
         return None if found is None else ({self.out_keys[0]: found[0]}, found[1], self.tangents_of)
 
@@ -209,7 +209,7 @@ class SubModel(Checked, TensorDictModule):
         return "noise" in self._wants
 
     def on_entries(self, entries: Entries, call: Call) -> Entries:
-        """Returns what the sub-model writes on entries; changes nothing.
+        """Returns the sub-model's outputs for entries; changes nothing.
 
         Raises:
             KeyError: if an entry is missing.
@@ -375,7 +375,7 @@ class Transition(SubModel):
     mask_key: NestedKey | None = None
 
     def without_step(self, entries: Entries) -> Entries:
-        """Returns what it writes in addition to the forecast where an episode begins and no step leads there."""
+        """Returns the outputs in addition to the forecast at the start of an episode, where no step is taken."""
         return {}
 
 
@@ -446,7 +446,7 @@ class Update(SubModel):
     def updates_ensemble(self) -> bool:
         """Tells whether it reads an ensemble, its predicted observations, the reading, its noise, and a mask.
 
-        Such an analysis can be given a past to correct (:meth:`move_past`).
+        Such an analysis can be given a lag window to correct (:meth:`move_past`).
         """
         keys = [unravel_key(key) for key in self.in_keys]
         read = [unravel_key(key) for key in (self.predicted_key, *self.reading_keys)]
@@ -496,7 +496,7 @@ class Update(SubModel):
         return entries
 
     def on_aligned(self, entries: Entries, call: Call) -> Entries:
-        """Does what :meth:`on_entries` does, on entries that are :meth:`aligned` already."""
+        """Works as :meth:`on_entries`, on entries that are :meth:`aligned` already."""
         return self.on_entries(entries, call)
 
 

@@ -53,7 +53,7 @@ class Arm:
         return torch.cat([angles.cos(), angles.sin(), velocity], -1)
 
     def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Angles in (-pi, pi] and velocities; a sensor's errors may follow in the state."""
+        """Returns angles in (-pi, pi] and velocities; a sensor's errors may follow in the state."""
         cos, sin, velocity = state[..., : 3 * self.joints].split(self.joints, -1)
         return torch.atan2(sin, cos), velocity
 
@@ -63,7 +63,7 @@ class Arm:
         return torch.stack([links * turned.cos(), links * turned.sin()], -1).cumsum(-2)
 
     def angles(self, places: Tensor) -> Tensor:
-        """The angles, in [-pi, pi), of links that end at ``places``, whatever their lengths."""
+        """Returns the angles, in [-pi, pi), of links that end at ``places``, whatever their lengths."""
         x, y = torch.cat([places[..., :1, :], places.diff(dim=-2)], -2).unbind(-1)
         turned = torch.atan2(y, x) - self.ahead
         return wrap(torch.cat([turned[..., :1], turned.diff(dim=-1)], -1))
@@ -73,7 +73,7 @@ class Arm:
         return self.places(angles)[..., -1, :]
 
     def goal(self, emitted: TensorDictBase) -> Tensor:
-        """The joint angles to go to, at the start of an episode."""
+        """Returns the goal of the joint angles at the start of an episode."""
         angles = self.split(self.state(emitted))[0]
         if self.domain != "reacher":  # upright, away from floor and walls
             return 1.6 * torch.rand_like(angles) - 0.8
@@ -85,12 +85,12 @@ class Arm:
         return torch.stack([shoulder, wrist], -1)
 
     def hold(self, angles: Tensor) -> Tensor:
-        """The action that holds the arm against gravity, of angles ``[*, J]``; angles are 0 where a link stands up."""
+        """Returns the action that holds the arm against gravity at angles ``[*, J]``, which are 0 for links upright."""
         flat = torch.tensor(self.weights) * angles.cumsum(-1).sin()
         return -flat.flip(-1).cumsum(-1).flip(-1) / torch.tensor(self.torques)  # a joint carries all that follows
 
     def control(self, state: Tensor, goal: Tensor, explore: float = 0.0) -> Tensor:
-        """The policy, whatever its estimate of the state comes from.
+        """Returns the policy, whatever its estimate of the state comes from.
 
         Proportional to the angles' errors, damped, and what holds the arm at its goal.
 

@@ -18,7 +18,7 @@ from torch_denkf.training.parts import train_part
 
 # What follows was chosen on other episodes than those of the tests, see README.md.
 MEMBERS = 256
-DRIFT = 0.005  # noise of an angle after a way of 1 rad, beside those of the accelerations and of a step, rad
+DRIFT = 0.005  # noise of an angle after a way of 1 rad, in addition to those of the accelerations and of a step, rad
 LENGTH = 0.3  # rad: a motion after which a picture is read with other errors
 FASTER = 1.25  # than any joint was seen to turn: no member is
 
@@ -48,7 +48,7 @@ class ArmTransition(m.Transition):
         self.register_buffer("bias", bias)
 
     def faster(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the change of the velocities in a step, rad/s, of states ``[*, 3 J]``.
+        """Returns mean and standard deviation of the velocity change in a step, rad/s, at states ``[*, 3 J]``.
 
         The network reads velocities no larger than ``fastest``: beyond, the noise that it claims grows with them.
         """
@@ -68,7 +68,7 @@ class ArmTransition(m.Transition):
         mean, std = self.faster(state, action)
         after = (velocity + mean + std * torch.randn_like(std)).clamp(-self.fastest, self.fastest)
         ways = self.arm.dt * velocity.abs()
-        # Without the creep an arm at rest would be believed for ever.
+        # Without the creep the variance of an arm at rest would vanish.
         drift = (DRIFT**2 * ways + self.arm.creep**2).sqrt() * torch.randn_like(ways)
         turned = angles + self.arm.dt * torch.lerp(velocity, after, self.lead) + drift
         moved = self.arm.join(turned, after)
@@ -80,7 +80,7 @@ class ArmTransition(m.Transition):
 
 
 def make_filter(arm: Arm, motion: TensorDict, sensor: JointSensor | None, error: Tensor | None) -> DEnKF:
-    """State [cos, sin, velocity] of each joint; encoders read cosines and sines, a sensor of pictures places.
+    """Returns a filter of the state [cos, sin, velocity] per joint; encoders read cos and sin, images link positions.
 
     Args:
         arm: the arm.

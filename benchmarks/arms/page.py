@@ -31,7 +31,7 @@ def difference(rows: pd.DataFrame, name: str) -> str:
 
 
 def page(rows: pd.DataFrame) -> str:
-    """The tables of all tasks and sources that there are rows of; the truth is never missing."""
+    """Returns the tables of all tasks and sources that there are rows of; the truth is never missing."""
     shown = {name: SCORES[name] for name in ("angle", "tip", "velocity", "effort")}
     cases = {case: [difference(own, name) for name in shown] for case, own in rows.groupby(CASE, sort=False)}
     compared = pd.DataFrame.from_dict(cases, orient="index", columns=list(shown.values()))

@@ -64,7 +64,7 @@ class JointSensor(Sensor):
         self.arm, self.observation_dim = arm, 2 * arm.joints
 
     def places(self, maps: Tensor) -> Tensor:
-        """Means of maps ``[*B, J, H, W]``, m ``[*B, J, 2]``."""
+        """Returns means of maps ``[*B, J, H, W]``, m ``[*B, J, 2]``."""
         share = maps.flatten(-2).softmax(-1).unflatten(-1, maps.shape[-2:])
         middle = torch.stack([share.sum(-2) @ MIDDLES, -(share.sum(-1) @ MIDDLES)], -1)  # rows go down
         return self.arm.view * middle

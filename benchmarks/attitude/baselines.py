@@ -56,7 +56,7 @@ def error_state_filter(
     start_std: float = 0.05,
     bias_std: float = 0.01,
 ) -> tuple[ndarray, ndarray, ndarray]:
-    """An extended Kalman filter of an orientation and the gyro's bias, whose errors are turns in the body's axes.
+    """Returns an extended Kalman filter of orientation and gyro bias, with orientation errors in body axes.
 
     Args:
         gyro: ``[R, T, 3]`` rad/s.
@@ -100,7 +100,7 @@ def error_state_filter(
 
 
 def _up(q: ndarray) -> ndarray:
-    """The world's z in the body's axes."""
+    """Returns the world's z in the body's axes."""
     return matrix(q)[..., 2, :]
 
 

@@ -34,7 +34,7 @@ class GivenNoise(Sensor):
         self.observation_dim = 3
 
     def compute(self, std):
-        """The same for all three numbers."""
+        """Returns the same for all three numbers."""
         return std.square().expand(*std.shape[:-1], 3)
 
 
@@ -50,7 +50,7 @@ class VelocityInBody(SubModel):
 
 
 def prepared(data: TensorDict) -> TensorDict:
-    """A log with what the filters read besides: where up is, features of that reading, masks, and states.
+    """Returns a log with what the filters read besides: where up is, features of that reading, masks, and states.
 
     Args:
         data: of :mod:`benchmarks.attitude.task`, ``[R, T]``.
@@ -137,7 +137,7 @@ def inertial_filter(
             module that writes variances ``[*B, 3]``.
         members: of ensembles.
         magnetometer: read it, too.
-        feet: read ``"leg"``, the velocity in the body's axes by the foot that stands, in the place of rest.
+        feet: read ``"leg"``, the body velocity by the stance foot, instead of a velocity of zero.
         **options: of the ensemble's analyses.
     """
     sheet = Sensors()

@@ -1,4 +1,4 @@
-"""Roll and pitch of a walk: a filter's intervals, Mahony's filter beside them."""
+"""Roll and pitch of a walk: a filter's intervals, Mahony's filter for comparison."""
 
 from __future__ import annotations
 

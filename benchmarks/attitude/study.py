@@ -30,7 +30,7 @@ STEADY = slice(50, 1168)  # rows of iCub's log that are scored; studies of its v
 PULLS = (0.1, 0.2, 0.5, 1.0)  # 1/s; Mahony's integral gain is a twentieth of it
 #: In rad, of one reading: the accelerometer's direction is off while the body is pushed, for many rows in the same way.
 UP_NOISES = (0.3, 0.5, 1.0, 2.0)
-#: In m/s, of one of ten readings a second that the body rests: a velocity lasts for many of them, too.
+#: In m/s, of one of ten readings per second that the body rests: a velocity lasts for many of them, too.
 REST_NOISES = (1.0, 2.0, 3.0, 5.0)
 #: rad/s/sqrt(Hz): the data sheet's; of iCub set by us, because the times of its rows jitter by milliseconds.
 GYRO_NOISES = {"simulated": Sensors().gyro_noise, "iCub": 5e-3}
@@ -64,7 +64,7 @@ class Study:
 
 
 def scores(orientation: Tensor, data: TensorDict, rows: slice, cov: Tensor | None = None) -> dict[str, float]:
-    """Errors in degrees, and how they compare with what a filter claims.
+    """Returns errors in degrees, and how they compare with what a filter claims.
 
     Args:
         orientation: ``[R, T, 4]``.
@@ -198,7 +198,7 @@ def library_rows(
 
 
 def chosen(make: Callable, noises: Sequence[float], data: TensorDict, rows: slice) -> float:
-    """The standard deviation with the least root mean square tilt; all are tried at once."""
+    """Returns the standard deviation with the least root mean square tilt; all are tried at once."""
     several = torch.cat([data] * len(noises))
     several["std"] = torch.tensor(noises).repeat_interleave(len(data)).reshape(-1, 1, 1).expand(*several.shape, 1)
     orientation, _, _ = run(make("EKF", GYRO_NOISES["simulated"], GivenNoise()), several)
@@ -209,7 +209,7 @@ def chosen(make: Callable, noises: Sequence[float], data: TensorDict, rows: slic
 
 
 def learned_noise(data: TensorDict, up_noise: float, updates: int, window: int = 250) -> DiagonalNoise:
-    """The noise of the accelerometer's direction by features of the reading, trained through the extended filter.
+    """Returns the accelerometer's direction noise as a network of the reading, trained through the EKF.
 
     The score is the CRPS of the tilt about x and about y, which are tangents at the filter's mean.
 
@@ -254,9 +254,9 @@ def picture(data: TensorDict, pull: float, path: Path) -> None:
 
 
 def page(rows: list[dict], study: Study) -> str:
-    """The table."""
+    """Returns the table."""
     lines = [
-        "# Which way is up",
+        "# Attitude from an inertial sensor",
         "",
         "Tilt is the angle between where up is and where it is thought to be; orientation is the angle of the whole "
         f"error, heading included. Root mean squares. Simulated: {study.runs} runs of {study.seconds:g} s, without "
@@ -264,7 +264,7 @@ def page(rows: list[dict], study: Study) -> str:
         f"filter's covariance, over its expectation: above 1 a filter is too sure. The {LEVEL:.0%} intervals are those "
         "of the tilt about x and about y.",
     ]
-    titles = ("filter", "setting", "tilt, deg", "largest, deg", "orientation, deg", "NEES", "held", "ms a step")
+    titles = ("filter", "setting", "tilt, deg", "largest, deg", "orientation, deg", "NEES", "coverage", "ms per step")
     for data, reads in dict.fromkeys((row["data"], row["reads"]) for row in rows):
         lines += ["", f"## {data}: {reads}", "", *head(*titles)]
         for row in rows:
@@ -289,7 +289,7 @@ def page(rows: list[dict], study: Study) -> str:
 
 
 def found_settings(study: Study, settled: slice) -> tuple[float, float, DiagonalNoise]:
-    """Both settings by other runs, and the learned noise."""
+    """Returns both settings, chosen on other runs, and the learned noise."""
     others = study.runs // 3 + 1
     validation = prepared(simulated(others, study.seconds, study.seed + 1))
     up_noise = chosen(attitude_filter, UP_NOISES[-2:] if study.smoke else UP_NOISES, validation, settled)

@@ -68,7 +68,7 @@ _BODY = f"""
 
 
 def simulated(runs: int, seconds: float, seed: int, sensors: Sensors | None = None) -> TensorDict:
-    """A free body in MuJoCo, pushed and turned at random about a place, and what cheap sensors read of it.
+    """Returns a free body in MuJoCo, pushed and turned at random about a place, and what cheap sensors read of it.
 
     Gyro and accelerometer read the mean over the time since the last row, the magnetometer the moment.
 
@@ -101,7 +101,7 @@ def simulated(runs: int, seconds: float, seed: int, sensors: Sensors | None = No
 
 
 def walking(folder: Path) -> TensorDict:
-    """The humanoid iCub walks 1.5 m in 12 s, with motion capture as truth.
+    """Returns a log of the humanoid iCub, which walks 1.5 m in 12 s, with motion capture as truth.
 
     Args:
         folder: with ``walking.npz`` and ``model.urdf``.
@@ -133,7 +133,7 @@ def walking(folder: Path) -> TensorDict:
 
 
 def tilt_error(orientation: Tensor, truth: Tensor) -> Tensor:
-    """The angle ``[*]`` in rad between where up is in the body's axes and where it is thought to be, of ``[*, 4]``."""
+    """Returns the angle ``[*]`` in rad between the true and the estimated vertical, from quaternions ``[*, 4]``."""
     up = torch.tensor([0.0, 0.0, 1.0]).to(truth)
     one, other = (rotate(SO3().inverse(each), up) for each in (orientation, truth))
     return torch.atan2(torch.linalg.cross(one, other).norm(dim=-1), (one * other).sum(-1))
@@ -170,7 +170,7 @@ def _run(model: mujoco.MjModel, rows: int, random: np.random.Generator) -> tuple
 
 
 def _leg_velocity(urdf: Path, log: dict[str, np.ndarray], gyro: np.ndarray) -> np.ndarray:
-    """The velocity ``[T, 3]`` of the inertial sensor, in the axes of the root, as the standing leg tells it."""
+    """Returns the velocity ``[T, 3]`` of the inertial sensor, in the axes of the root, as the standing leg tells it."""
     tree = ElementTree.parse(urdf)
     for part in list(tree.iter()):
         for child in list(part):
@@ -196,7 +196,7 @@ def _leg_velocity(urdf: Path, log: dict[str, np.ndarray], gyro: np.ndarray) -> n
 
 
 def _of_rpy(angles: Tensor) -> Tensor:
-    """The quaternions of roll, pitch and yaw ``[*, 3]``, turns about x, then y, then z of the world."""
+    """Returns the quaternions of roll, pitch and yaw ``[*, 3]``: rotations about x, then y, then z of the world."""
     turns = [SO3().exp(angles[..., axis : axis + 1] * torch.eye(3).to(angles)[axis]) for axis in range(3)]
     return SO3().compose(turns[2], SO3().compose(turns[1], turns[0]))
 

@@ -7,7 +7,7 @@ magnetometer and the latency of the readings are least squares. The place's fiel
 other numbers are found by an evolution strategy that lowers, averaged over the trials, the total error plus the
 inclination error, in degrees, plus 0.3 times the negative logarithm of Student's density of heading and inclination;
 and on every second trial, with 6 axes, the inclination error plus 0.2 times the total error. Factors on the standard
-deviations then make the 90 % intervals hold 90 % of the rows; they are larger as far as factors of all other kinds are
+deviations then set the coverage of the 90 % intervals to 90 %; they are larger as far as factors of all other kinds are
 too small for a kind. The numbers for other kinds, ``all``, are geometric means of the three sets; ``anywhere``, the
 library's, are those with factors where the place's field is not known.
 """
@@ -62,7 +62,7 @@ class Learning:
 
     data: Path = Path("../shared/data/broad")  # folder with .npz files of BROAD
     out: Path | None = None  # numbers.json
-    start: Path | None = None  # numbers.json of the same folds to go on from, else the library's defaults
+    start: Path | None = None  # numbers.json of the same folds to continue from, else the library's defaults
     generations: int = 22  # of the evolution strategy
     seed: int = 0
     smoke: bool = False  # one simulated trial, one generation
@@ -243,7 +243,7 @@ def learn(run: Equations, trials: Sequence[Trial], generations: int, seed: int, 
 
 
 def calibrated(run: Equations, trials: Sequence[Trial], s: ImuSettings) -> ImuSettings:
-    """Returns the numbers with factors on the standard deviations that make the intervals hold 90 %."""
+    """Returns the settings with factors on the standard deviations for a coverage of 90 %."""
     found = [measures(run, Rows(trial, s, short=True), s) for trial in trials]
     kinds = [trial.kind for trial in trials]
     for name in ("heading", "tilt"):
@@ -265,7 +265,7 @@ def factor(needs: Sequence[ndarray]) -> float:
 
 
 def _means(sets: Sequence[ImuSettings]) -> dict:
-    """Returns geometric means of all numbers, but for the place."""
+    """Returns geometric means of all numbers, except for the place."""
     names = [name for name in asdict(sets[0]) if name != "place"]
     return {name: np.exp(np.mean(np.log([getattr(each, name) for each in sets]), 0)).tolist() for name in names}
 

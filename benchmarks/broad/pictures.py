@@ -1,4 +1,4 @@
-"""Heading and inclination errors of one trial: the filter's with its intervals, VQF's beside them."""
+"""Heading and inclination errors of one trial: the filter's with its intervals, VQF's for comparison."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from scipy.stats import bootstrap
 def bootstrap_interval(
     values: Sequence[float], statistic: Callable[..., np.ndarray] = np.mean
 ) -> tuple[float, float, float]:
-    """A statistic, and the bounds of its 95 % percentile bootstrap interval.
+    """Returns a statistic, and the bounds of its 95 % percentile bootstrap interval.
 
     The bounds are NaN where there is but one value, or all are the same.
 

@@ -17,14 +17,14 @@ from torch_denkf.deployment.workers import follow_parent
 
 
 def once(file: Path, rows: Callable[[], list[dict]]) -> None:
-    """Computes rows and leaves them in a JSON file, unless it is there: a study that was broken off goes on."""
+    """Computes rows and leaves them in a JSON file, unless it is there: an interrupted study resumes."""
     if file.exists():
         return
     write_text(file, json.dumps(rows()))
 
 
 def same_settings(out: Path, settings: dict) -> None:
-    """Leaves settings in ``out/settings.json``; a study that goes on there needs the same.
+    """Leaves settings in ``out/settings.json``; a study that continues there needs the same.
 
     Raises:
         SystemExit: if others are there; names them.
@@ -58,7 +58,7 @@ def side_by_side(calls: Sequence[Callable[[], object]], processes: int, title: s
 
 
 def compute(jobs: Mapping[Path, Callable[[], list[dict]]], processes: int, title: str) -> list[dict]:
-    """The rows of all jobs, each of which leaves them in a file; those that are there are not computed again."""
+    """Runs all jobs and returns their rows; each job saves its rows in a file, which a resumed run reads."""
     side_by_side([partial(_alone, file, rows) for file, rows in jobs.items()], processes, title)
     return read_rows(jobs)
 
@@ -69,7 +69,7 @@ def _alone(file: Path, rows: Callable[[], list[dict]]) -> None:
 
 
 def read_rows(files: Iterable[Path], shared: Callable[[dict], Hashable] = lambda row: None) -> list[dict]:
-    """All rows of some JSON files.
+    """Returns all rows of some JSON files.
 
     Args:
         files: in the order of their rows.
@@ -92,5 +92,5 @@ def read_rows(files: Iterable[Path], shared: Callable[[dict], Hashable] = lambda
 
 
 def rows_in(out: Path) -> list[dict]:
-    """All rows that a study's folder holds, in ``out/rows``."""
+    """Returns all rows that a study's folder holds, in ``out/rows``."""
     return read_rows(sorted((out / "rows").glob("*.json")))

@@ -13,7 +13,7 @@ from torch_denkf._checks import check_number
 
 
 def lorenz96_tendency(state: Tensor, forcing: float | Tensor = 8.0) -> Tensor:
-    """Time derivative dx_i/dt = (x_{i+1} − x_{i−2}) x_{i−1} − x_i + F, on a circle.
+    """Returns the time derivative dx_i/dt = (x_{i+1} − x_{i−2}) x_{i−1} − x_i + F, on a circle.
 
     Args:
         state: x, ``[..., N]`` with N >= 4, without units.
@@ -38,7 +38,7 @@ def lorenz96_tendency(state: Tensor, forcing: float | Tensor = 8.0) -> Tensor:
 
 
 def lorenz96_step(state: Tensor, dt: float = 0.05, forcing: float | Tensor = 8.0) -> Tensor:
-    """One step of the classical fourth-order Runge-Kutta scheme.
+    """Returns one step of the classical fourth-order Runge-Kutta scheme.
 
     Args:
         state: x, ``[..., N]`` with N >= 4, without units.

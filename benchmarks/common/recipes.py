@@ -83,7 +83,7 @@ class Recipe:
         raise NotImplementedError
 
     def ensemble_loss(self, model: Filter) -> DEnKFLoss:
-        """The fair CRPS of forecast and belief; a score is the mean over what counts."""
+        """Returns the fair CRPS of forecast and belief; a score is the mean over what counts."""
         share = self.state_scale.isfinite().float().mean().item()
         return DEnKFLoss(model, state=share, transition=share, sensor=0.0, state_scale=self.state_scale)
 

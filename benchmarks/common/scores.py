@@ -14,7 +14,7 @@ from torch_denkf.functional import crps_ensemble, crps_gaussian
 
 
 def counted(out: TensorDict, dims: Sequence[int], floor: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Means and variances of a belief ``[*K, T]`` and the truth, ``[*K, T - 1, D]``: the first row is given.
+    """Returns means and variances of a belief ``[*K, T]`` and the truth, ``[*K, T - 1, D]``: the first row is given.
 
     Args:
         out: with ``("belief", "mean")``, ``("belief", "var")`` and ``"state"``.
@@ -33,7 +33,7 @@ def belief_crps(out: TensorDict, dims: Sequence[int], unit: Tensor, floor: float
 
 @torch.no_grad()
 def cost(model: Filter, run: Callable[[], object], steps: int) -> dict[str, float]:
-    """Parameters behind the sensor, and milliseconds a step of a run without it: the least of three runs."""
+    """Parameters behind the sensor, and milliseconds per step of a run without it: the least of three runs."""
     parameters = {id(p): p.numel() for name, p in model.named_parameters() if not name.startswith("module.sensor.")}
     seconds = []
     for _ in range(3):

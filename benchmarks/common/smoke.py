@@ -58,7 +58,7 @@ def run(program: str) -> None:
 
 
 def start(program: str, log: IO[bytes]) -> int:
-    """A process of its own, whose output goes to a file; its number."""
+    """Returns a process of its own, whose output goes to a file; its number."""
     sys.stdout.flush()
     process = os.fork()
     if process:

@@ -61,7 +61,7 @@ def fit_filter(
 
 
 def read_filter(recipe: Recipe, model: Filter, saved: dict) -> Filter:
-    """The model with the parameters and the inflation of a ``filter.pt``."""
+    """Returns the model with the parameters and the inflation of a ``filter.pt``."""
     model.load_state_dict(saved["model"])
     recipe.set_inflation(model, saved["inflation"])
     return model

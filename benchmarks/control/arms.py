@@ -65,7 +65,7 @@ class Inputs:
 
 
 def memory(width: int, name: str) -> LSTMModule:
-    """An LSTM of torchrl's on what is seen."""
+    """Returns an LSTM of torchrl's on what is seen."""
     states = [f"{name}_hidden", f"{name}_cell"]
     keys = {"in_keys": ["seen", *states], "out_keys": [f"{name}_memory", *(("next", key) for key in states)]}
     return LSTMModule(input_size=width, hidden_size=MEMORY, **keys)

@@ -86,7 +86,7 @@ class NoisyCartpole(LinearGaussianEnv):
         return self._emit(state, tensordict["step"] + 1).set("reward", reward)
 
     def moved(self, state: Tensor, motor: Tensor) -> tuple[Tensor, np.ndarray]:
-        """States ``[N, 5]`` one action on, and MuJoCo's own ``[N, physics steps, 5]`` on the way.
+        """Returns states ``[N, 5]`` one action on, and MuJoCo's own ``[N, physics steps, 5]`` on the way.
 
         Args:
             state: ``[N, 5]``.
@@ -101,7 +101,7 @@ class NoisyCartpole(LinearGaussianEnv):
 
 
 def swing_up(position: np.ndarray, cos: np.ndarray, turn: np.ndarray, motor: np.ndarray) -> np.ndarray:
-    """The reward of ``dm_control.suite.cartpole.Balance``, which is not sparse, of many carts."""
+    """Returns the reward of ``dm_control.suite.cartpole.Balance``, which is not sparse, of many carts."""
     centered = (1 + tolerance(position, margin=2)) / 2
     small_control = (4 + tolerance(motor, margin=1, value_at_margin=0, sigmoid="quadratic")) / 5
     small_velocity = (1 + tolerance(turn, margin=5)) / 2
@@ -115,7 +115,7 @@ class Push(m.SubModel):
     a push on the cart the pole gets. The track ends where it ends: there the cart stops, which is such a push, too.
     """
 
-    MOST = 20.0  # m/s, rad/s: more is not believed
+    MOST = 20.0  # m/s, rad/s: upper bound of the speeds
 
     def __init__(self):
         network = nn.Sequential(nn.Linear(5, 32), nn.Tanh(), nn.Linear(32, 4))
@@ -123,7 +123,7 @@ class Push(m.SubModel):
         self.register_buffer("scale", torch.tensor(SCALE))
 
     def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
-        """States ``[*B, E, 5]`` one step on, with actions ``[*B, 1]``."""
+        """Returns states ``[*B, E, 5]`` one step on, with actions ``[*B, 1]``."""
         position, cos, sin, velocity, turn = ensemble.split(1, -1)
         angle = torch.atan2(sin, cos)
         features = torch.cat([position, angle.cos(), angle.sin(), velocity, turn], -1) / self.scale
@@ -147,7 +147,7 @@ class Physics(m.Transition):
         self.world = NoisyCartpole(1, 0.0)
 
     def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
-        """States ``[*B, E, 5]`` one step on, with actions ``[*B, 1]``."""
+        """Returns states ``[*B, E, 5]`` one step on, with actions ``[*B, 1]``."""
         normal = exact_draws(torch.randn(*ensemble.shape[:-1], REPEAT), ensemble)
         motor = action.unsqueeze(-2) + ACTION_NOISE * normal
         state, _ = self.world.moved(ensemble.flatten(0, -2), motor.clamp(-1, 1).flatten(0, -2))
@@ -155,12 +155,12 @@ class Physics(m.Transition):
 
 
 def exact_filter(noise: float, members: int = 32, read: int = 3) -> DEnKF:
-    """A filter that knows the world, and the noise of its readings."""
+    """Returns a filter that knows the world, and the noise of its readings."""
     return _filter(Physics(), m.ConstantNoise([noise] * read, in_key="observation"), members)
 
 
 def unlearned_filter(members: int, read: int = 3) -> DEnKF:
-    """A filter that knows what is read and where an episode starts; accelerations and both noises are learned."""
+    """Returns a filter with known observation model and reset; learned acceleration and noises."""
     q = m.ConstantNoise([0.2, 0.3], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     r = m.ConstantNoise([0.2] * read, trainable=True, in_key="observation")
     return _filter(m.NoisyTransition(Push(), q, dims=[3, 4], before=True), r, members)

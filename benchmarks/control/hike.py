@@ -57,7 +57,7 @@ class MountainHike(LinearGaussianEnv):
 
 
 def exact_filter(noise: float) -> KalmanFilter:
-    """The Kalman filter that knows the hike."""
+    """Returns the Kalman filter that knows the hike."""
     one = torch.eye(2)
     return KalmanFilter(
         one,
@@ -72,7 +72,7 @@ def exact_filter(noise: float) -> KalmanFilter:
 
 
 def unlearned_filter(members: int) -> DEnKF:
-    """A filter that knows what is read and where the hike starts; what an action does and both noises are learned."""
+    """Returns a filter with known observation model and reset; the effect of actions and both noises are learned."""
     linear = nn.Linear(4, 2)
     nn.init.zeros_(linear.weight)
     nn.init.zeros_(linear.bias)

@@ -41,7 +41,7 @@ class Kept:
 
 
 def make_filter(motion: nn.Module, members: int, keep: bool) -> DEnKF:
-    """The page's filter with random draws: it knows the spring, and nothing of the motor."""
+    """Returns the page's filter with random draws; it knows the spring, and not the motor."""
     q = ConstantNoise([0.0, 0.1], in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return DEnKF(
         NoisyTransition(LearnedTransition(motion, residual=False, action_key="action"), q, draws="random"),
@@ -55,7 +55,7 @@ def make_filter(motion: nn.Module, members: int, keep: bool) -> DEnKF:
 
 
 def run(study: Kept, keep: bool, seed: int) -> list[str]:
-    """Cells: share of the ratios that are clipped, return, seconds."""
+    """Returns cells: share of the ratios that are clipped, return, seconds."""
     begun, clipped, names = time.process_time(), [], {}
     set_up, ppo = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)[:2]
     exec(re.sub(r"^ROUNDS, SEED = .*$", f"ROUNDS, SEED = {study.rounds}, {seed}", set_up, flags=re.MULTILINE), names)

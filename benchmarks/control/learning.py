@@ -123,7 +123,7 @@ class Learner:
 
 
 def between(readings: Tensor) -> Tensor:
-    """The readings' noise as a variance ``[O]``: half of the mean square difference of neighbours in ``[B, T, O]``.
+    """Returns the readings' variance ``[O]``: half the mean square difference of neighbours in ``[B, T, O]``.
 
     The true value's own mean square step adds half of itself. NaN where no two neighbouring readings came.
     """
@@ -131,7 +131,7 @@ def between(readings: Tensor) -> Tensor:
 
 
 def refiltered(filter: Filter, data: TensorDict) -> TensorDict:
-    """Whole episodes ``[B, T]`` with what a filter believes of them: means and variances."""
+    """Returns whole episodes ``[B, T]`` with means and variances of a filter's belief."""
     after = data["next"][:, -1:]
     frames = {key: torch.cat([data[key], after[key]], 1) for key in ("observation", "observed")}
     frames["action"] = torch.cat([data["action"], torch.zeros_like(data["action"][:, :1])], 1)

@@ -26,12 +26,12 @@ KNOWING = ("truth", "Kalman", "physics")  # what these arms know, no filter lear
 
 
 def interquartile_mean(values, axis: int = -1):
-    """The mean of the middle half."""
+    """Returns the mean of the middle half."""
     return trim_mean(values, 0.25, axis=axis)
 
 
 def summary(values: pd.Series) -> str:
-    """The interquartile mean over seeds, and the bounds of its 95 % bootstrap interval; empty where none ran."""
+    """Returns the interquartile mean over seeds and its 95 % bootstrap interval; empty for cells that did not run."""
     values = values.dropna()
     if values.empty:
         return ""
@@ -45,7 +45,7 @@ def is_trained(frame: pd.DataFrame) -> pd.Series:
 
 
 def ends(rows: pd.DataFrame) -> pd.DataFrame:
-    """The final returns of a task by cell and seed, with a column for each arm.
+    """Returns the final returns of a task by cell and seed, with a column for each arm.
 
     What reads the truth ran in one cell alone, and returns the same in all that were trained in.
     """
@@ -60,7 +60,7 @@ def ends(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def by_cell(wide: pd.DataFrame) -> list[str]:
-    """A table of interquartile means over seeds, of each cell and arm."""
+    """Returns a table of interquartile means over seeds, of each cell and arm."""
     return markdown(wide.groupby("cell").agg(summary))
 
 
@@ -85,7 +85,7 @@ def reached(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def page(rows: pd.DataFrame, budget: Budget) -> str:
-    """The tables; ``budget`` is the runs'."""
+    """Returns the tables; ``budget`` is the runs'."""
     lines = ["# Policies that read a belief, against policies that remember", ""]
     for task in [task for task in TITLES if task in set(rows["task"])]:
         own = rows[rows["task"] == task]

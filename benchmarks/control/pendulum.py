@@ -25,7 +25,7 @@ class Swing(m.Transition):
         super().__init__(network, [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
 
     def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
-        """States ``[*B, E, 3]`` (cosine, sine, rad/s) one step on, with torques ``[*B, 1]``."""
+        """Returns states ``[*B, E, 3]`` (cosine, sine, rad/s) one step on, with torques ``[*B, 1]``."""
         cos, sin, velocity = ensemble.split(1, -1)
         angle = torch.atan2(sin, cos)
         torque = (action / NoisyPendulumEnv.MAX_TORQUE).unsqueeze(-2).expand_as(velocity)
@@ -37,7 +37,7 @@ class Swing(m.Transition):
 
 
 def unlearned_filter(members: int) -> DEnKF:
-    """A filter that knows what is read; acceleration and both noises are learned."""
+    """Returns a filter that knows what is read; acceleration and both noises are learned."""
     q = m.ConstantNoise([0.3], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return DEnKF(
         transition=m.NoisyTransition(Swing(), q, dims=[2], before=True),

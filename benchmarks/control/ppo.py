@@ -62,7 +62,7 @@ class ActorHead(Head):
             self.layers[-1].bias.zero_()
 
     def forward(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Two times ``[*B, A]``."""
+        """Returns two times ``[*B, A]``."""
         mean = super().forward(value)
         return mean, self.log_std.exp().expand_as(mean)
 
@@ -100,7 +100,7 @@ class PPO:
         settings: the task's.
         batches: that will come; the learning rate goes down to 5 % meanwhile.
         filter: of the environment, which the actor's loss trains, too: it filters slices of time once more, each from
-            the ensemble that was stored there. The critic reads what was believed when the data came.
+            the ensemble that was stored there. The critic reads the belief at collection.
 
     Attributes:
         actor: writes ``"raw"``.

@@ -48,12 +48,12 @@ class Budget:
     """Holds what all arms of all tasks may use.
 
     Attributes:
-        env_steps: in the place of the task's; ``None`` for those.
+        env_steps: instead of the task's; ``None`` for those.
         tests: in a run, evenly spaced.
         episodes: of a test.
         members: of an ensemble.
         updates: of a filter, as a share of the task's.
-        every: environment steps for each update of SAC, in the place of the task's; ``None`` for those.
+        every: environment steps for each update of SAC, instead of the task's; ``None`` for those.
     """
 
     env_steps: int | None = None
@@ -71,7 +71,7 @@ def batches_of(task: Task, budget: Budget) -> tuple[int, list[int]]:
 
 
 def shifted_names(task: Task, cell: tuple[float, float]) -> list[str]:
-    """Names of the tests in which the readings are noisier than in the training: with the filter told, and with not.
+    """Returns the names of the tests with more noise than in training, with and without the filter knowing it.
 
     None of a cell after whose training the readings stay as they are.
     """
@@ -81,13 +81,13 @@ def shifted_names(task: Task, cell: tuple[float, float]) -> list[str]:
 
 
 def rollout(env: EnvBase, policy: TensorDictModuleBase | None, steps: int, kind: ExplorationType) -> TensorDict:
-    """Whole episodes ``[B, T]``."""
+    """Returns whole episodes ``[B, T]``."""
     with torch.no_grad(), set_exploration_type(kind):
         return env.rollout(steps, policy, break_when_any_done=False)
 
 
 def make_env(task: Task, arm: Arm, count: int, cell: tuple[float, float], seed: int, filter: Filter | None) -> EnvBase:
-    """The world with what the arm reads.
+    """Returns the world with what the arm reads.
 
     Args:
         task: the world's.
@@ -108,7 +108,7 @@ def make_env(task: Task, arm: Arm, count: int, cell: tuple[float, float], seed: 
 
 
 def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, budget: Budget) -> list[dict]:
-    """Rows: the return after some numbers of environment steps, and the processor's seconds until then."""
+    """Returns rows: the return after some numbers of environment steps, and the processor's seconds until then."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     task, arm, spent = TASKS[task_name], ARMS[arm_name], 0.0

@@ -98,7 +98,7 @@ class SAC:
         self.buffer: TensorDictReplayBuffer | None = None
 
     def refilter(self, filter: Filter) -> None:
-        """Puts what a filter believes in the place of what was believed when an episode was collected."""
+        """Replaces the beliefs stored at collection by those of the present filter."""
         if self.buffer is None:
             return
         data = refiltered(filter, self.buffer[:].select(*self.keys).clone().reshape(-1, self.steps))
@@ -129,5 +129,5 @@ class SAC:
 
 
 def _both(*keys: NestedKey) -> list[NestedKey]:
-    """Keys before and after a step."""
+    """Returns keys before and after a step."""
     return [*keys, *(unravel_key(("next", key)) for key in keys)]

@@ -40,7 +40,7 @@ SEEDS = range(100)  # that the tables know
 class Study:
     """Policies that read a belief, against policies that remember. See benchmarks/control/README.md."""
 
-    out: Path = Path("runs/control")  # a run that was broken off goes on from here
+    out: Path = Path("runs/control")  # an interrupted run resumes from here
     tasks: some_of(CELLS) = tuple(CELLS)
     cells: int = 6  # the first so many of each task
     seeds: int = 5  # 0 only makes the tables of what is there
@@ -50,7 +50,7 @@ class Study:
 
 
 def arms_of(task: str, cell: tuple[float, float]) -> tuple[str, ...]:
-    """The arms that run in a cell."""
+    """Returns the arms that run in a cell."""
     number = CELLS[task].index(cell)
     arms = (*READERS[task], "truth") if cell == min(CELLS[task]) else READERS[task]
     if number >= MORE_CELLS:
@@ -65,7 +65,7 @@ def part(study: Study, task: str, cell: tuple[float, float], arm: str, seed: int
 
 
 def jobs(study: Study, seed: int, budget: Budget) -> Iterator[partial]:
-    """All runs with a seed."""
+    """Yields all runs with a seed."""
     for task in study.tasks:
         for cell in CELLS[task][: study.cells]:
             for arm in arms_of(task, cell):
@@ -87,7 +87,7 @@ def keep(study: Study, table: Path) -> None:
 
 
 def complete(study: Study) -> list[dict]:
-    """The rows of seeds with which all arms of a cell have run; says of others what they lack."""
+    """Returns the rows of seeds with which all arms of a cell have run; says of others what they lack."""
     files: list[Path] = []
     for task in study.tasks:
         for cell in CELLS[task]:
@@ -102,7 +102,7 @@ def complete(study: Study) -> list[dict]:
 
 
 def main() -> None:
-    """Runs the study; one that was broken off goes on."""
+    """Runs the study; an interrupted one resumes."""
     study, budget = parse(Study), Budget()
     if study.smoke:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="control-")), seeds=1, cells=1)

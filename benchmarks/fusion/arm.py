@@ -59,7 +59,7 @@ def record(demos: int, steps: int, seed: int) -> TensorDict:
 
 
 def finer(angles: Tensor) -> Tensor:
-    """Angles ``[N, T, 7]`` at 12.5 Hz on smooth paths at 100 Hz, ``[N, 8 T, 7]`` (cubic Hermite)."""
+    """Returns angles ``[N, T, 7]`` at 12.5 Hz on smooth paths at 100 Hz, ``[N, 8 T, 7]`` (cubic Hermite)."""
     slope = torch.gradient(angles, dim=1)[0]
     end, end_slope = (torch.cat([value[:, 1:], value[:, -1:]], 1) for value in (angles, slope))
     t = (torch.arange(EVERY) / EVERY).reshape(1, 1, EVERY, 1)
@@ -70,7 +70,7 @@ def finer(angles: Tensor) -> Tensor:
 
 
 def arm_task(*, demos: tuple[int, int] = (24, 6), steps: int = 75, validate: bool = False) -> Task:
-    """The task.
+    """Returns the task.
 
     Args:
         demos: for training, and for the test.

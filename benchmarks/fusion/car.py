@@ -34,7 +34,7 @@ TRAIN, VALIDATION = ("02", "05", "08", "09", "10"), ("03", "04", "07")  # paths 
 
 
 def readings(states: Tensor, camera: Tensor, seed: int) -> TensorDict:
-    """All readings of drives at 50 Hz.
+    """Returns all readings of drives at 50 Hz.
 
     Args:
         states: truth at 10 Hz, ``[N, T, 5]``: the velocities are those of the step that led there.
@@ -68,7 +68,7 @@ def readings(states: Tensor, camera: Tensor, seed: int) -> TensorDict:
 
 @torch.no_grad()
 def recorded(root: Path, frames: int) -> tuple[Tensor, Tensor]:
-    """Truth and the shipped sensor's readings of real drives, in windows, ``[N, frames, ...]`` each."""
+    """Returns windows of real drives ``[N, frames, ...]``: true states, and readings of the shipped sensor."""
     car, parts = from_pretrained("car-odometry"), []
     for name in list_kitti_drives(root):
         data = Drive(root, name, car.settings.size, True).read()
@@ -84,7 +84,7 @@ def recorded(root: Path, frames: int) -> tuple[Tensor, Tensor]:
 
 
 def driven(root: Path, names: Sequence[str], frames: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Windows of true paths, and what a camera might read there."""
+    """Returns windows of true paths, and what a camera might read there."""
     parts = []
     for name in names:
         poses = read_poses(root / "poses" / f"{name}.txt")
@@ -97,7 +97,7 @@ def driven(root: Path, names: Sequence[str], frames: int, seed: int) -> tuple[Te
 
 
 def simulated(frames: int, seed: int, count: int = 2) -> tuple[Tensor, Tensor]:
-    """Windows of a made-up drive, for a run without data."""
+    """Returns windows of a synthetic drive, for a run without data."""
     generator = torch.Generator().manual_seed(seed)
     velocity = torch.tensor([10.0, 0.0]) + torch.randn(count, frames, 2, generator=generator) * torch.tensor([1.0, 0.1])
     pose, states = torch.zeros(count, 3), []
@@ -108,7 +108,7 @@ def simulated(frames: int, seed: int, count: int = 2) -> tuple[Tensor, Tensor]:
 
 
 def car_task(root: Path | None, *, frames: int = 60, validate: bool = False) -> Task:
-    """The task, on real frames, or on a made-up drive where there are no data.
+    """Returns the task, on real frames, or on a made-up drive where there are no data.
 
     Args:
         root: folder with ``sequences`` and ``poses``.
@@ -123,7 +123,7 @@ def car_task(root: Path | None, *, frames: int = 60, validate: bool = False) -> 
     test = delayed(readings(*paths, 2), "gps", LATE)
     noises = {"camera": CAMERA, "wheels": WHEELS, "gps": GPS}
     models = {"camera": Select(VELOCITIES), "wheels": Select(VELOCITIES), "gps": Select([0, 1])}
-    late = {"camera": FINER, "wheels": FINER, "gps": 0}  # beside what they are late anyway
+    late = {"camera": FINER, "wheels": FINER, "gps": 0}  # in addition to their usual latency
     longest = {"camera": MIDDLE + FINER, "wheels": FINER, "gps": LATE}
     parts = {name: ConstantNoise(noises[name], trainable=True, in_key=name) for name in models}
     walk = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import SubModel
 
-#: What a sensor does for a while, without a word.
+#: Faults of a sensor, which no mask announces.
 FAULTS = ("frozen", "offset", "noise")
 STARTUP = 0.5  # seconds, in which the first readings come
 FEATURE_STEPS = 5  # readings of which the spread is a feature
@@ -27,14 +27,15 @@ class Task:
         rate: of the filter's steps, in Hz.
         offsets: by sensor, what a fault adds, in the reading's units.
         noises: by sensor, standard deviations of the readings.
-        failing: the sensors of which one fails in a training window; those that matter most stand there twice.
+        failing: sensors from which the faulty one of a training window is drawn; a name that is there twice is drawn
+            twice as often.
         slope: of the weights before training, see :class:`~torch_denkf.fusion.SensorAttention`.
         updates: of the noise and of the weights.
         late: by sensor, by how many more steps its readings come late where it is delayed.
         train: windows ``[N, T]`` on which noise and weights are trained.
         test: recordings ``[N, T]``.
         parts: what is trained: the modules of the noise.
-        build: makes a filter of these, from the network of its weights and whether it heeds delays.
+        build: makes a filter of these, from the network of its weights and whether it uses delays.
         heeds: whether the usual filter does.
         loss: of a filter's output, to be trained on.
         error: of a belief against the truth, ``[N, T, D]``, in ``unit``.
@@ -60,12 +61,12 @@ class Task:
 
     @property
     def sensors(self) -> list[str]:
-        """Names of all sensors."""
+        """Returns names of all sensors."""
         return list(self.offsets)
 
     @property
     def settled(self) -> slice:
-        """The steps that are scored: all but those of the start-up."""
+        """Returns the steps that are scored: all but those of the start-up."""
         return slice(round(min(STARTUP * self.rate, self.test.shape[1] // 4)), None)
 
 
@@ -86,7 +87,7 @@ def fused_sensors(
 
 
 def without(data: TensorDict, *sensors: str) -> TensorDict:
-    """The recordings without some sensors' readings."""
+    """Returns the recordings without some sensors' readings."""
     out = data.copy()
     for name in sensors:
         out[f"{name}_observed"] = torch.zeros_like(data[f"{name}_observed"])
@@ -96,7 +97,7 @@ def without(data: TensorDict, *sensors: str) -> TensorDict:
 def faulty(
     task: Task, data: TensorDict, sensor: str, fault: str, begin: Tensor, end: Tensor, generator: torch.Generator
 ) -> TensorDict:
-    """The recordings with one sensor out of order from ``begin`` to ``end`` ``[N]``, which its mask does not tell."""
+    """Returns the recordings with an unmasked fault of one sensor from ``begin`` to ``end`` ``[N]``."""
     time = torch.arange(data.shape[1]).unsqueeze(0)
     bad = ((time >= begin.unsqueeze(-1)) & (time < end.unsqueeze(-1))).unsqueeze(-1)
     reading = data[sensor]
@@ -113,7 +114,7 @@ def faulty(
 
 
 def delayed(data: TensorDict, sensor: str, steps: int) -> TensorDict:
-    """The recordings with one sensor's readings so many steps late."""
+    """Returns the recordings with one sensor's readings so many steps late."""
     out = data.copy()
     for key in (sensor, f"{sensor}_observed", f"{sensor}_features"):
         out[key] = data[key].roll(steps, 1)
@@ -153,7 +154,7 @@ def add_features(data: TensorDict, noises: Mapping[str, Tensor]) -> TensorDict:
 
 
 def last_seen(data: TensorDict, sensor: str) -> Tensor:
-    """The step of a sensor's last reading at each time, ``[N, T, 1]``; 0 before the first."""
+    """Returns the step of a sensor's last reading at each time, ``[N, T, 1]``; 0 before the first."""
     seen = data[f"{sensor}_observed"]
     time = torch.arange(data.shape[1]).reshape(1, -1, 1).expand_as(seen)
     return torch.where(seen, time, 0).cummax(1).values

@@ -63,13 +63,13 @@ class SensorSpread:
 
     @torch.no_grad()
     def __call__(self, readings: TensorDict) -> Tensor:
-        """Variances ``[N, T, D]``."""
+        """Returns variances ``[N, T, D]``."""
         features = readings["sensor", "encoding"]
         return self.factor**2 * self._variance(features.flatten(0, 1)).unflatten(0, features.shape[:2])
 
 
 def baselines(readings: TensorDict, sequences: Sequence[Tensor], spread: SensorSpread) -> dict[str, TensorDict]:
-    """Beliefs ``[N, T]`` of all baselines, by name.
+    """Returns beliefs ``[N, T]`` of all baselines, by name.
 
     Args:
         readings: of the sensor.

@@ -16,7 +16,7 @@ MARGIN = (0.16, 0.3)  # between the hand's middle and another episode's table, i
 
 
 def shifted(pixels: Tensor, right: int, down: int) -> Tensor:
-    """Pictures ``[*, H, W]`` moved by whole pixels; the edges are repeated."""
+    """Returns pictures ``[*, H, W]`` moved by whole pixels; the edges are repeated."""
     height, width = pixels.shape[-2:]
     rows = (torch.arange(height) - down).clamp(0, height - 1)
     columns = (torch.arange(width) - right).clamp(0, width - 1)
@@ -24,7 +24,7 @@ def shifted(pixels: Tensor, right: int, down: int) -> Tensor:
 
 
 def boxed(pixels: Tensor, place: Tensor, side: float = BOX) -> Tensor:
-    """Pictures ``[N, 3, H, W]`` with a black box around places ``[N, 2]`` from -1 (left, top) to 1."""
+    """Returns pictures ``[N, 3, H, W]`` with a black box around places ``[N, 2]`` from -1 (left, top) to 1."""
     height, width = pixels.shape[-2:]
     half = side * width / 2
     column, row = (place[:, 0] + 1) / 2 * width, (place[:, 1] + 1) / 2 * height
@@ -34,7 +34,7 @@ def boxed(pixels: Tensor, place: Tensor, side: float = BOX) -> Tensor:
 
 
 def before_another(pixels: Tensor, place: Tensor, other: Tensor, margin: float) -> Tensor:
-    """The arm of one picture before the table of another, uint8 ``[3, H, W]``.
+    """Returns the arm of one picture before the table of another, uint8 ``[3, H, W]``.
 
     The arm reaches in from the right and from below. What is left of the hand or above it comes from the other picture.
 
@@ -91,7 +91,7 @@ def disturb(pixels: Tensor, place: Tensor, generator: torch.Generator) -> tuple[
 
 
 def failing(pixels: Tensor, place: Tensor, condition: str, draw: Tensor, exact: bool) -> Tensor:
-    """Pictures of a failing camera.
+    """Returns pictures of a failing camera.
 
     Args:
         pixels: ``[N, 3, H, W]`` in [0, 1].

@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.g1.later --root G1``. It reads no pictures. The state is the joints of a row and of the row
 before; the motion, which also reads the row's commands, is fitted by least squares, and its noise by what it leaves. A
-factor on that noise is chosen on validation episodes, so that 90 % of the intervals of the later moment hold the truth.
+factor on that noise is chosen on validation episodes, for a 90 % coverage at the later moment.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.fusion import BeliefAhead, FusedFilter, FusedSensor
 from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, LinearTransition, MomentPrior, Select
 
-RATE, LEVEL = 30, 1.6449  # rows a second; of a normal distribution, the 90 % interval
+RATE, LEVEL = 30, 1.6449  # rows per second; of a normal distribution, the 90 % interval
 ENCODER = 0.1 * torch.pi / 180  # noise of the encoders, a standard deviation in rad
 FIRST = 15  # rows after which a filter is scored: it has forgotten its start
 FACTORS = (1.0, 1.2, 1.4, 1.7, 2.0)  # on the standard deviations of the motion's noise
@@ -44,7 +44,7 @@ class Later:
 
 
 def episodes(root: Path) -> dict[str, TensorDict]:
-    """Joints and commands by role, ``[B, T]``, in rad; ``valid`` says where an episode is."""
+    """Returns joints and commands by role, ``[B, T]``, in rad; ``valid`` says where an episode is."""
     found: dict[str, list[Tensor]] = {"train": [], "validation": [], "test": []}
     for file in sorted((root / "data").glob("*/*.parquet")):
         number, table = int(file.stem.rpartition("_")[-1]), read_parquet(file, ["observation.state", "action"])
@@ -90,7 +90,7 @@ class Motion:
         return cls(weight.mT, left.mT @ left / len(left), center)
 
     def filter(self, kind: str, factor: float) -> Filter:
-        """A filter of joints and those of the row before; ``kind`` is ``"EKF"`` or ``"DEnKF"``."""
+        """Returns a filter of joints and those of the row before; ``kind`` is ``"EKF"`` or ``"DEnKF"``."""
         passed = torch.eye(JOINTS, 2 * JOINTS)
         matrix = torch.cat([self.weight[:, : 2 * JOINTS], passed])
         control = torch.cat([self.weight[:, 2 * JOINTS :], torch.zeros(JOINTS, JOINTS)])
@@ -121,7 +121,7 @@ class Motion:
 
 
 def looked(motion: Motion, data: TensorDict, kind: str, factor: float, steps: int) -> TensorDict:
-    """The belief now, and those of the next rows ``[B, T, steps, 14]``."""
+    """Returns the belief now, and those of the next rows ``[B, T, steps, 14]``."""
     filter = motion.filter(kind, factor)
     ahead = BeliefAhead(filter, steps, each=True, keep=[("belief", "mean"), ("belief", "var")])
     with torch.no_grad():
@@ -129,7 +129,7 @@ def looked(motion: Motion, data: TensorDict, kind: str, factor: float, steps: in
 
 
 def scores(motion: Motion, data: TensorDict, out: TensorDict, ahead: int) -> tuple[float, ...]:
-    """Errors of the belief of the last reading and of the belief ahead, in degrees, and the share within 90 %."""
+    """Returns errors of the last belief and of the predicted belief, in degrees, and the 90 % coverage."""
     last = data["valid"].shape[1] - ahead
     rows = data["valid"][:, ahead:] & (torch.arange(last) >= FIRST)
     truth = (data["joints"] - motion.center)[:, ahead:][rows]

@@ -47,7 +47,7 @@ class RatesAndBias(SubModel):
         super().__init__(parts, [*rates.in_keys, *bias.in_keys], rates.out_keys)
 
     def compute(self, mean, encoding, *, batch_size):
-        """Variances ``[*B, 2D]``."""
+        """Returns variances ``[*B, 2D]``."""
         rates = self.module["rates"].compute(mean, batch_size=batch_size)
         return torch.cat([rates, self.module["bias"].compute(encoding, batch_size=batch_size)], -1)
 
@@ -86,7 +86,7 @@ class G1Recipe(ArmRecipe):
         return ScaledNoise(self._of_sensor(WHITE if self.bias else 1.0, ("sensor", "noise")))
 
     def _of_sensor(self, share: float, out_key: NestedKey) -> DiagonalNoise:
-        """A share of the sensor's errors, from what it sees; before training as it was fitted."""
+        """Returns the sensor's noise model, scaled by ``share`` and initialised with its fit."""
         root = (self.spread.variance + self.spread.floor).sqrt()
         keys = {"in_features": self.encoding, "in_key": ("sensor", "encoding"), "out_key": out_key}
         noise = DiagonalNoise(JOINTS, r=share * root, num_cells=SPREAD_CELLS, **keys)

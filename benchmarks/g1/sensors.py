@@ -27,7 +27,7 @@ class HalfKeypointTrunk(KeypointTrunk):
     """Keypoints with convolutions of 16 bits: half the time on a processor that has them. Places keep 32 bits."""
 
     def forward(self, images: Tensor) -> Tensor:
-        """Features of images."""
+        """Returns features of images."""
         height, width = images.shape[-2:]
         rows, columns = torch.linspace(-1, 1, height), torch.linspace(-1, 1, width)
         grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy")).expand(len(images), -1, -1, -1)
@@ -84,12 +84,12 @@ class FramePool:
         return len(self.target)
 
     def rows(self, index: Tensor) -> TensorDict:
-        """Frames as they are, ``[n]``."""
+        """Returns frames as they are, ``[n]``."""
         rows = {"pixels": self.pixels[index].float() / 255, "target": self.target[index], "place": self.place[index]}
         return TensorDict(rows, batch_size=[len(index)])
 
     def sample(self, generator: torch.Generator, batch: int) -> TensorDict:
-        """Random disturbed frames ``[batch]``, some before the table of another episode."""
+        """Returns random disturbed frames ``[batch]``, some before the table of another episode."""
         index = torch.randint(len(self), (batch,), generator=generator)
         rows = {"target": self.target[index], "place": self.place[index]}
         pixels, moved = disturb(self._elsewhere(index, generator), self.place[index], generator)

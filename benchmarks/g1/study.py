@@ -1,4 +1,4 @@
-"""The study's options, and the jobs of its table, each of which can be broken off and resumed."""
+"""The study's options, and the jobs of its table, each of which can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Study(Recordings):
     """A real arm that its head camera watches: seven joints, with every filter that is registered.
 
     table: estimate the lag, train sensors and filters, test. diagnosis: how the trained sensors err. pictures: plots
-    of what a table left in --out. What was broken off goes on where it stopped. See benchmarks/g1/README.md.
+    of what a table left in --out. An interrupted run resumes. See benchmarks/g1/README.md.
     """
 
     command: Positional[Literal["table", "diagnosis", "pictures"]] = "table"
@@ -89,7 +89,7 @@ class Base:
 
     @cached_property
     def _encoding(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the encodings of the tuning episodes, in all pictures."""
+        """Returns the mean and standard deviation of the encodings of the tuning episodes, in all pictures."""
         seen = torch.cat([one["sensor", "encoding"][one["observed"].squeeze(-1)] for one in self._tune.values()])
         return seen.mean(0), seen.std(0).clamp_min(1e-3)
 
@@ -104,27 +104,27 @@ class Base:
 
     @cached_property
     def tune(self) -> dict[str, TensorDict]:
-        """Readings that filters are trained on."""
+        """Returns readings that filters are trained on."""
         return self.readings("tune")
 
     @cached_property
     def validation(self) -> dict[str, TensorDict]:
-        """Readings to choose by."""
+        """Returns readings to choose by."""
         return self.readings("validation")
 
     @cached_property
     def test(self) -> dict[str, TensorDict]:
-        """Readings of the test episodes."""
+        """Returns readings of the test episodes."""
         return self.readings("test")
 
     @cached_property
     def spread(self) -> SensorSpread:
-        """The variance of the sensor's errors."""
+        """Returns the variance of the sensor's errors."""
         tune, validation = ([one[name] for name in PICTURES] for one in (self.tune, self.validation))
         return SensorSpread(tune, validation, self.study.out / "spreads" / self.name, self.study.budget.spread)
 
     def _motion(self, actions: bool) -> Motion:
-        """The motion, trained once on true states."""
+        """Returns the motion, trained once on true states."""
         seed, study = self.trained.seed, self.study
         torch.manual_seed(seed)
         paths = [torch.cat([with_rates(state, 1), delayed(action)], -1) for state, action in self.sequences]
@@ -152,7 +152,7 @@ class Base:
 
 
 def joined(readings: dict[str, TensorDict]) -> TensorDict:
-    """Readings of all conditions as one batch."""
+    """Returns readings of all conditions as one batch."""
     return torch.cat(list(readings.values()))
 
 

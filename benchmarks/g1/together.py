@@ -1,4 +1,4 @@
-"""Camera, encoders and commands of the arm together, each with errors that last: ``python -m benchmarks.g1.together``.
+"""Camera, encoders and commands of the arm together, each with coloured noise: ``python -m benchmarks.g1.together``.
 
 All filters run on what one camera sensor reads. Their motion is learned from true states, all else is taken from
 residuals: no filter is trained.
@@ -31,7 +31,7 @@ from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import ConstantNoise, LearnedTransition, MappedNoise, MomentPrior, Select
 from torch_denkf.training import hold_last
 
-RATE = 30  # rows a second
+RATE = 30  # rows per second
 ENCODER = math.radians(0.1)  # standard deviation of an encoder's reading, rad
 COMMANDS = 8  # of the last rows, that the joints follow
 SURPRISE = 2.0  # factor on what the motion missed in training: of 1, 1.5, 2 and 3, on the validation episodes
@@ -81,7 +81,7 @@ class Arm:
 
     @cached_property
     def motion(self) -> Motion:
-        """The motion, learned from true states."""
+        """Returns the motion, learned from true states."""
         torch.manual_seed(self.study.seed)
         motion, paths = Motion(self.sensor.trained[1]), [with_rates(state, 1) for state, _ in self.known]
         settings = {"seed": self.study.seed, "updates": self.study.motion_updates}
@@ -106,7 +106,7 @@ class Arm:
 
     @cached_property
     def unseen(self) -> list[TensorDict]:
-        """Readings of the episodes that are not tested on, and that the camera's sensor has not seen."""
+        """Returns readings of the episodes that are not tested on, and that the camera's sensor has not seen."""
         return [self.readings(role) for role in ("tune", "validation")]
 
     def errors(self, name: str, kind: str) -> tuple[FadingBias | None, Tensor]:
@@ -130,7 +130,7 @@ class Arm:
         return belief["mean"][..., :JOINTS], belief["var"][..., :JOINTS].sqrt()
 
     def held(self, data: TensorDict, name: str) -> Tensor:
-        """A sensor's last reading."""
+        """Returns a sensor's last reading."""
         return hold_last(data[name], data[f"{name}_observed"], self.begin.mean(0).expand_as(data[name][:, 0]))
 
     def combined(self, data: TensorDict) -> Tensor:
@@ -155,7 +155,7 @@ def lagged(commands: Tensor) -> Tensor:
 
 
 def score(estimate: Estimate, data: TensorDict, at: Tensor) -> list[str]:
-    """Mean absolute error in degrees, and what the 90 % intervals hold, at rows ``[N, T]``."""
+    """Returns the mean absolute error in degrees, and the coverage of the 90 % intervals, at rows ``[N, T]``."""
     mean, std = estimate
     error = (mean - data["state"])[at].abs()
     held = "" if std is None else f"{100 * (error < LEVEL * std[at]).float().mean():.0f} %"
@@ -163,7 +163,7 @@ def score(estimate: Estimate, data: TensorDict, at: Tensor) -> list[str]:
 
 
 def read_together(arm: Arm) -> list[str]:
-    """The table of what is read, and how well the arm is known from it."""
+    """Returns the table of what is read, and how well the arm is known from it."""
     data = arm.readings("test")
     at, dark = data["valid"].squeeze(-1).clone(), data.copy()
     at[:, 0] = False
@@ -192,7 +192,7 @@ def read_together(arm: Arm) -> list[str]:
 
 
 def camera_off(arm: Arm) -> list[str]:
-    """The table of a camera that is off."""
+    """Returns the table of a camera that is off."""
     data, rows = arm.readings("test"), SEEN + max(AFTER) + 1
     generator, parts = torch.Generator().manual_seed(5), []
     lengths = data["valid"].sum((1, 2)).tolist()

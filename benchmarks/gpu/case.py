@@ -60,7 +60,7 @@ class Found:
 
     @property
     def rate(self) -> float | None:
-        """Steps of one filter in a second."""
+        """Returns steps of one filter in a second."""
         return None if self.ms is None else 1e3 * self.batch * self.steps / self.ms
 
     def as_dict(self) -> dict[str, Any]:

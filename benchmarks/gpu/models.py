@@ -76,7 +76,7 @@ MODELS = {
 
 
 def frames(dims: int, batch: int, steps: int, device: str) -> TensorDict:
-    """Readings ``[batch, steps, O]``."""
+    """Returns readings ``[batch, steps, O]``."""
     generator = torch.Generator().manual_seed(1)
     reading = torch.randn(batch, steps, max(2, dims // 2), generator=generator)
     return TensorDict({READING: reading}, [batch, steps]).to(device)
@@ -101,7 +101,7 @@ CORNERS = {
 
 
 def robot_filter(kind: str, members: int = 64) -> Filter:
-    """A legged robot's filter; MuJoCo reads its file, and no simulator of MuJoCo's runs."""
+    """Returns a legged robot's filter; MuJoCo reads its file, and no simulator of MuJoCo's runs."""
     import mujoco
 
     from torch_denkf.applications.legged import legged_filter
@@ -112,7 +112,7 @@ def robot_filter(kind: str, members: int = 64) -> Filter:
 
 
 def robot_readings(batch: int, device: str) -> TensorDict:
-    """Readings of robots that stand, with noise."""
+    """Returns readings of robots that stand, with noise."""
     generator = torch.Generator().manual_seed(2)
 
     def noisy(mean: list[float], std: float) -> torch.Tensor:

@@ -15,7 +15,7 @@ from torch_denkf.filters import Filter
 
 
 def sequence(filter: Filter, data: TensorDict, gradients: bool) -> Callable[[], object]:
-    """A whole sequence; with the gradients of a loss of its means."""
+    """Returns a whole sequence; with the gradients of a loss of its means."""
     parameters = [value for value in filter.parameters() if value.requires_grad]
     if gradients and not parameters:
         data = data.apply(lambda value: value.requires_grad_())
@@ -32,7 +32,7 @@ def sequence(filter: Filter, data: TensorDict, gradients: bool) -> Callable[[], 
 
 
 def loop(step: Callable[[TensorDict], object], row: TensorDict) -> Callable[[], object]:
-    """One step, without gradients."""
+    """Returns one step, without gradients."""
 
     def call() -> object:
         with torch.no_grad():
@@ -42,7 +42,7 @@ def loop(step: Callable[[TensorDict], object], row: TensorDict) -> Callable[[], 
 
 
 def of_filters(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """Each kind of filter, dimension and batch size: a sequence, forward and with gradients."""
+    """Yields each kind of filter, dimension and batch size: a sequence, forward and with gradients."""
     steps = 2 if smoke else 20
     for batch in (2,) if smoke else (65536, 4096, 64, 1):
         for name, make in MODELS.items():
@@ -61,7 +61,7 @@ def of_filters(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case
 
 
 def of_paper(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """The paper's networks (Table I, S = 5, O = 2, E = 32), as ``benchmarks.speed`` has them, beside cuthbert."""
+    """Yields cases of the paper's networks (Table I, S = 5, O = 2, E = 32) and of cuthbert."""
     steps = 2 if smoke else 20
     for batch in (2,) if smoke else (64, 4096):
         for way in ways:
@@ -124,7 +124,7 @@ def of_peers(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
 
 
 def of_training(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """A training step of the KITTI preset on 64 sequences of 20 pictures, beside its trunk alone."""
+    """Yields a training step of the KITTI preset on 64 sequences of 20 images, and one of its trunk alone."""
     from benchmarks.speed import training_step as preset
 
     batch, steps = (2, 3) if smoke else (preset.BATCH, preset.STEPS)
@@ -220,7 +220,7 @@ def of_environments(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator
 
 
 def of_analysis(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """An ensemble of many components, as weather has them, and 40 members."""
+    """Yields an ensemble of many components, as weather has them, and 40 members."""
     from torch_denkf.functional import analyse
 
     size = 100 if smoke else 10**6

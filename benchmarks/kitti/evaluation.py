@@ -1,4 +1,4 @@
-"""Errors of a trained filter on the drive that was left out, beside dead reckoning and its floor."""
+"""Errors of a trained filter on the drive that was left out, compared with dead reckoning and its floor."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ DRAWS = 3  # runs of a filter that draws random numbers: its errors are means ov
 
 
 def last_velocities(reading: TensorDict, dt: float) -> Tensor:
-    """The sensor's mean velocities ``[N, 2]``; where it is blind the last ones, at the start the true ones.
+    """Returns the sensor's mean velocities ``[N, 2]``; where it is blind the last ones, at the start the true ones.
 
     A pair over a gap gives the mean over its steps, unless it is farther apart than the sensor can read.
     """
@@ -49,14 +49,14 @@ def last_velocities(reading: TensorDict, dt: float) -> Tensor:
 
 
 def integrate(velocity: Tensor, truth: Tensor, dt: float) -> Tensor:
-    """The states ``[N, 5]`` that velocities lead to from the true first pose."""
+    """Returns the states ``[N, 5]`` that velocities lead to from the true first pose."""
     return torch.cat([dead_reckoning(velocity.double(), truth[0, :3].double(), dt), velocity.double()], -1)
 
 
 def evaluate(
     recipe: KITTIRecipe, model: Filter, stream: Stream, cache: Path, *, filter_name: str, kind: str, seed: int
 ) -> tuple[list[dict], dict[str, TensorDict]]:
-    """All rows of the table for one drive, and its beliefs by condition, for the plots."""
+    """Returns all rows of the table for one drive, and its beliefs by condition, for the plots."""
     clean = read_spans(model["sensor"], Part(stream), cache, kind)
     pairs = [("clean", all_frames(clean))]
     for condition in DISTURBANCES:
@@ -94,7 +94,7 @@ def evaluate(
 
 
 def _mean(rows: list[dict]) -> dict:
-    """One row of several that differ in their numbers alone: which frames are missing is chance, as are draws."""
+    """Returns the mean of rows that differ only by the random draw of missing frames and noise."""
     mean = {
         key: fmean(row[key] for row in rows) if isinstance(value, float) else value for key, value in rows[0].items()
     }
@@ -102,7 +102,7 @@ def _mean(rows: list[dict]) -> dict:
 
 
 def errors(states: Tensor, truth: Tensor) -> list[dict]:
-    """Errors of a path by window; those that know no window stand in each row."""
+    """Returns errors of a path by window; those that know no window stand in each row."""
     velocity = state_errors(states[1:, VELOCITIES], truth[1:, VELOCITIES])
     whole = {
         "rmse_v_m_per_s": float(velocity.rmse[0]),

@@ -49,7 +49,7 @@ class Part:
         return self.stream.steps
 
     def read(self, cache: Path) -> TensorDict:
-        """The stretch, ``[n]``."""
+        """Returns the stretch, ``[n]``."""
         data = self.stream.read(cache)
         return data[int(self.begin * len(data)) : int(self.end * len(data))]
 
@@ -76,17 +76,17 @@ class Fold:
 
     @property
     def trained(self) -> set[str]:
-        """Drives that the sensor sees."""
+        """Returns drives that the sensor sees."""
         return {part.stream.drive for part in self.train}
 
     @property
     def shared(self) -> set[str]:
-        """Drives for both sensor and filter."""
+        """Returns drives for both sensor and filter."""
         return self.trained & {part.stream.drive for part in self.tune}
 
 
 def with_disturbances(parts: Sequence[Part]) -> list[Part]:
-    """Each part clean, and with half as much weight again in all disturbances together."""
+    """Returns each part clean, and with half as much weight again in all disturbances together."""
     disturbed = []
     for part in parts:
         disturbed.append(part)
@@ -97,7 +97,7 @@ def with_disturbances(parts: Sequence[Part]) -> list[Part]:
 
 
 def with_spans(parts: Sequence[Part]) -> list[Part]:
-    """Each clean part, and with less weight in pairs of two and of three steps."""
+    """Returns each clean part, and with less weight in pairs of two and of three steps."""
     longer = [
         replace(part, stream=replace(part.stream, steps=steps), weight=weight * part.weight)
         for part in parts
@@ -108,7 +108,7 @@ def with_spans(parts: Sequence[Part]) -> list[Part]:
 
 
 def make_fold(test: str, streams: Sequence[Stream], train: Sequence[Part], held_out: Sequence[Part]) -> Fold:
-    """The fold that leaves ``test`` out.
+    """Returns the fold that leaves ``test`` out.
 
     All others train both sensor and filter, see ``SensorTraining.unseen_readings``; rendered drives validate, or,
     without them, the drive that follows the test drive.
@@ -139,7 +139,7 @@ def _rows(stream: Stream) -> int:
 
 
 def statistics(parts: Sequence[Part], cache: Path) -> Statistics:
-    """Means and standard deviations over clean training drives, each counted mirrored, too."""
+    """Returns means and standard deviations over clean training drives and their mirror images."""
     data = [part.read(cache) for part in parts if part.stream.condition == "clean" and part.stream.steps == 1]
     velocity = torch.cat([part["state"][:, VELOCITIES] for part in data])
     loc, scale = velocity.mean(0), velocity.std(0)

@@ -29,7 +29,7 @@ def flow_sensor(statistics: Statistics) -> SubModel:
 
 
 def image_sensor(statistics: Statistics) -> SubModel:
-    """The paper's: Table I on a grey frame and its difference to the one before."""
+    """Returns the paper's: Table I on a grey frame and its difference to the one before."""
     return ImageSensor(
         2,
         image_shape=(2, 50, 150),
@@ -97,7 +97,7 @@ class SensorTraining:
     def unseen_readings(
         self, sensor: SubModel, fold: Fold, out: Path, updates: int, lr: float
     ) -> list[tuple[TensorDict, TensorDict, float]]:
-        """Readings of drives by sensors that have not seen them, also where drives are too few to set some aside.
+        """Returns readings of drives by sensors that were not trained on them (cross-fitting).
 
         A filter learns from its sensor's errors, which are smaller on drives that the sensor was trained on. So drives
         that are in both lists are read by one of two sensors that stand in: each is trained on one half of those
@@ -136,7 +136,7 @@ class SensorOfFold:
 
     @property
     def validation(self) -> list[TensorDict]:
-        """Readings to choose by; not the mirrored ones: they say the same."""
+        """Returns readings to choose by; not the mirrored ones: they say the same."""
         return [reading for _, reading, _ in self.readings[::2]]
 
 
@@ -159,7 +159,7 @@ def sensor_of_fold(
         out: checkpoints and logs.
         cache: of the streams.
         seed: of all random numbers.
-        updates: of a sensor that starts anew.
+        updates: of a sensor that starts again.
         fine_tuning: updates of one that is ``pretrained``, and of the stand-ins that read shared drives.
         pretrained: where to start.
     """

@@ -52,7 +52,7 @@ class Stream:
         return f"{self.drive}/{self.camera}"
 
     def seed(self) -> int:
-        """Random numbers of the condition: its own, the same each time; not changed by what is made of the images."""
+        """Returns the seed of the condition, the same in each run."""
         what = (self.drive, self.camera, self.condition, self.size, self.pitch, self.steps)
         return int.from_bytes(hashlib.blake2b(repr(what).encode(), digest_size=4).digest(), "big")
 
@@ -62,7 +62,7 @@ class Stream:
         return cached(cache / name, self._compute)
 
     def _drive(self) -> TensorDict:
-        """Images as they come, whole."""
+        """Returns images as they come, whole."""
         torch.set_num_threads(1)
         cv2.setNumThreads(1)
         drive = read_kitti_drive(self.root, self.drive, camera=self.camera, size=self.size, colour=False, cache=None)
@@ -85,7 +85,7 @@ class Stream:
 
 
 def find_streams(root: Path, size: tuple[int, int], drives: list[str] | None = None) -> list[Stream]:
-    """Every camera of every drive below ``root`` that has images and poses."""
+    """Returns every camera of every drive below ``root`` that has images and poses."""
     found = drives or list_kitti_drives(root)
     if not found:
         raise FileNotFoundError(f"no drive below {root} has both images and poses")
@@ -109,11 +109,11 @@ def _prepare(stream: Stream, cache: Path) -> None:
 
 
 def spans(stream: Stream, sensor: str) -> list[Stream]:
-    """The same drive in pairs of 1, 2, ... steps: what a sensor may read where frames are missing."""
+    """Returns the same drive in pairs of 1, 2, ... steps: what a sensor may read where frames are missing."""
     longest = LONGEST if sensor == "flow" and stream.condition == "clean" else 1
     return [replace(stream, steps=steps) for steps in range(1, longest + 1)]
 
 
 def read_by(sensor: str, stream: TensorDict) -> TensorDict:
-    """A stream without what a sensor does not read."""
+    """Returns a stream without what a sensor does not read."""
     return stream.exclude("image") if sensor == "flow" else stream.exclude(*MOTION_KEYS)

@@ -1,4 +1,4 @@
-"""The study's options, and the jobs of its table, each of which can be broken off and resumed."""
+"""The study's options, and the jobs of its table, each of which can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SHARED = ("dead_reckoning", "floor")  # rows that come with every filter
 class Study:
     """Visual odometry on KITTI: the paper's protocol, with every filter that is registered.
 
-    table: leave one drive out after the other, in all conditions. What was broken off goes on where it stopped. See
+    table: leave one drive out after the other, in all conditions. An interrupted run resumes. See
     benchmarks/kitti/README.md.
     """
 
@@ -81,7 +81,7 @@ class Study:
 
 
 def _settings(out: Path) -> dict:
-    """Options of a table that was made in a folder."""
+    """Returns options of a table that was made in a folder."""
     file = out / "settings.json"
     if not file.exists():
         raise FileNotFoundError(f"--first {out} has no settings.json; pass the --out of a table")
@@ -103,7 +103,7 @@ class Job:
         return self.study.out / "folds" / f"{self.fold.name}-{name}-{self.sensor}-{self.seed}"
 
     def base(self) -> SensorOfFold:
-        """The sensor, trained, and its readings."""
+        """Returns the sensor, trained, and its readings."""
         torch.set_num_threads(1)
         return sensor_of_fold(
             self.fold,
@@ -126,7 +126,7 @@ class Job:
             once(self.out(name) / "rows.json", lambda name=name, base=base: self.test(name, base))
 
     def test(self, name: str, base: SensorOfFold) -> list[dict]:
-        """Rows of one filter, trained for it; and pictures, of the first seed."""
+        """Returns rows of one filter, trained for it; and pictures, of the first seed."""
         loggers = ("csv", "tensorboard")
         settings = {"cache": self.study.cache, "seed": self.seed, "budget": self.study.budget, "loggers": loggers}
         trained = train_filter(self.fold, name, base, out=self.out(name), **settings)
@@ -135,7 +135,7 @@ class Job:
         return evaluate_and_draw(*trained, self.fold.test, self.study.cache, plots, **names)
 
     def pretrain(self) -> SubModel:
-        """The sensor that all folds of this seed begin with."""
+        """Returns the sensor that all folds of this seed begin with."""
         torch.set_num_threads(1)
         study, parts = self.study, with_spans(with_disturbances(self.rendered[0]))
         torch.manual_seed(self.seed)
@@ -150,7 +150,7 @@ class Job:
 
 
 def evaluate_and_draw(recipe, model, streams: Sequence[Stream], cache: Path, plots: Path | None, **names) -> list[dict]:
-    """Rows of some drives, and pictures of each, clean and with missing frames, in a folder if one is given."""
+    """Returns rows of some drives; draws each, clean and with missing frames, if a folder is given."""
     rows = []
     for stream in streams:
         own, beliefs = evaluate(recipe, model, stream, cache, **names)
@@ -165,7 +165,7 @@ def evaluate_and_draw(recipe, model, streams: Sequence[Stream], cache: Path, plo
 
 
 def make_jobs(study: Study) -> list[Job]:
-    """Every combination; seeds last, so that a study that is broken off has whole folds."""
+    """Returns every combination; seeds last, so that an interrupted study has whole folds."""
     streams, rendered = find_streams(study.root, study.size, list(study.drives) or None), study.rendered_parts()
     names = study.test or list(dict.fromkeys(stream.drive for stream in streams))
     folds = [make_fold(name, streams, *rendered) for name in names]
@@ -196,7 +196,7 @@ def run_jobs(jobs: Sequence[Job], processes: int) -> None:
 
 
 def rows_of(out: Path) -> list[dict]:
-    """All rows that a study's folder holds: filters, sensors and seeds may come from several calls.
+    """Returns all rows that a study's folder holds: filters, sensors and seeds may come from several calls.
 
     Each filter's rows bring dead reckoning with its sensor and the floor; those of the first one are kept.
     """

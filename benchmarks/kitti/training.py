@@ -89,7 +89,7 @@ def log_gains(fold: Fold, base: SensorOfFold) -> Tensor:
 
 
 def certain_gain(gains: Tensor) -> float:
-    """The mean logarithm, if a t test over the drives tells it from 0 at 5 %; else 0."""
+    """Returns the mean logarithm, if a t test over the drives tells it from 0 at 5 %; else 0."""
     if len(gains) < 3 or not ttest_1samp(gains.double().numpy(), 0.0).pvalue < 0.05:
         return 0.0
     return float(gains.mean())
@@ -106,7 +106,7 @@ def train_filter(
     budget: Budget,
     loggers: Sequence[str] = ("csv",),
 ) -> tuple[KITTIRecipe, Filter]:
-    """Trains one filter on a fold, or goes on where it was broken off; the model at the end is the best one."""
+    """Trains one filter on a fold, or resumes after an interruption; the model at the end is the best one."""
     torch.manual_seed(seed)
     facts, kind = base.facts, base.kind
     sensor = SENSORS[kind](facts)

@@ -1,4 +1,4 @@
-"""The velocity of a robot on slippery ground, as two filters believe it; and a walk with what is believed of it."""
+"""Draws the velocity of a robot on slippery ground by two filters; and a walk with the estimated velocity."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Camera:
             self.renderer.scene.flags[flag] = 0
 
     def frame(self, arrows: Mapping[str, Tensor], std: Tensor) -> np.ndarray:
-        """A picture ``[H, W, 3]``.
+        """Returns a picture ``[H, W, 3]``.
 
         Args:
             arrows: velocities ``[3]`` in the base's axes, by their colour.

@@ -1,4 +1,4 @@
-"""A policy that was trained with the base's true velocity, and walks on what is believed of it.
+"""A policy that was trained with the base's true velocity, and runs on the filter's estimate.
 
 python -m benchmarks.legged.policy --out runs/walk
 """
@@ -165,7 +165,7 @@ class Laboratory:
         return agent
 
     def trained(self, arm: str, batches: int) -> PPO:
-        """A policy that was trained with what an arm reads; goes on where it was stopped."""
+        """Returns a policy that was trained with what an arm reads; resumes where it stopped."""
         agent, file, first = self.agent(arm, batches), self.study.out / f"{arm}.pt", 0
         parts = {"loss": agent.loss, "optimiser": agent.optimiser, "schedule": agent.schedule}
         if file.exists():
@@ -224,7 +224,7 @@ def scored(data: TensorDict) -> dict[str, Tensor]:
 
 
 def tested(laboratory: Laboratory, policies: dict[str, TensorDictModuleBase]) -> pd.DataFrame:
-    """A row for each ground, arm and robot; robots, commands and forces are the same for all arms."""
+    """Returns a row for each ground, arm and robot; robots, commands and forces are the same for all arms."""
     study, file = laboratory.study, laboratory.study.out / "policy.csv"
     rows = records(file)
     for (number, ground), arm in product(enumerate(GROUNDS), ARMS):
@@ -243,7 +243,7 @@ def tested(laboratory: Laboratory, policies: dict[str, TensorDictModuleBase]) ->
 
 
 def film(laboratory: Laboratory, policy: PPO, every: int = 8) -> None:
-    """A robot on slippery ground with the command, the true velocity, and what is believed of it."""
+    """Draws a robot on slippery ground with the command, the true and the estimated velocity."""
     alone = Laboratory(replace(laboratory.study, robots=1))
     env = alone.env("belief", list(GROUNDS)[1], laboratory.study.seed + 600)
     robot, frames, rows = env.base_env.robots[0], [], count()
@@ -261,7 +261,7 @@ def film(laboratory: Laboratory, policy: PPO, every: int = 8) -> None:
 
 
 def page(rows: pd.DataFrame, study: Study) -> str:
-    """The tables."""
+    """Returns the tables."""
     text = [
         "# A policy that walks on the belief of its base's velocity",
         "",

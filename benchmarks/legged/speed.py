@@ -65,7 +65,7 @@ def main() -> None:
     study = Speed(robots=8, rounds=1, smoke=True) if study.smoke else study
     torch.manual_seed(0)
     text = [
-        "# What a step costs",
+        "# Time of a step",
         "",
         "The simulated quadruped, four feet, single precision. Times are of the processor, one thread: the least of "
         f"{study.rounds} rounds. A batch holds {study.robots:,} robots.",

@@ -39,7 +39,7 @@ class Start:
 
 
 def turned(state: Tensor, turn: Tensor) -> Tensor:
-    """States ``[*, 16 + 3 F]`` with the whole world turned about its origin, by quaternions ``[*, 4]``."""
+    """Returns states ``[*, 16 + 3 F]`` with the whole world turned about its origin, by quaternions ``[*, 4]``."""
     turn = turn.expand(*state.shape[:-1], 4)
     feet = rotate(turn.unsqueeze(-2), state[..., 16:].unflatten(-1, (-1, 3))).flatten(-2)
     moved = [rotate(turn, state[..., 4:7]), rotate(turn, state[..., 7:10]), state[..., 10:16], feet]

@@ -42,8 +42,8 @@ SCORES = {
     "tilt": ("tilt, deg", 2),
     "drift": ("drift, %", 1),
     "nees": ("NEES", 2),
-    "held": ("held", 2),
-    "ms": ("ms a step", 0),
+    "held": ("coverage", 2),
+    "ms": ("ms per step", 0),
 }
 HEADS = ("joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)")
 SHOWN = list(DATA["quadruped"])[1]  # in the picture
@@ -95,19 +95,19 @@ def run(robot: Robot, **options) -> tuple[TensorDict, float]:
 
 
 def scored(robot: Robot, belief: TensorDict) -> dict[str, float]:
-    """Scores of a belief."""
+    """Returns scores of a belief."""
     return scores(robot, belief["velocity"], belief["velocity_var"], belief["mean"])
 
 
 def in_the_air(robot: Robot) -> Robot:
-    """The same log, in which no foot ever stands: what is left is to integrate the inertial sensor."""
+    """Returns the same log, in which no foot ever stands: what is left is to integrate the inertial sensor."""
     log = robot.log.clone()
     log["contact"] = torch.zeros_like(log["contact"])
     return replace(robot, log=log)
 
 
 def chosen(make: Callable[[], Robot], name: str, grid: Iterable[dict[str, float]], out: Path) -> LeggedNoises:
-    """The noises of a grid under which the true velocity is likeliest.
+    """Returns the noises of a grid under which the true velocity is likeliest.
 
     Args:
         make: makes the log.
@@ -128,7 +128,7 @@ def chosen(make: Callable[[], Robot], name: str, grid: Iterable[dict[str, float]
 
 
 def best(rows: list[dict], name: str) -> LeggedNoises:
-    """The noises of rows of a log under which the true velocity is likeliest."""
+    """Returns the noises of rows of a log under which the true velocity is likeliest."""
     row = min(pick(rows, data=name), key=lambda row: row["nll"])
     return LeggedNoises(**{key: row[key] for key in NOISES})
 
@@ -143,7 +143,7 @@ def feet_grid(smoke: bool) -> list[dict[str, float]]:
 def filter_rows(
     robots: dict[str, Robot], variants: dict[str, dict], kinds: dict[str, dict], integrated: bool = True
 ) -> tuple[list[dict], dict[str, TensorDict]]:
-    """Rows of the library's filters; and their beliefs, by filter, of all runs.
+    """Returns rows of the library's filters; and their beliefs, by filter, of all runs.
 
     Args:
         robots: by the name of the data, with logs of one shape, which are filtered side by side.
@@ -173,20 +173,20 @@ def filter_rows(
 
 
 def still(robot: Robot) -> dict[str, float]:
-    """Scores of a velocity of zero: how fast the robot is."""
+    """Returns scores of a velocity of zero: how fast the robot is."""
     zero = torch.zeros_like(robot.log["true", "velocity"])
     return {key: scores(robot, zero, torch.ones_like(zero))[key] for key in ("velocity", "certain")}
 
 
 def page(frame: pd.DataFrame, study: Study) -> str:
-    """The table."""
+    """Returns the table."""
     lines = [
-        "# How fast is the base",
+        "# Velocity of a legged base",
         "",
         "Velocity is the root mean square error of the base's velocity, all three axes together, in the base's axes; "
         "tilt that of where up is. Drift is how far the end of the path is off, over the path's length. NEES is the "
         "squared error of the velocity in units of the variance, over its expectation: above 1 a filter is too sure. "
-        f"Held is the share of true velocities within the {LEVEL:.0%} intervals.",
+        f"Coverage is the share of true velocities within the {LEVEL:.0%} intervals.",
     ]
     frame = frame.reindex(columns=["data", "filter", "draws", *SCORES, *NOISES])
     shown = frame[["filter", "draws"]].assign(
@@ -207,7 +207,7 @@ def page(frame: pd.DataFrame, study: Study) -> str:
         "grounds for all simulated rows. iCub has those of the simulated humanoid on firm ground, whose rows were "
         "stamped as unevenly as iCub's. Milliseconds are those of the processor for a step of all "
         f"{study.runs * len(GROUNDS)} runs of a simulated robot, or of iCub's, without compilation, one thread. "
-        "`--kinds` runs some filters again, with exact draws; rows of random draws are of a whole run before.",
+        "`--kinds` runs some filters again, with the quadruped's contacts that the library has.",
         "",
         *markdown(noises.set_axis(HEADS, axis=1)),
         "",
@@ -218,7 +218,7 @@ def page(frame: pd.DataFrame, study: Study) -> str:
 
 
 def again(study: Study, kind: str) -> list[dict]:
-    """Rows of some filters: of all four grounds, with the noises that were chosen before."""
+    """Returns rows of some filters: of all four grounds, with the noises that were chosen before."""
     if kind == "icub":
         robots = {ICUB: icub(study.icub)}
         names = "humanoid, firm ground, uneven stamps"
@@ -234,7 +234,7 @@ def again(study: Study, kind: str) -> list[dict]:
 
 
 def grounds(study: Study, kind: str) -> dict[str, Robot]:
-    """A simulated robot's test logs."""
+    """Returns a simulated robot's test logs."""
     return {
         name: simulated(kind, study.runs, study.seconds, study.seed + 3 + number, ground)
         for number, (name, ground) in enumerate(DATA[kind].items())
@@ -242,7 +242,7 @@ def grounds(study: Study, kind: str) -> dict[str, Robot]:
 
 
 def walked(study: Study, kind: str) -> list[dict]:
-    """The rows of a simulated robot; of the quadruped the picture and the trained filter are left in the folder."""
+    """Returns the rows of a simulated robot; for the quadruped it also saves the picture and the trained filter."""
     length = 0.3 if study.smoke else 6.0
     make = partial(simulated, kind, VALIDATION_RUNS, length, study.seed + 2)
     noises = chosen(make, f"{kind}, all grounds", feet_grid(study.smoke), study.out)
@@ -279,7 +279,7 @@ def _save(contacts: LearnedContacts, noises: LeggedNoises, study: Study) -> None
 
 
 def real(study: Study) -> list[dict]:
-    """The rows of iCub."""
+    """Returns the rows of iCub."""
     robot = icub(study.icub)
     make = partial(simulated, "humanoid", VALIDATION_RUNS, 6.0, study.seed + 2, FIRM)
     firm = chosen(make, "humanoid, firm ground", feet_grid(study.smoke), study.out)

@@ -89,14 +89,14 @@ class Robot:
 
 
 def _trots(random: np.random.Generator, options: dict[str, float]) -> tuple[LeggedEnv, Callable[[float], Tensor]]:
-    """A quadruped, and its controls at a time."""
+    """Returns a quadruped, and its controls at a time."""
     low, high = [0.8, 0.2, 0.2, -0.3], [1.2, 0.4, 0.4, 0.3]
     gait = dict(zip(("pace", "stride", "height", "turn"), random.uniform(low, high).tolist(), strict=True))
     return quadruped_env(**options), lambda time: min(1.0, time) * trot(time, **gait)
 
 
 def _strolls(random: np.random.Generator, options: dict[str, float]) -> tuple[LeggedEnv, Callable[[float], Tensor]]:
-    """A humanoid in its harness, and its controls."""
+    """Returns a humanoid in its harness, and its controls."""
     pace, stride, lift, turn, fits = random.uniform([0.8, 0.12, 0.3, -0.2, 0.9], [1.1, 0.22, 0.5, 0.2, 1.1]).tolist()
     options["pushes"] *= 0.4  # as it weighs
     env = humanoid_env(**options, speed=2.5 * fits * stride * pace, turn=turn)
@@ -111,7 +111,7 @@ SIMULATED: dict[str, tuple[dict[str, Any], Callable]] = {
 
 
 def simulated(kind: str, runs: int, seconds: float, seed: int, ground: Ground | None = None) -> Robot:
-    """A robot of dm_control that walks at a pace, with strides and turns of its own in each run; all sensors err.
+    """Returns a walking robot of dm_control, with other strides and turns in each run and noise on all sensors.
 
     Args:
         kind: one of ``SIMULATED``.
@@ -138,7 +138,7 @@ def simulated(kind: str, runs: int, seconds: float, seed: int, ground: Ground | 
 
 
 def icub(folder: Path) -> Robot:
-    """The walk of iCub. Its truth is in doubt where motion capture moves a foot that carries the whole robot.
+    """Returns the walk of iCub; its truth is doubtful where motion capture moves the stance foot.
 
     Args:
         folder: with ``model.urdf`` and ``walking.npz``.
@@ -153,7 +153,7 @@ def icub(folder: Path) -> Robot:
 
 
 def jittered(robot: Robot, like: Robot) -> Robot:
-    """A robot whose rows are stamped as unevenly as those of another: ``"dt"`` is what the stamps say."""
+    """Returns a robot whose rows are stamped as unevenly as those of another: ``"dt"`` is what the stamps say."""
     dt = like.log["dt"][:, 1:, 0]
     late = dt.std() / 2**0.5 * torch.randn(*robot.log.shape, 1).to(dt)
     steps = robot.dt + torch.cat([torch.zeros_like(late[:, :1]), late.diff(dim=1)], 1)
@@ -179,7 +179,7 @@ def scores(robot: Robot, velocity: Tensor, var: Tensor, mean: Tensor | None = No
 
     Returns:
         ``velocity``, the root mean square error of the velocity in m/s, and ``certain``, the same without rows whose
-        truth is in doubt; ``held``, the share of the true velocities in the intervals; ``nees``, the mean of square
+        truth is in doubt; ``held``, the coverage of the intervals; ``nees``, the mean of square
         error by variance; ``nll``, the mean negative log-likelihood. With ``mean`` also ``tilt`` in degrees, and
         ``drift``, how far the end of the path is off, in % of its length.
     """
@@ -207,12 +207,12 @@ def scores(robot: Robot, velocity: Tensor, var: Tensor, mean: Tensor | None = No
 
 
 def _length(position: Tensor) -> Tensor:
-    """The length of a path without the noise of single rows: of its places every 10 rows."""
+    """Returns the length of a path without the noise of single rows: of its places every 10 rows."""
     return position[:, ::10].diff(dim=1).norm(dim=-1).sum(1)
 
 
 def _from_start(turn: Tensor, place: Tensor) -> Tensor:
-    """Places as seen from the first one, along its heading."""
+    """Returns places as seen from the first one, along its heading."""
     forward = rotate(turn[:, 0], turn.new_tensor([1.0, 0.0, 0.0]))
     angle = torch.atan2(forward[:, 1], forward[:, 0])
     heading = SO3().exp(angle.unsqueeze(-1) * turn.new_tensor([0.0, 0.0, 1.0]))

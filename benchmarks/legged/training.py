@@ -71,12 +71,12 @@ class LSTM(nn.Module):
         self.register_buffer("scale", torch.ones(self.features))
 
     def read(self, log: TensorDict) -> Tensor:
-        """Features ``[R, T, N]`` of a log."""
+        """Returns features ``[R, T, N]`` of a log."""
         keys = ("imu", "joints", "joint_rates", "contact")
         return self.contacts[0].features(*(log[key] for key in keys), rows=1).flatten(-2)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocities and variances ``[R, T, 3]``."""
+        """Returns velocities and variances ``[R, T, 3]``."""
         mean, spread = self.head(self.memory((features - self.loc) / self.scale)[0]).split(3, -1)
         return mean, F.softplus(spread) + 1e-5
 

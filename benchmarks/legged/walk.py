@@ -46,7 +46,7 @@ def gait(phase: Tensor, stride: Tensor) -> Tensor:
 
 
 class Walk(EnvBase):
-    """Robots side by side, 100 rows a second. An ``"action"`` ``[3]`` in [-1, 1] adds to the strides of their gait.
+    """Robots side by side, 100 rows per second. An ``"action"`` ``[3]`` in [-1, 1] adds to the strides of their gait.
 
     Emits what each robot reads, the truth, and ``"command"`` ``[2]``, the velocity that is wanted in the base's axes,
     in m/s, which changes every 2 to 4 s; and ``"phase"`` ``[2]``, cosine and sine, of the gait. The reward of a row is
@@ -130,7 +130,7 @@ def play(
     keep: list,
     watch: Callable[[TensorDict], None] = lambda row: None,
 ) -> TensorDict:
-    """Some entries of an episode ``[B, T]``, in which a policy acts every fifth row.
+    """Returns some entries of an episode ``[B, T]``, in which a policy acts every fifth row.
 
     Args:
         env: a :class:`Walk`, maybe with transforms.

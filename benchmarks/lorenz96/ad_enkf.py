@@ -113,7 +113,7 @@ class ADEnKF:
 
 
 def page(options: ADEnKF, rows: list[str], errors: list[float], seconds: float) -> str:
-    """The page of results."""
+    """Returns the page of results."""
     lines = [
         "# AD-EnKF: Lorenz-96's forcing from observations alone",
         "",

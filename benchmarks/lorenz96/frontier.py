@@ -1,4 +1,4 @@
-"""Error against milliseconds a step on Lorenz-96: ensemble filters of many sizes beside EKF, UKF and particle filter.
+"""Error against milliseconds per step on Lorenz-96: ensemble filters of many sizes, EKF, UKF, particle filter.
 
 The standard set-up of :mod:`benchmarks.lorenz96.schemes`: 40 variables, all observed with unit variance, no model
 noise. All filters know the equations and R. Each filter, at each size, gets one setting on validation records: an
@@ -59,7 +59,7 @@ def _models() -> dict:
 
 
 def ensemble(scheme: str, size: int, radius: float | None, inflation: float) -> Filter:
-    """The DEnKF with one of the schemes; a localised ``"etkf"`` is the LETKF."""
+    """Returns the DEnKF with one of the schemes; a localised ``"etkf"`` is the LETKF."""
     keys = {"inflation": inflation, "rotate": scheme == "etkf", "observation_key": "observation"}
     if scheme == "etkf" and radius is not None:
         places = torch.arange(float(VARIABLES)).unsqueeze(-1)
@@ -71,20 +71,20 @@ def ensemble(scheme: str, size: int, radius: float | None, inflation: float) -> 
 
 
 def gaussian(kind: type[EKF | UKF], inflation: float) -> Filter:
-    """An extended or unscented Kalman filter."""
+    """Returns an extended or unscented Kalman filter."""
     keys = {"observation_key": "observation", "inflation": inflation, "process_noise": 0.0}
     return kind(**_models(), initial=GaussianAround([1.0] * VARIABLES), **keys)
 
 
 def particles(size: int, kernel: float) -> Filter:
-    """A bootstrap filter, regularised."""
+    """Returns a bootstrap filter, regularised."""
     initial = AroundState([1.0] * VARIABLES, ensemble_size=size)
     likelihood = GaussianLikelihood(observation_key="observation")
     return ParticleFilter(**_models(), likelihood=likelihood, jitter=kernel, initial=initial)
 
 
 def candidates(sizes: Iterable[int]) -> dict[tuple[str, int], dict[str, Make]]:
-    """Filters by name and size, and their settings."""
+    """Returns filters by name and size, and their settings."""
     found: dict[tuple[str, int], dict[str, Make]] = {}
     for (name, scheme), size in product(SCHEMES.items(), sizes):
         if scheme == "etkf" and size > ROTATED:
@@ -124,14 +124,14 @@ def _rows(*arguments) -> list[dict]:
 
 @dataclass
 class Frontier:
-    """Error against milliseconds a step: ensemble filters of many sizes, EKF, UKF, particle filter."""
+    """Error against milliseconds per step: ensemble filters of many sizes, EKF, UKF, particle filter."""
 
     sizes: tuple[int, ...] = (8, 16, 32, 64, 128, 256, 512, 1024)  # members
     records: int = 4  # to choose by, and as many to test on
     steps: int = 600  # of each
     burn_in: int = 100  # of these, which do not count
     out: Path = Path("benchmarks/lorenz96/results/frontier.md")
-    rows: Path = Path("runs/lorenz96-frontier")  # what was broken off goes on from here
+    rows: Path = Path("runs/lorenz96-frontier")  # an interrupted run resumes from here
     smoke: bool = False  # one size on short records, nothing compiled, nothing written
 
     def __call__(self) -> None:
@@ -159,7 +159,7 @@ class Frontier:
 
     def _page(self, rows: list[dict], seconds: float) -> str:
         lines = [
-            "# Lorenz-96: error against milliseconds a step",
+            "# Lorenz-96: error against milliseconds per step",
             "",
             f"{VARIABLES} variables, all observed with R = 1, no model noise, steps of 0.05 time units; all "
             f"filters know the equations and R, and begin around the truth with a standard deviation of 1. The "
@@ -167,14 +167,14 @@ class Frontier:
             f"of {self.steps} steps without the first {self.burn_in}. The readings' own RMSE is 1. ms: processor "
             f"time, one record, one thread, the least of {RUNS} runs of {TIMED} steps, each step compiled.",
             "",
-            *head("filter", "members", "setting", "RMSE, validation", "RMSE", "ms a step", "ms, not compiled"),
+            *head("filter", "members", "setting", "RMSE, validation", "RMSE", "ms per step", "ms, not compiled"),
         ]
         for row in rows:
             numbers = (f"{row[k]:.3f}" for k in ("validation_rmse", "rmse", "ms_per_step", "eager_ms_per_step"))
             lines.append(line(row["filter"], row["members"], row["setting"], *numbers))
         lines += [
             "",
-            "![RMSE against milliseconds a step](frontier.png)",
+            "![RMSE against milliseconds per step](frontier.png)",
             "",
             *made_by("lorenz96", f", {seconds:.0f} s"),
         ]

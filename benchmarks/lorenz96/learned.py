@@ -50,13 +50,13 @@ def tapers(dims: Sequence[int], variables: int, radius: float) -> tuple[torch.Te
 
 
 def on_circle(first: torch.Tensor, second: torch.Tensor, variables: int) -> torch.Tensor:
-    """Distances ``[len(first), len(second)]`` between places on a circle."""
+    """Returns distances ``[len(first), len(second)]`` between places on a circle."""
     distance = (first.unsqueeze(-1) - second).abs()
     return torch.minimum(distance, variables - distance)
 
 
 def simulate(variables: int, steps: int, records: int, rng: torch.Generator) -> torch.Tensor:
-    """True states ``[records, steps, variables]`` on the attractor."""
+    """Returns true states ``[records, steps, variables]`` on the attractor."""
     state = FORCING + torch.randn(records, variables, generator=rng)
     states = []
     for _ in range(SPIN_UP + steps):
@@ -80,7 +80,7 @@ def make_filter(
     radius: float | None,
     learn_noise: bool = False,
 ) -> DEnKF:
-    """An ensemble Kalman filter of the system with a wrong forcing.
+    """Returns an ensemble Kalman filter of the system with a wrong forcing.
 
     Args:
         variables: N.
@@ -113,18 +113,18 @@ def make_filter(
 
 
 def climate_of(record: TensorDict) -> tuple[float, float]:
-    """Mean and standard deviation of a variable, from observations: their variance is the system's plus R."""
+    """Returns mean and standard deviation of a variable, from observations whose variance includes R."""
     observation = record["observation"]
     return observation.mean().item(), (observation.var().item() - R**2) ** 0.5
 
 
 def forcing_of(denkf: DEnKF) -> torch.Tensor:
-    """The parameter F."""
+    """Returns the parameter F."""
     return denkf["transition"].module["transition"].module.forcing
 
 
 def noise_of(denkf: DEnKF) -> torch.Tensor:
-    """Standard deviation of the model noise of each variable."""
+    """Returns the standard deviation of the model noise of each variable."""
     return (0.5 * denkf["transition"].module["noise"].log_variance).exp().detach()
 
 
@@ -145,7 +145,7 @@ def learn(denkf: DEnKF, record: TensorDict, updates: int, rng: torch.Generator, 
         with torch.no_grad():
             warm = denkf.sequence(frames[:, : WARM_UP + 1].copy()).select(*denkf.belief_keys)
         frames = frames[:, WARM_UP:].copy()
-        # A stored belief needs an entry for every time; only the first is read, as nothing starts anew in between.
+        # A stored belief needs an entry for every time; only the first is read, as nothing starts again in between.
         frames.update(warm[:, -1:].expand(BATCH, WINDOW + 1))
         return loss(frames)["loss_nll"]
 
@@ -155,6 +155,6 @@ def learn(denkf: DEnKF, record: TensorDict, updates: int, rng: torch.Generator, 
 
 @torch.no_grad()
 def evaluate(denkf: DEnKF, states: torch.Tensor, record: TensorDict, skip: int) -> float:
-    """Root mean square error of the belief's mean on an unseen record; here alone the true states are used."""
+    """Returns the RMSE of the belief's mean on an unseen record, whose true states no training uses."""
     mean = denkf.sequence(record.copy())["belief", "mean"]
     return (mean - states)[:, skip:].square().mean().sqrt().item()

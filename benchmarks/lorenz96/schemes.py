@@ -43,7 +43,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """The scheme in words."""
+        """Returns the scheme in words."""
         return self.scheme + (", rotated every cycle" if self.rotate else "")
 
 
@@ -66,7 +66,7 @@ class Random:
         self.generators = [torch.Generator().manual_seed(1000 * stream + seed) for seed in numbers]
 
     def randn(self, *shape: int) -> Tensor:
-        """Standard normal, ``[seeds, *shape]``."""
+        """Returns standard normal numbers, ``[seeds, *shape]``."""
         return torch.stack([torch.randn(*shape, generator=g, dtype=torch.float64) for g in self.generators])
 
     def rotation(self, size: int) -> Tensor:
@@ -75,7 +75,7 @@ class Random:
 
 
 def simulate(seeds: int, cycles: int, first: int = 0) -> tuple[Tensor, Tensor]:
-    """Truth and observations, ``[cycles + 1, seeds, VARIABLES]``; the first is the start."""
+    """Returns the truth and observations, ``[cycles + 1, seeds, VARIABLES]``; the first is the start."""
     random = Random(seeds, 0, first)
     state = 8 + random.randn(VARIABLES)
     for _ in range(SPIN_UP):
@@ -89,7 +89,7 @@ def simulate(seeds: int, cycles: int, first: int = 0) -> tuple[Tensor, Tensor]:
 def assimilate(
     case: Case, truth: Tensor, observations: Tensor, first: int = 0, exact: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Root mean square error and spread of every analysis, both ``[cycles, seeds]``.
+    """Returns the root mean square error and spread of every analysis, both ``[cycles, seeds]``.
 
     Args:
         case: of the table.
@@ -175,7 +175,7 @@ class Schemes:
     burn_in: int = 400  # cycles before those
     first: int = 0  # seed
     schemes: tuple[str, ...] = ("perturbed", "sakov", "etkf", "letkf")
-    inflation: float | None = None  # in the place of the published ones
+    inflation: float | None = None  # instead of the published ones
     draws: Literal["exact", "random"] = "exact"  # of the start and of perturbations
     out: Path | None = None  # also write the table to this Markdown file
     smoke: bool = False  # a few cycles: does it run?

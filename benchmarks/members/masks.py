@@ -34,7 +34,7 @@ def main() -> None:
         f"{study.draws} draws of the noise, and share of the truth within the 90 % intervals. No localisation. Weights "
         "are the same.",
         "",
-        *head("task", "members", *(word for masks in MASKS for word in (f"{masks} masks", "held"))),
+        *head("task", "members", *(word for masks in MASKS for word in (f"{masks} masks", "coverage"))),
     ]
     for members in study.members:
         cells = []

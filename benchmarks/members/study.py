@@ -32,7 +32,7 @@ class Study:
 
 
 def made(study: Study, name: str) -> Task:
-    """A task with its data."""
+    """Returns a task with its data."""
     if name == "walks":
         return tasks.walks(*((2, 20) if study.smoke else ()))
     if name == "lorenz96":
@@ -45,7 +45,7 @@ def made(study: Study, name: str) -> Task:
 
 
 def rows_of(task: Task, study: Study, there: list[dict]) -> Iterator[dict]:
-    """Rows of a task that are not there yet."""
+    """Yields rows of a task that are not there yet."""
     if task.reference is not None:
         name, score = task.reference
         if not pick(there, task=task.name, filter=name):
@@ -65,21 +65,21 @@ def rows_of(task: Task, study: Study, there: list[dict]) -> Iterator[dict]:
 
 
 def chosen(task: Task, study: Study, members: int) -> float | None:
-    """The threshold with the least error on validation data; ``None`` where members are too few for any."""
+    """Returns the threshold with the least error on validation data; ``None`` where members are too few for any."""
     able = [threshold for threshold in study.thresholds if threshold**2 < members - 1]
     scores: dict[float, Score] = {threshold: task.validate(members, threshold) for threshold in able}
     return min(scores, key=lambda threshold: scores[threshold].error) if scores else None
 
 
 def page(rows: list[dict], study: Study) -> str:
-    """The table."""
+    """Returns the table."""
     lines = [
         "# How many members?",
         "",
         'Error, and share of the truth within the 90 % intervals, without and with `localisation="significance"`.',
         "Validation data of the same kind choose the threshold, and of Lorenz-96 the inflation.",
         "",
-        *head("task", "error", "members", "without", "held", "with", "held", "threshold"),
+        *head("task", "error", "members", "without", "coverage", "with", "coverage", "threshold"),
     ]
     for name in tasks.ERRORS:
         own = pick(rows, task=name)
@@ -97,7 +97,7 @@ def page(rows: list[dict], study: Study) -> str:
 
 
 def cells(row: dict) -> tuple[str, str]:
-    """Error and coverage; empty where there is no row."""
+    """Returns the error and coverage; empty where there is no row."""
     return (f"{row['error']:.3g}", f"{row['held']:.0%}") if row else ("", "")
 
 

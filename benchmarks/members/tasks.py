@@ -77,12 +77,12 @@ class Task:
 
 
 def localised(threshold: float | None) -> dict[str, Any]:
-    """The options of an analysis."""
+    """Returns the options of an analysis."""
     return {} if threshold is None else {"localisation": "significance", "threshold": threshold}
 
 
 def scored(mean: Tensor, var: Tensor, truth: Tensor, dims: slice = slice(None)) -> Score:
-    """Root mean square error of some components, coverage of all, over ``[*B, S]``."""
+    """Returns the root mean square error of some components, coverage of all, over ``[*B, S]``."""
     parts = [value.flatten(0, -2) for value in (mean, var, truth)]
     error = (parts[0] - parts[2])[:, dims].square().mean().sqrt()
     return Score(float(error), float(interval_coverage(*parts, level=LEVEL).mean()))
@@ -90,14 +90,14 @@ def scored(mean: Tensor, var: Tensor, truth: Tensor, dims: slice = slice(None)) 
 
 @torch.no_grad()
 def filtered(filter: Filter, seed: int, data: TensorDict, skip: int, dims: slice = slice(None)) -> Score:
-    """The score on sequences ``[B, T]`` behind their first steps."""
+    """Returns the score on sequences ``[B, T]`` behind their first steps."""
     torch.manual_seed(seed)
     out = filter.sequence(data.clone(), keep=[("belief", "mean"), ("belief", "var")])["belief"][:, skip:]
     return scored(out["mean"], out["var"], data["state"][:, skip:], dims)
 
 
 def wheels(runs: int = 8, steps: int = 6000) -> Task:
-    """The robot on wheels of ``benchmarks.wheels``: fast sensors, slow GPS."""
+    """Returns the robot on wheels of ``benchmarks.wheels``: fast sensors, slow GPS."""
     test, other = recordings(runs, steps, 0), recordings(runs, steps, 1)
     scores = [partial(filtered, data=data, skip=min(500, steps // 2), dims=slice(0, 2)) for data in (test, other)]
 
@@ -141,7 +141,7 @@ def walks(runs: int = 16, steps: int = 1000) -> Task:
 
 
 def _weather(seeds: int, cycles: int, first: int) -> tuple[Tensor, Tensor]:
-    """True states and readings of Lorenz-96, ``[cycles + 1, seeds, 40]``."""
+    """Returns true states and readings of Lorenz-96, ``[cycles + 1, seeds, 40]``."""
     generator = torch.Generator().manual_seed(first)
     draw = partial(torch.randn, seeds, 40, generator=generator, dtype=torch.float64)
     state = 8 + draw()
@@ -196,7 +196,7 @@ def lorenz96(seeds: int = 4, cycles: int = 600, inflations: tuple[float, ...] = 
 
 
 def manipulator(folder: Path, demos: int = 100, updates: int = 8000) -> Task:
-    """Joint velocities of dm_control's manipulator by the filter of ``benchmarks.arms``, which learned its motion.
+    """Returns joint velocities of dm_control's manipulator, by the filter of ``benchmarks.arms``.
 
     Cosine, sine and velocity of its joints are 12 numbers, of which noisy encoders read 8.
     """
@@ -221,14 +221,14 @@ def localise(filter: Filter, threshold: float | None) -> Filter:
 
 
 def resized(filter: Any, members: int, threshold: float | None) -> Any:
-    """A filter that comes with the library, with so many members; their noise models stay those of its training."""
+    """Returns a pretrained filter with so many members and the noise models of its training."""
     new = type(filter)(replace(filter.settings, ensemble_size=members))
     new.load_state_dict(filter.state_dict())
     return localise(new.eval(), threshold)
 
 
 def reacher(episodes: int = 10, steps: int = 400) -> Task:
-    """Joint velocities of the reacher by the filter that comes with the library, under random actions."""
+    """Returns joint velocities of the reacher by the pretrained filter, under random actions."""
     scores = []
     for seed in (1000, 2000):
         torch.manual_seed(seed)
@@ -245,7 +245,7 @@ def _pushes(noise: float, episodes: int, seed: int) -> TensorDict:
 
 
 def cartpole(noise: float = 0.3, episodes: int = 20) -> Task:
-    """Velocities of the cartpole of ``benchmarks.control`` under random pushes, by a filter that knows its physics."""
+    """Returns velocities of ``benchmarks.control``'s cartpole under random pushes; the filter has its physics."""
     data = [_pushes(noise, episodes, seed) for seed in (0, 1)]
 
     def make(members: int, threshold: float | None) -> Filter:
@@ -255,7 +255,7 @@ def cartpole(noise: float = 0.3, episodes: int = 20) -> Task:
 
 
 def ur5(folder: Path, demos: int = 200, others: int = 100) -> Task:
-    """Joints of the UR5 at its table by the filter that comes with the library, on demos that it has not seen."""
+    """Returns joints of the UR5 at its table, by the pretrained filter on test demos."""
     side = UR5TableSettings.pixels
     collect_ur5_demos(folder / "test", demos, size=(side, side), seed=0)
     collect_ur5_demos(folder / "validation", others, size=(side, side), seed=1)

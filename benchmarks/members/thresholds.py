@@ -59,7 +59,7 @@ class Bearing(SubModel):
         super().__init__(nn.Identity(), [("forecast", "ensemble"), "observer"], [("forecast", "observation")])
 
     def compute(self, ensemble, observer):
-        """The bearings ``[*B, E, 1]``."""
+        """Returns the bearings ``[*B, E, 1]``."""
         away = ensemble[..., :2] - observer.unsqueeze(-2)
         return torch.atan2(away[..., :1], away[..., 1:])
 
@@ -86,7 +86,7 @@ def targets(runs: int, seed: int, steps: int = 40) -> TensorDict:
 
 @torch.no_grad()
 def bearings(runs: int) -> tuple[Score, Callable[[int, float | None], Score]]:
-    """The unscented Kalman filter's score, and an ensemble's: the median error of a run, a mean over components."""
+    """Returns the scores of the UKF and of an ensemble: median error of a run, mean over components."""
     data = targets(runs, 4)
     common = {"process_noise": WALK, "update_at_reset": True}
     reading = {"reading_space": Circle(), "observation_key": "reading"}
@@ -109,7 +109,7 @@ def bearings(runs: int) -> tuple[Score, Callable[[int, float | None], Score]]:
 
 
 def linear(size: int, read: int, runs: int) -> tuple[Score, Callable[[int, float | None], Score]]:
-    """The Kalman filter's score on a random stable system, and an ensemble's."""
+    """Returns the Kalman filter's score on a random stable system, and an ensemble's."""
     generator = torch.Generator().manual_seed(size)
     draw = partial(torch.randn, generator=generator)
     f, h = 0.98 * torch.linalg.qr(draw(size, size))[0], draw(read, size) / size**0.5
@@ -154,7 +154,7 @@ def main() -> None:
     }
     for name, task in others.items():
         tasks[name] = task.validate(8 if small else 512, None), task.validate
-    lines = ["# Which threshold?", "", *head("task", "members", "none", *study.thresholds)]
+    lines = ["# Threshold of significance", "", *head("task", "members", "none", *study.thresholds)]
     for name, (reference, score) in tasks.items():
         for members in (8,) if small else study.members:
             able = [one for one in study.thresholds if one**2 < members - 1]

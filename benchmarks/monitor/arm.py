@@ -1,4 +1,4 @@
-"""The UR5 at its table, watched by a camera and by noisy encoders, of which one fails without a word."""
+"""The UR5 at its table, watched by a camera and by noisy encoders, of which one fails silently."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Beliefs(NamedTuple):
 
 
 def arm_filter() -> Filter:
-    """The trained filter behind its camera, with a second update by the encoders of all joints."""
+    """Returns the trained filter behind its camera, with a second update by the encoders of all joints."""
     model = from_pretrained("ur5-table")
     parts = {name: model[name] for name in model.module if name != "sensor"}
     parts["analysis"] = EnsembleAnalysis("sensor", inflation=model.inflation, belief_prefix="seen")
@@ -117,7 +117,7 @@ def read_demos(folder: Path, split: str, fault: str, cache: Path) -> TensorDict:
 
 
 def pushed(pictures: Tensor, number: int) -> Tensor:
-    """Pictures ``[T, 3, H, W]`` of a camera that was pushed: 8 % to one side, and turned by 5 degrees."""
+    """Returns pictures ``[T, 3, H, W]`` of a camera that was pushed: 8 % to one side, and turned by 5 degrees."""
     side = 1.0 if number % 2 else -1.0
     turn, way = torch.tensor(side * 5.0).deg2rad(), 2 * side * 0.08  # the picture's coordinates reach from -1 to 1
     matrix = torch.tensor([[turn.cos(), -turn.sin(), way], [turn.sin(), turn.cos(), 0.0]]).expand(len(pictures), 2, 3)
@@ -126,12 +126,12 @@ def pushed(pictures: Tensor, number: int) -> Tensor:
 
 
 def error_of(out: TensorDict) -> Tensor:
-    """Error of the belief's mean in units of what counts as one, mean over the state, ``[N, T]``."""
+    """Returns the error of the belief's mean in units of what counts as one, mean over the state, ``[N, T]``."""
     return ((out["belief", "mean"] - out["state"]).abs() / UNIT).mean(-1)
 
 
 def own_demos(out: Path, count: int = OWN) -> Path:
-    """The folder of demos that neither trained nor test anything; collects what is missing."""
+    """Returns the folder of demos that neither trained nor test anything; collects what is missing."""
     collect_ur5_demos(out / "ur5", count, size=(64, 64), frames=0, seed=OWN_SEED)
     return out / "ur5"
 
@@ -148,13 +148,13 @@ def chosen_on(folder: Path, cache: Path) -> Beliefs:
 
 
 def arm_monitor(clean: TensorDict, guard: ArmGuard = CHOSEN) -> InnovationMonitor:
-    """A monitor, calibrated on beliefs of clean demos."""
+    """Returns a monitor, calibrated on beliefs of clean demos."""
     options = {"window": 3, "reference": guard.reference, "false_alarm_rate": guard.rate}
     return InnovationMonitor(arm_sensors(), **options).calibrate([clean], margin=guard.margin)
 
 
 def arm_gate(known: TensorDict, guard: ArmGuard = CHOSEN) -> Filter:
-    """The filter with two gates, calibrated on clean readings."""
+    """Returns the filter with two gates, calibrated on clean readings."""
     gate = Gated(arm_filter(), 10, places=["analysis"], response="reject", rate=1e-4, patience=10)
     gate = Gated(gate, JOINTS, places=["encoders"], response="reject", rate=1e-4, patience=100, by_component=True)
     return gate.calibrate([known], margin=guard.gate_margin)
@@ -166,7 +166,7 @@ def demo_runs(monitor: InnovationMonitor, beliefs: dict[str, TensorDict]) -> dic
 
 
 def gated_errors(beliefs: Beliefs, guard: ArmGuard) -> dict[str, float]:
-    """Mean error with the gate by fault: of a fault, while it lasts."""
+    """Returns the mean error with the gate by fault: of a fault, while it lasts."""
     gate, out = arm_gate(beliefs.known, guard), {}
     for fault, data in beliefs.tested.items():
         rows = slice(1, None) if fault == "none" else data["fault"][0, :, 0]
@@ -175,7 +175,7 @@ def gated_errors(beliefs: Beliefs, guard: ArmGuard) -> dict[str, float]:
 
 
 def arm_rows(folder: Path, own: Path, cache: Path, draws: int) -> list[dict]:
-    """A row for each fault, over the demos of the test side; thresholds from the study's own demos."""
+    """Returns a row for each fault, over the demos of the test side; thresholds from the study's own demos."""
     model = arm_filter()
     known = read_demos(own, "all", "none", cache)
     tested = {fault: read_demos(folder, "test", fault, cache) for fault in ("none", *FAULTS)}
@@ -195,7 +195,7 @@ def arm_rows(folder: Path, own: Path, cache: Path, draws: int) -> list[dict]:
 
 @torch.no_grad()
 def believe(model: Filter, demos: TensorDict, draws: int, seed: int = 0) -> TensorDict:
-    """Beliefs on demos ``[N, T]``, each so many times, ``[draws N, T]``."""
+    """Returns beliefs on demos ``[N, T]``, each so many times, ``[draws N, T]``."""
     torch.manual_seed(seed)
     return model.sequence(torch.cat([demos] * draws).clone())
 
@@ -209,6 +209,6 @@ def runs_of(monitor: InnovationMonitor, beliefs: TensorDict) -> list[Run]:
 
 
 def errors(plain: TensorDict, gated: TensorDict, during: Tensor | None = None) -> dict[str, float]:
-    """Mean errors of the filter and of the gated one, over the steps ``[T]`` that are marked."""
+    """Returns the mean errors of the filter and of the gated one, over the steps ``[T]`` that are marked."""
     rows = slice(1, None) if during is None else during
     return {"error": float(error_of(plain)[:, rows].mean()), "error_gated": float(error_of(gated)[:, rows].mean())}

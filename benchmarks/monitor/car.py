@@ -65,7 +65,7 @@ class CarGates(NamedTuple):
         return self.pictures(signs)["seen"]
 
     def answered(self, reading: TensorDict) -> TensorDict:
-        """The reading without what its pictures speak against.
+        """Returns the reading without what its pictures speak against.
 
         Where the flow contradicts the road, the speed is that of the flow.
         """
@@ -79,7 +79,7 @@ class CarGates(NamedTuple):
 
 
 def monitor_of(beliefs: Sequence[TensorDict], guard: CarGuard = CHOSEN) -> InnovationMonitor:
-    """A monitor, calibrated on beliefs of clean drives."""
+    """Returns a monitor, calibrated on beliefs of clean drives."""
     sensor = MonitoredSensor(
         "info", 2, ("forecast", "observed"), ("sensor", "noise"), sign_key="signs", signs=len(SIGNS), floor=FLOOR
     )
@@ -101,7 +101,7 @@ def gates_of(readings: Sequence[TensorDict], guard: CarGuard = CHOSEN) -> CarGat
 
 
 def path_scores(beliefs: TensorDict) -> dict[str, float]:
-    """End point error over 100 steps, and what the 90 % intervals hold, of draws ``[K, N]``."""
+    """Returns end-point error over 100 steps and 90 % coverage of draws ``[K, N]``."""
     window = min(100, beliefs.shape[1] - 1)
     ends = [
         float(kitti_endpoint_error(mean[:, :3].double(), truth[:, :3].double(), window=window).translation)
@@ -115,7 +115,7 @@ def path_scores(beliefs: TensorDict) -> dict[str, float]:
 def drive_rows(
     task: str, root: Path, drives: Sequence[str], calibration: Sequence[TensorDict], cache: Path, draws: int
 ) -> list[dict]:
-    """A row for each fault, over all drives.
+    """Returns a row for each fault, over all drives.
 
     Args:
         task: ``"kitti-real"``, of whose drives each one's gate is calibrated on the others, because real pictures are
@@ -172,7 +172,7 @@ def drive_rows(
 
 
 def compared(plain: Sequence[TensorDict], gated: Sequence[TensorDict]) -> dict[str, float]:
-    """Path scores of the filter and of the gated one, means over the drives of at least 100 steps."""
+    """Returns path scores of the filter and of the gated filter, means over the drives of at least 100 steps."""
     out: dict[str, float] = {}
     for suffix, beliefs in (("", plain), ("_gated", gated)):
         scores = [path_scores(each) for each in beliefs if each.shape[1] > 100] or [path_scores(beliefs[0])]
@@ -188,5 +188,5 @@ def runs_of(monitor: InnovationMonitor, beliefs: TensorDict) -> list[Run]:
 
 
 def velocity_error(beliefs: TensorDict, unit: Tensor) -> Tensor:
-    """Error of speed and turn rate in units of a good sensor's, ``[K, N]``."""
+    """Returns the error of speed and turn rate in units of a good sensor's, ``[K, N]``."""
     return ((beliefs["belief", "mean"] - beliefs["state"])[..., VELOCITIES].abs() / unit).mean(-1)

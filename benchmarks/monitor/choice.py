@@ -40,7 +40,7 @@ def choose_car(
     known = filtered(model, calibration)
 
     def guarded(readings: Sequence[TensorDict], guard: CarGuard, left_out: bool = False) -> list[dict[str, float]]:
-        """Path scores; where the drives are those of the calibration, each with a gate from the others."""
+        """Returns the path scores; where the drives are those of the calibration, each with a gate from the others."""
         answered = []
         for place, reading in enumerate(readings):
             others = [each for k, each in enumerate(calibration) if not (left_out and k == place)]
@@ -85,7 +85,7 @@ def choose_arm(beliefs: Beliefs) -> tuple[ArmGuard, list[dict]]:
 
 
 def _alarms(runs: dict[str, list], sound: str) -> dict[str, float]:
-    """False alarms on sound runs, and the worst AUROC and delay over the faults."""
+    """Returns false alarms on fault-free runs, and the worst AUROC and delay over the faults."""
     found = [detection(part) for fault, part in runs.items() if fault != sound]
     worst = {"auroc": min(each["auroc"] for each in found), "delay_steps": max(each["delay_steps"] for each in found)}
     return {**false_alarms(runs[sound]), **worst}

@@ -1,4 +1,4 @@
-"""Drives whose camera fails without a word: what the trained sensor reads of them."""
+"""Drives whose camera fails silently: what the trained sensor reads of them."""
 
 from __future__ import annotations
 
@@ -88,14 +88,14 @@ def failing(root: Path, name: str, fault: str, cache: Path, steps: int = 1, *, r
 
 
 def _with_signs(reading: TensorDict, shown: Tensor, seen: Tensor) -> TensorDict:
-    """The reading with all signs, with what the flow says ``[N, 2]``."""
+    """Returns the reading with all signs, with what the flow says ``[N, 2]``."""
     distance = reading["sensor", "ensemble"][..., 0].mean(-1) * KITTI_DT
     of_flow = flow_signs(seen[:, 0], seen[:, 1].reshape(-1, 1, 1), distance)
     return reading.update({"signs": torch.cat([shown, of_flow], -1), "by_flow": seen, "plane": seen[:, :1]})
 
 
 def _drive(root: Path, name: str, fault: str, steps: int) -> TensorDict:
-    """The drive with its fault: ``"steps"`` ``[N, 1]`` of a pair, and ``"fault"`` ``[N, 1]``, whether it is in it."""
+    """Returns the drive with its fault: ``"steps"`` ``[N, 1]`` of each frame pair, a mask ``"fault"`` ``[N, 1]``."""
     size = from_pretrained("car-odometry").settings.size
     drive = read_kitti_drive(root, name, size=size, colour=False, cache=None).copy()
     image, hit = drive["image"].clone(), torch.zeros(len(drive), dtype=torch.bool)
@@ -125,7 +125,7 @@ def _picture_signs(root: Path, name: str, fault: str, steps: int) -> TensorDict:
 
 
 def _by_flow(root: Path, name: str, fault: str, known: TensorDict | None, cache: Path) -> TensorDict:
-    """Distance by the flow, and the road's correlation, ``[N, 2]``, of what is repaired if more is known."""
+    """Returns distance by the flow and road correlation, ``[N, 2]``, after the repair if one is possible."""
     motion = _motion(root, name, fault, 1, known, cache, repair=known is not None)
     values = torch.stack([plane_distance(motion["flow"].float()), motion["road"].float().amax((1, 2))], -1)
     return TensorDict({"by_flow": torch.where(motion["steps"] > 0, values, torch.nan)}, [len(motion)])
@@ -160,7 +160,7 @@ def believed_spans(spans: Sequence[TensorDict], seen: Callable[[TensorDict], Ten
 
     Args:
         spans: what the sensor reads of them, ``[N]`` each.
-        seen: of readings, ``[N, 1]``: whether they are to be believed.
+        seen: of readings, ``[N, 1]``: their observed mask.
     """
     values = {name: torch.stack([each["sensor", name] for each in spans], 1) for name in ("ensemble", "encoding")}
     values["observed"] = torch.stack([seen(each) for each in spans], 1)
@@ -169,7 +169,7 @@ def believed_spans(spans: Sequence[TensorDict], seen: Callable[[TensorDict], Ten
 
 
 def from_truth(reading: TensorDict) -> TensorDict:
-    """Readings ``[N]`` that begin at the true pose."""
+    """Returns readings ``[N]`` that begin at the true pose."""
     row = reading.copy()
     row["start"] = row["state"].clone()
     row["start"][0] = first_state(row)
@@ -178,7 +178,7 @@ def from_truth(reading: TensorDict) -> TensorDict:
 
 @torch.no_grad()
 def filtered(model: Filter, readings: Sequence[TensorDict], draws: int = 1, seed: int = 0) -> list[TensorDict]:
-    """Beliefs on readings ``[N]`` each, ``[draws, N]``, from the true pose on; those of one length run side by side."""
+    """Returns beliefs ``[draws, N]`` on each of some readings ``[N]``, from the true pose on."""
     groups: dict[int, list[int]] = defaultdict(list)
     for place, reading in enumerate(readings):
         groups[len(reading)].append(place)
@@ -194,7 +194,7 @@ def filtered(model: Filter, readings: Sequence[TensorDict], draws: int = 1, seed
 
 
 def side_by_side(beliefs: Sequence[TensorDict]) -> list[TensorDict]:
-    """Beliefs ``[K, N]`` of one length each, joined into ``[K', N]``: a monitor runs over all at once."""
+    """Returns beliefs ``[K, N]`` of one length each, joined into ``[K', N]``: a monitor runs over all at once."""
     groups: dict[int, list[TensorDict]] = defaultdict(list)
     for each in beliefs:
         groups[each.shape[1]].append(each)
@@ -205,7 +205,7 @@ def side_by_side(beliefs: Sequence[TensorDict]) -> list[TensorDict]:
 
 
 def car_filter() -> tuple[CarFilter, Filter]:
-    """The trained filter, and the same behind its sensor."""
+    """Returns the trained filter, and the same behind its sensor."""
     car = from_pretrained("car-odometry")
     assert isinstance(car, CarFilter)
     return car, car.without_sensor()

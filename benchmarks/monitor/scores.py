@@ -40,13 +40,13 @@ def auroc(score: Tensor, positive: Tensor) -> float:
 
 
 def detection(runs: Sequence[Run]) -> dict[str, float]:
-    """Scores of runs with faults.
+    """Returns scores of runs with faults.
 
     Neither the first step, which sees no reading, nor the ten steps after a fault count.
 
     Returns:
         ``auroc`` of the evidence for "in a fault" against "not"; ``delay_steps``, the median of the steps from a
-        fault's first to the first with an alarm, infinite where there is none; ``found``, the share of the faults that
+        fault's first to the first with an alarm, infinite if there is none; ``found``, the share of the faults that
         raise an alarm while they last.
     """
     scores, labels, delays = [], [], []

@@ -29,7 +29,7 @@ SETTINGS = ("rate", "margin", "reference", "gate_margin")
 
 @dataclass(frozen=True)
 class Study:
-    """Faults that nobody announces, on the UR5 and on KITTI, with the weights that come with the package."""
+    """Unannounced faults on the UR5 and on KITTI, with the weights that come with the package."""
 
     root: Path | None = None  # KITTI's folder with sequences and poses; without it there is no task kitti-real
     out: Path = Path("runs/monitor")  # also holds demos, rendered drives and readings
@@ -43,7 +43,7 @@ class Study:
 
 
 def invented(study: Study, kind: str) -> tuple[Path, list[str]]:
-    """The folder of rendered drives along random roads, and their names."""
+    """Returns the folder of rendered drives along random roads, and their names."""
     names = [f"{kind[0]}{number:02d}" for number in range(2 if study.smoke else INVENTED[kind])]
     frames = 80 if study.smoke else 500
     render_drives(study.out / kind, names=names, frames=frames, seed=77, size=(100, 300), processes=1)
@@ -51,7 +51,7 @@ def invented(study: Study, kind: str) -> tuple[Path, list[str]]:
 
 
 def rows_of(study: Study, task: str) -> list[dict]:
-    """The rows of one task."""
+    """Returns the rows of one task."""
     cache = study.out / "readings"
     if task == "ur5":
         from benchmarks.monitor.arm import arm_rows, own_demos  # needs mujoco
@@ -96,7 +96,7 @@ def trials_of(study: Study, task: str) -> list[dict]:
 
 def choice_page(rows: Sequence[dict], study: Study) -> str:
     """Everything that was tried, and what is chosen."""
-    lines = ["# What is chosen, and on what", ""]
+    lines = ["# Chosen settings", ""]
     lines += head("trial", "setting", "score")
     for row in rows:
         said = ", ".join(f"{key} {row[key]:g}" for key in SETTINGS if key in row)
@@ -113,9 +113,9 @@ def choice_page(rows: Sequence[dict], study: Study) -> str:
 
 
 def page(rows: Sequence[dict], study: Study) -> str:
-    """Two tables: alarms, and errors."""
-    lines = ["# Faults that nobody announces", ""]
-    lines += head("task", "fault", "AUROC", "delay, steps", "found", "alarms in 1,000 sound steps", "error afterwards")
+    """Returns two tables: alarms, and errors."""
+    lines = ["# Unannounced faults", ""]
+    lines += head("task", "fault", "AUROC", "delay, steps", "found", "false alarms in 1,000 steps", "error afterwards")
     for row in rows:
         if "auroc" in row:
             cells = [f"{row[key]:.3g}" for key in ("auroc", "delay_steps", "found", "false_alarms_per_1000")]
@@ -151,7 +151,7 @@ def page(rows: Sequence[dict], study: Study) -> str:
 
 
 def main() -> None:
-    """Runs the study; one that was broken off goes on."""
+    """Runs the study; an interrupted one resumes."""
     study = parse(Study)
     if study.smoke:
         out = Path(tempfile.mkdtemp(prefix="monitor-"))

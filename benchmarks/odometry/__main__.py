@@ -43,7 +43,7 @@ class Study:
 
 
 def track(study: Study, root: Path, drive: str, height: float) -> dict:
-    """One run of the command, and its errors."""
+    """Runs the command once, and returns its errors."""
     folder = root / "sequences" / drive
     camera = choose_camera(folder, None)
     out, images = study.out / f"{drive}-{height:g}", read_frames(folder / camera)
@@ -79,7 +79,7 @@ def track(study: Study, root: Path, drive: str, height: float) -> dict:
 
 
 def page(rows: Sequence[dict]) -> str:
-    """A table of all drives at the first height, and the means at each."""
+    """Returns a table of all drives at the first height, and the means at each height."""
     table = pd.DataFrame(rows, columns=COLUMNS)
     table["devkit"] = table["devkit_percent"].map("{:.2f}".format).replace("nan", "")
     table["devkit_turn"] = table["devkit_deg_per_100m"].map("{:.2f}".format).replace("nan", "")

@@ -40,7 +40,7 @@ class Case:
         name: what is damaged, and how; unique in its border.
         words: arguments, keys or files that were damaged: a clear message has one of them as a word.
         act: does what a user would do, in an empty folder that it is given.
-        right: whether a result is right, as the sound part of the input tells; ``None`` where it must raise.
+        right: whether a result is right, judged by the undamaged part of the input; ``None`` where it must raise.
         within: s in which it must be over.
     """
 
@@ -62,7 +62,7 @@ class Verdict:
 
     Attributes:
         kind: ``clear``: an error raised in this library that names what was damaged. ``right``: no error, and the
-            result of the sound part. ``silent``: no error, and no right result. ``unclear``: any other error.
+            result of the undamaged part. ``silent``: no error, and no right result. ``unclear``: any other error.
             ``hang``: not over in time. ``crash``: the process was ended by a signal.
         text: the message, or what is known of it.
     """
@@ -102,7 +102,7 @@ def apart(work: Callable[[], Any]) -> None:
 
 @cache
 def workshop() -> Path:
-    """A folder for what cases start from; it goes with the process that made it."""
+    """Returns a folder for what cases start from; it goes with the process that made it."""
     folder = Path(tempfile.mkdtemp(prefix="fuzz-sound-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)  # not in forked children, which leave by os._exit
     return folder
@@ -156,7 +156,7 @@ def verdict_on(case: Case, folder: Path) -> Verdict:
         right = bool(case.right(result))
     except Exception as error:
         return Verdict("silent", f"the result cannot be compared: {type(error).__name__}: {error}"[:500])
-    return Verdict("right") if right else Verdict("silent", "a result, and not that of the sound part")
+    return Verdict("right") if right else Verdict("silent", "a result, and not that of the undamaged part")
 
 
 def _of_error(case: Case, error: Exception) -> Verdict:

@@ -93,7 +93,7 @@ CELLS = of((0,), (-4,), (2.5,), "wide", others=st.tuples(st.just(4), NO_COUNT))
 
 
 def indices(size: int) -> Wrong:
-    """Indices of components, none of which fits ``size`` of them."""
+    """Returns indices of components, none of which fits ``size`` of them."""
     beyond = st.integers(min_value=size, max_value=99) | st.integers(-99, -size - 1)
     return of([size], [-size - 1], [0.5], ["x"], others=beyond.map(lambda index: [0, index]))
 
@@ -180,7 +180,7 @@ def covariance(size: int) -> Wrong:
 
 
 def copied(sound: Path, folder: Path) -> Path:
-    """A copy of a folder that a case may damage."""
+    """Returns a copy of a folder that a case may damage."""
     return Path(shutil.copytree(sound, folder / sound.name, symlinks=True))
 
 
@@ -288,7 +288,7 @@ def put(path: Any, value: Any) -> Change:
 
 
 def leaves(result: Any) -> dict[str, Tensor]:
-    """The tensors of a result, by name."""
+    """Returns the tensors of a result, by name."""
     if isinstance(result, Tensor):
         return {"": result}
     if isinstance(result, TensorDictBase):
@@ -316,7 +316,7 @@ def same(result: Any, expected: Any, *, rtol: float = 0.0, atol: float = 0.0) ->
 
 
 def kept(result: Any, expected: Any, *, most: int = 1, rtol: float = 0.0) -> bool:
-    """Tells whether rows are as expected, but for some that are marked as missing, or lack at the end.
+    """Tells whether rows are as expected, except for some that are marked as missing, or lack at the end.
 
     Args:
         result: entries ``[N, ...]``.

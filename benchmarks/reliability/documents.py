@@ -108,7 +108,7 @@ def edited(change: d.Change) -> d.Change:
 
 
 def _some(*values: Any, often: int = 4) -> d.Wrong:
-    """Values of which the first are always tried, and one of the others is drawn."""
+    """Returns values of which the first are always tried, and one of the others is drawn."""
     return d.of(*values[:often], others=st.sampled_from(values[often:]))
 
 

@@ -84,7 +84,7 @@ def search(cases: st.SearchStrategy[Case], count: int, seed: int, words: str) ->
 
 
 def attacked(target: Target, drawn: int, seed: int) -> list[Row]:
-    """All named cases of a target, and some that are drawn."""
+    """Returns all named cases of a target, and some that are drawn."""
     words = f"--match {f'{target.border} {target.name}:'!r} --drawn {drawn} --seed {seed}"
     rows = [row(case, judge(case), f"--match {f'{case.border} {case.name}'!r} --drawn 0") for case in target.named()]
     if drawn and not target.wrong.others.is_empty:
@@ -108,7 +108,7 @@ def _work(number: int) -> list[Row]:
 
 
 def side_by_side(works: Sequence[Callable[[], list[Row]]], processes: int) -> list[Row]:
-    """The rows of all works, each of which goes to the first process that is free."""
+    """Runs all jobs, each on the first free process, and returns their rows."""
     rows: list[Row] = []
     _WORKS[:], at = works, time.monotonic()
     with multiprocessing.get_context("fork").Pool(processes) as pool:
@@ -134,7 +134,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def table(found: dict[str, Any]) -> str:
-    """A summary as Markdown."""
+    """Returns a summary as Markdown."""
     rows = [*found["borders"].items(), ("all", found)]
     lines = [line(name, one["records"], *(one[kind] for kind in KINDS)) for name, one in rows]
     return "\n".join([*head("border", "inputs", *KINDS), *lines, ""])
@@ -155,8 +155,8 @@ def sampled(targets: Sequence[Target], count: int, seed: int) -> list[Callable[[
 class Fuzz:
     """Runs damaged inputs and counts what comes of them; leaves fuzz.json."""
 
-    sample: int = 0  # so many cases, drawn of all; 0 for all that have names, and those that are drawn beside
-    drawn: int = 3  # so many cases beside those with names, of each thing that may be damaged
+    sample: int = 0  # so many cases, drawn of all; 0 for all that have names, and some random ones in addition
+    drawn: int = 3  # number of random cases in addition to the named ones, of each thing that may be damaged
     seed: int = 0  # of what is drawn
     borders: some_of(BORDERS) = BORDERS  # type: ignore[valid-type]
     """where the inputs come in"""

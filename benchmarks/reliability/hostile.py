@@ -26,12 +26,12 @@ class Bomb:
 
     @staticmethod
     def pickled() -> bytes:
-        """The pickle."""
+        """Returns the pickle."""
         return pickle.dumps(Bomb())
 
     @staticmethod
     def npz(name: str) -> bytes:
-        """An archive of arrays, one of them of such objects."""
+        """Returns an archive of arrays, one of them of such objects."""
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=True, **{name: np.array([Bomb()], dtype=object)})
         return buffer.getvalue()
@@ -39,7 +39,7 @@ class Bomb:
 
 @cache
 def npz_of_zeros(size: int) -> bytes:
-    """A small archive with an array of so many bytes."""
+    """Returns a small archive with an array of so many bytes."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, pixels=np.zeros(size, np.uint8))
     return buffer.getvalue()
@@ -73,7 +73,7 @@ def _pickle_in_zip(file: Path) -> None:
     archive(members | {name: Bomb.pickled() for name in members if name.endswith("data.pkl")})(file)
 
 
-#: What writes a file in the place of weights.
+#: Payload that writes a file, saved as weights.
 PICKLES: dict[str, Callable[[Path], Any]] = {
     "a pickle": lambda file: file.write_bytes(Bomb.pickled()),
     "torch's pickle of code": _saved(Bomb()),

@@ -1,4 +1,4 @@
-"""Runs that last: a million steps, kills, full disks, many workers."""
+"""Long runs: a million steps, kills, full disks, many workers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Soak:
-    """Runs parts of the soak; goes on where an earlier run was left. Leaves soak.json and soak.md."""
+    """Runs parts of the soak; continues where an earlier run was left. Leaves soak.json and soak.md."""
 
     parts: some_of(PARTS) = PARTS  # type: ignore[valid-type]
     """what to run"""

@@ -30,7 +30,7 @@ class Target:
         words: arguments, keys or files: a clear message has one of them as a word.
         act: does what a user would do with a wrong value of it, in an empty folder.
         wrong: its wrong values.
-        right: whether a result is right, as the sound part of the input tells; ``None`` where it must raise.
+        right: whether a result is right, judged by the undamaged part of the input; ``None`` where it must raise.
         rights: ``right`` for some of the values, by their names; or a function that returns it, given name and value.
         within: s in which it must be over.
         needs: makes what it starts from, in a process of its own; called once.
@@ -51,7 +51,7 @@ class Target:
     said: bool = False
 
     def case(self, one: tuple[str, Any]) -> Case:
-        """The input with one of the wrong values."""
+        """Returns the input with one of the wrong values."""
         what, value = one
         rights = self.rights
         right = rights(what, value) if callable(rights) else rights.get(what, self.right)
@@ -120,7 +120,7 @@ class Source:
         return _reference(self, tuple(options.items()))
 
     def like(self, change: d.Change | None = None, near: float = 0.0, **options: Any) -> Callable[[Any], bool]:
-        """Right where a result is that of another change, by default of none; NaN never is."""
+        """Tells whether a result is that of another change, by default of none; NaN never is."""
 
         def right(result: Any) -> bool:
             expected = self.damaged(change, **options) if change else self.reference(**options)
@@ -138,7 +138,7 @@ class Source:
         options: Mapping[str, Any] | None = None,
         **more: Any,
     ) -> Target:
-        """A target whose wrong values are changes of it, or of a file in it; maybe of a single one."""
+        """Returns a target whose wrong values are changes of it, or of a file in it; maybe of a single one."""
         words = (words,) if isinstance(words, str) else words
         wrong = {"damaged": wrong} if callable(wrong) else wrong
         wrong = wrong if isinstance(wrong, d.Wrong) else d.Wrong(wrong)
@@ -163,7 +163,7 @@ class Source:
         Args:
             file: the document.
             right: whether a result is right, in a loose place.
-            words: of clear messages, beside the file's name and the place's.
+            words: of clear messages, in addition to the file's name and the place's.
             skip: whether a place is left out.
             loose: whether what stands in a place may be wrong without an error.
             then: wraps a change of the file, as to adapt a checksum.
@@ -225,7 +225,7 @@ OF_NAMES: dict[str, d.Wrong] = {
 
 
 def annotations(make: Callable[..., Any]) -> dict[str, str]:
-    """The arguments that a class or function takes, with their types, as text."""
+    """Returns the arguments that a class or function takes, with their types, as text."""
     if isinstance(make, type):
         signature, options, _ = _signature(make)
     else:
@@ -256,7 +256,7 @@ class Subject:
     name: str = ""
 
     def damage(self) -> dict[str, d.Wrong]:
-        """The wrong values of each argument."""
+        """Returns the wrong values of each argument."""
         found = {}
         for name, text in annotations(self.make).items():
             kind = text.removesuffix(" | None").split("[...")[0]
@@ -267,7 +267,7 @@ class Subject:
         return {name: values for name, values in {**found, **self.wrong}.items() if values is not None}
 
     def targets(self, border: str, **more: Any) -> Iterator[Target]:
-        """A target for every argument."""
+        """Yields a target for every argument."""
         name = self.name or self.make.__qualname__
         for argument, wrong in self.damage().items():
             words = (argument, *self.also.get(argument, ()))
@@ -280,6 +280,6 @@ class Subject:
 
 
 def targets_of(border: str, *subjects: Subject, **more: Any) -> Iterator[Target]:
-    """The arguments of several subjects."""
+    """Yields the arguments of several subjects."""
     for subject in subjects:
         yield from subject.targets(border, **more)

@@ -39,7 +39,7 @@ def _named(values: Tensor) -> tuple[tuple, CornerNoise]:
 def corner_likelihood(
     values: Tensor, rows: TensorDict, camera: StereoCamera, start: Tensor, steps: int = 3, memory: bool = True
 ) -> tuple[Tensor, Tensor]:
-    """Mean log-likelihood of a corner in the later row, in the tracker's own pixels; and the motions ``[T, 7]``."""
+    """Returns the mean log-likelihood of a corner in the later row, in pixels, and the motions ``[T, 7]``."""
     (radial, short), noise = _named(values)
     lens = replace(camera, radial=radial, disparity_offset=short)
     found = corner_motions(rows, lens, noise, start=start, steps=steps, memory=memory)

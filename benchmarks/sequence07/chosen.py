@@ -45,7 +45,7 @@ FILTER = {
     "gyro": 0.0499,
 }
 
-#: Error of the corners' motion that lasts, in rad/m and m/m, drawn anew where the tracker finds new corners; and which
+#: Error of the corners' motion that lasts, in rad/m and m/m, drawn again where the tracker finds new corners; and which
 #: share is left a row later. HALVES: by how much the motions of two halves of the corners differ. LENS: what the lens
 #: that was found changes of KITTI's, because that of another day is as far off.
 HALVES = (0.00015, 0.00017, 0.00023, 0.0058, 0.0045, 0.011)

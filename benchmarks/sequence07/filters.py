@@ -35,7 +35,7 @@ RESTART = [1e-4] * 6 + [0.01] * 3 + [0.05] * 3 + [0.01] * 3 + [0.05] + [0.003] *
 
 
 class CarMotion(Motion):
-    """The twist of the row before moves the pose, which so trails by a row, and goes on: a twist is a row's mean.
+    """The twist of the row before moves the pose, which so trails by a row, and continues: a twist is a row's mean.
 
     A share of the twist is kept, and a share of its last change comes again: a car sways, and speeds up for a while.
     The pose also moves by the slip, which is what corners do not show of each meter: the same corners are wrong for
@@ -55,7 +55,7 @@ class CarMotion(Motion):
         )
 
     def move(self, state, kept, swing, slip_kept, *, dt):
-        """The pose moved by twist and slip; the twist that is kept."""
+        """Returns the pose moved by twist and slip; the twist that is kept."""
         pose, twist, change, bias, *slips = self.space.points(state)
         change = swing * change
         after = kept * twist + torch.cat([change[..., :3], torch.zeros_like(twist[..., 3:5]), change[..., 3:]], -1)
@@ -85,7 +85,7 @@ class WhitenedMotion(SubModel):
         super().__init__(nn.Identity(), keys, [("forecast", "observation")])
 
     def compute(self, ensemble, dt, motion, cov):
-        """The tangent between both motions, by the root of its covariance."""
+        """Returns the tangent between both motions, by the root of its covariance."""
         moved = SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2))
         away = SE3().minus(moved, motion.unsqueeze(-2).expand_as(moved))
         return torch.linalg.solve_triangular(torch.linalg.cholesky(cov), away.mT, upper=False).mT
@@ -98,7 +98,7 @@ class TurnRate(SubModel):
         super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
 
     def compute(self, ensemble):
-        """The twist's turn and the bias."""
+        """Returns the angular velocity and the gyro bias."""
         return ensemble[..., TWIST][..., :3] + ensemble[..., BIAS]
 
 
@@ -110,12 +110,12 @@ class Given(Sensor):
         self.observation_dim = size
 
     def compute(self, value):
-        """The same."""
+        """Returns the same."""
         return value[..., : self.observation_dim]
 
 
 def pose_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
-    """Poses ``[*B, T - 1, 7]`` and their variances ``[*B, T - 1, 6]``, of each row but the last.
+    """Returns poses ``[*B, T - 1, 7]`` and their variances ``[*B, T - 1, 6]``, of each row but the last.
 
     Args:
         out: of a filter's sequence, ``[*B, T]``. The pose trails, so that of a row is forecast for the next one.
@@ -142,7 +142,7 @@ def noise_paths(slip: bool = True) -> Tensor:
 
 
 def speed_before(data: TensorDict) -> Tensor:
-    """The last speed that corners have shown before each row, ``[*B, T, 1]`` in m/s."""
+    """Returns the last speed that corners have shown before each row, ``[*B, T, 1]`` in m/s."""
     rows = torch.arange(data.shape[-1]).unsqueeze(-1)
     last = torch.where(data["motion_observed"], rows, 0).cummax(-2).values
     last = torch.cat([last[..., :1, :], last[..., :-1, :]], -2)
@@ -150,7 +150,7 @@ def speed_before(data: TensorDict) -> Tensor:
 
 
 def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | None = None) -> TensorDict:
-    """Readings with the noises that a filter is to believe.
+    """Returns readings with the noise covariances of the filter.
 
     Args:
         readings: ``[*B, T]``.
@@ -189,7 +189,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
 
 
 def car_filter(kind: Kind, members: int = 64, *, again: bool = False, slip: bool = True, **analysis) -> Filter:
-    """A filter of all three parts of the state.
+    """Returns a filter of all three parts of the state.
 
     Args:
         kind: of filter.

@@ -57,17 +57,17 @@ class Claim(NamedTuple):
     truth: Tensor
 
     def away(self) -> Tensor:
-        """The tangent's errors, in standard deviations, ``[*B, K, 6]``."""
+        """Returns the tangent's errors, in standard deviations, ``[*B, K, 6]``."""
         return SE3().minus(self.truth, self.mean) / self.var.sqrt()
 
     def held(self, level: float = LEVEL) -> Tensor:
-        """Share of the tangent's components within the intervals of that level, ``[K]``."""
+        """Returns the share of the tangent's components within the intervals of that level, ``[K]``."""
         inside = self.away().abs() <= NormalDist().inv_cdf((1 + level) / 2)
         return inside.double().mean(-1).flatten(0, -2).mean(0)
 
 
 def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict, Tensor]:
-    """Sequences that start from a pose that is known.
+    """Returns sequences that start from a pose that is known.
 
     Args:
         data: what a filter reads, ``[C, T]``.
@@ -107,7 +107,7 @@ def run(model: Filter, data: TensorDict) -> TensorDict:
 
 
 def and_one_more(data: TensorDict) -> TensorDict:
-    """Rows ``[C, T + 1]``: one more, in which nothing is read."""
+    """Returns rows ``[C, T + 1]``: one more, in which nothing is read."""
     last = data[:, -1:].clone()
     for key in ("motion_observed", "gyro_observed"):
         last[key] = torch.zeros_like(last[key])
@@ -150,13 +150,13 @@ def filter_rows(
 
 
 def drift(path: Tensor, poses: Tensor) -> dict[str, float]:
-    """The official errors: % and degrees in 100 m."""
+    """Returns the official errors: % and degrees in 100 m."""
     error = kitti_devkit_error(path, poses)
     return {"translation": error.translation.item(), "rotation": 100 * error.rotation.item()}
 
 
 def alone(study: Study, data: TensorDict, poses: Tensor, count: int) -> Iterator[tuple[dict, Tensor]]:
-    """Rows and paths without a filter: motions one after the other, the last one held where none is seen."""
+    """Yields rows and paths of chained motions without a filter, with zero-order hold for missing motions."""
     for number, condition in enumerate(CONDITIONS):
         seen = data[number]["motion_observed"].squeeze(-1)
         motions, found = naive(study.data, "0027", condition, count, study.seed)
@@ -169,16 +169,16 @@ def alone(study: Study, data: TensorDict, poses: Tensor, count: int) -> Iterator
 
 
 def page(rows: Sequence[dict], count: int) -> str:
-    """The table."""
+    """Returns the table."""
     lines = [
         "# Sequence 07 of KITTI",
         "",
         f"Odometry sequence 07, {count} rows: stereo corners and turn rates. Errors are KITTI's own, in six "
-        f"dimensions, over 100 to 800 m. *Held*: the share of errors within the {LEVEL:.0%} intervals, of the six "
-        f"numbers of the motion over 1, 10 and 100 rows; a start every {EVERY} rows. Rows of ensembles are means over "
-        f"{DRAWS} draws, with their standard deviation.",
+        f"dimensions, over 100 to 800 m. *Coverage*: the share of errors within the {LEVEL:.0%} intervals, for "
+        f"the six components of the motion over 1, 10 and 100 rows; a reset every {EVERY} rows. Rows of ensembles are "
+        f"means over {DRAWS} seeds, with their standard deviation.",
     ]
-    titles = ("filter", "translation, %", "rotation, deg/100 m", *(f"held, {step}" for step in STEPS), "ms a row")
+    titles = ("filter", "translation, %", "rotation, deg/100 m", *(f"coverage, {step}" for step in STEPS), "ms per row")
     for condition in CONDITIONS:
         lines += ["", f"## {condition.capitalize()}", "", *head(*titles)]
         for row in rows:
@@ -190,11 +190,11 @@ def page(rows: Sequence[dict], count: int) -> str:
                 lines.append(line(row["filter"], *numbers))
     lines += [
         "",
-        "*Corners lost*: none for 10 rows in each 100. *Wrong corners*: 20 % of the corners are up to 30 pixels off in "
-        "the later row, in both images by different amounts.",
+        "*Dropout*: no corners for 10 rows in each 100. *Outliers*: 20 % of the corners of the later row have an error "
+        "of up to 30 pixels, different in both images.",
         "",
-        "Milliseconds are those of the processor for one row of one drive, not compiled, one thread; without those of "
-        "the corners' motion.",
+        "Milliseconds are processor time for one row of one drive, not compiled, one thread. The estimation of the "
+        "corners' motion is not included.",
         "",
         *made_by("sequence07"),
     ]

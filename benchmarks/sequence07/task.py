@@ -24,10 +24,10 @@ from torch_denkf.functional.manifolds import SE3, quaternion_of
 __all__ = ["CONDITIONS", "ROWS", "Condition", "chained", "drive", "naive", "readings", "truth"]
 
 ROWS = 1101  # of the raw drive that sequence 07 has
-Condition = Literal["as it is", "corners lost", "wrong corners"]
+Condition = Literal["recorded", "dropout", "outliers"]
 CONDITIONS: tuple[Condition, ...] = get_args(Condition)
 LOST, EVERY = 10, 100  # rows without corners, 1 s, in each 10 s
-WRONG, OFF = 0.2, 30.0  # share of wrong corners; how far off they are, in pixels, uniformly in each direction
+WRONG, OFF = 0.2, 30.0  # share of outliers; their largest error in each direction, in pixels, uniformly distributed
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Drive:
 
 @cache
 def drive(folder: Path, name: str, count: int | None = None) -> Drive:
-    """Rows of ``kitti_inertial/NAME.npz`` in a folder, and its camera as it is calibrated."""
+    """Returns the rows of ``kitti_inertial/NAME.npz`` in a folder, and its calibrated camera."""
     return Drive(*read_corner_drive(folder / "kitti_inertial" / f"{name}.npz", count))
 
 
@@ -52,12 +52,12 @@ def truth(folder: Path, count: int = ROWS) -> Tensor:
 
 
 def calibrated(camera: StereoCamera) -> StereoCamera:
-    """A camera with what was found of its lens and of the tracker."""
+    """Returns the camera with the estimated lens distortion and disparity offset."""
     return replace(camera, radial=CAMERA["radial"], disparity_offset=CAMERA["disparity_offset"])
 
 
-def with_wrong_corners(rows: TensorDict, seed: int) -> TensorDict:
-    """Rows in which some corners are elsewhere in the later row, in both images by different amounts."""
+def with_outliers(rows: TensorDict, seed: int) -> TensorDict:
+    """Returns rows in which some corners of the later row are displaced, by different amounts in both images."""
     random = torch.Generator().manual_seed(seed)
     wrong = torch.rand(rows["seen"].shape, generator=random) < WRONG
     away = OFF * (2 * torch.rand(*wrong.shape, 4, generator=random, dtype=torch.float64) - 1)
@@ -67,10 +67,10 @@ def with_wrong_corners(rows: TensorDict, seed: int) -> TensorDict:
 
 
 def in_condition(rows: TensorDict, condition: Condition, seed: int) -> TensorDict:
-    """Rows as they are, or with what happens to their corners."""
-    if condition == "wrong corners":
-        return with_wrong_corners(rows, seed)
-    if condition == "corners lost":
+    """Returns the recorded rows, or rows with outliers or dropout of the corners."""
+    if condition == "outliers":
+        return with_outliers(rows, seed)
+    if condition == "dropout":
         rows = rows.clone()
         there = (torch.arange(len(rows)) % EVERY < EVERY - LOST).unsqueeze(-1)
         rows["seen"] &= there
@@ -121,7 +121,7 @@ def naive(folder: Path, name: str, condition: Condition, count: int | None = Non
 
 
 def chained(motions: Tensor, seen: Tensor, dt: Tensor) -> Tensor:
-    """A path ``[T, 7]`` of motions ``[T, 7]``; where one is not seen, the last velocity is held."""
+    """Returns a path ``[T, 7]`` of chained motions ``[T, 7]``, with zero-order hold for missing motions."""
     path, twist = [SE3().neutral(motions)], motions.new_zeros(6)
     twists = SE3().log(motions) / dt
     for row in range(1, len(motions)):

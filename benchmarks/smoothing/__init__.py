@@ -1,1 +1,1 @@
-"""Smoothers on chaotic systems, beside DAPPER."""
+"""Smoothers on chaotic systems, compared with DAPPER."""

@@ -54,7 +54,7 @@ OBSERVATION = torch.tensor([[1.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 def model_of(parameters: Parameters, series: Sequence[Series]) -> Model:
-    """The matrices; the usual x is that of the series."""
+    """Returns the matrices; the usual x is that of the series."""
     p = parameters
     keeps_change, keeps_error, share = (p[name].sigmoid() for name in ("keeps_change", "keeps_error", "share"))
     walk, change, error, white = (p[name].exp().square() for name in ("walk", "change", "error", "white"))
@@ -75,7 +75,7 @@ def model_of(parameters: Parameters, series: Sequence[Series]) -> Model:
 
 
 def believe(model: Model, series: Series, lag: int) -> tuple[Tensor, Tensor]:
-    """Means of x, filtered and smoothed, ``[N, T, D]``; the gradient goes through."""
+    """Returns means of x, filtered and smoothed, ``[N, T, D]``; the gradient goes through."""
     count, steps, size = series.truth.shape
     mean, cov = model.mean.expand(count, size, 3), model.cov.expand(count, size, 3, 3)
     transition, process = (value.expand(count, size, 3, 3) for value in (model.transition, model.noise))
@@ -97,7 +97,7 @@ def believe(model: Model, series: Series, lag: int) -> tuple[Tensor, Tensor]:
 
 
 def fit(series: Sequence[Series], lag: int, updates: int) -> Parameters:
-    """The parameters whose beliefs of x are nearest to the truth, with ``lag`` later readings; 0 fits a filter."""
+    """Returns the parameters with the least error of x, given ``lag`` later readings; a lag of 0 fits a filter."""
     steps = torch.cat([each.truth.diff(dim=1).flatten(0, 1) for each in series]).square().mean(0).sqrt()
     errors = torch.cat([(each.reading - each.truth)[:, 1:].flatten(0, 1) for each in series]).square().mean(0).sqrt()
     zero = torch.zeros_like(steps)
@@ -125,7 +125,7 @@ def fit(series: Sequence[Series], lag: int, updates: int) -> Parameters:
 
 
 def windows_of(series: Series) -> Series:
-    """The same as shorter recordings; what is left over at the end is not used."""
+    """Returns the same as shorter recordings; what is left over at the end is not used."""
     steps = series.truth.shape[1]
     length = min(WINDOW, steps)
 
@@ -136,7 +136,7 @@ def windows_of(series: Series) -> Series:
 
 
 def kalman_filter(model: Model) -> KalmanFilter:
-    """The library's filter of all quantities; the state is [x, c, b] of the first, of the second, ..."""
+    """Returns the library's filter of all quantities; the state is [x, c, b] of the first, of the second, ..."""
 
     def joined(value: Tensor) -> Tensor:
         return torch.block_diag(*value)

@@ -18,7 +18,7 @@ BELIEF, SMOOTHED = ("belief", "mean"), ("smoothed", "mean")
 
 
 def make_filter(case: Case) -> Filter:
-    """The filter of a case."""
+    """Returns the filter of a case."""
     system = SYSTEMS[case.system]
     size = len(system.mean)
     parts = {
@@ -37,7 +37,7 @@ def make_filter(case: Case) -> Filter:
 
 
 def estimates(case: Case, readings: Tensor) -> tuple[Tensor, Tensor]:
-    """Means of all cycles, filtered and smoothed, ``[seeds, cycles, N]`` each.
+    """Returns means of all cycles, filtered and smoothed, ``[seeds, cycles, N]`` each.
 
     The smoothed are those of the cycles that have ``lag`` later ones.
     """
@@ -56,7 +56,7 @@ def estimates(case: Case, readings: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def rows(case: Case, seeds: Sequence[int], cycles: int) -> list[dict]:
-    """One row a seed."""
+    """Returns one row a seed."""
     torch.set_default_dtype(torch.float64)
     system = SYSTEMS[case.system]
     path, readings = simulate(system, seeds, cycles)

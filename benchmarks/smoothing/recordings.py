@@ -51,7 +51,7 @@ class Task:
     read: Callable[[Filter], dict[str, Group]]
 
     def groups(self, members: int, folder: Path) -> dict[str, Group]:
-        """The recordings by group; read the first time, then kept in a folder."""
+        """Returns the recordings by group; read the first time, then kept in a folder."""
         file = folder / f"{self.name}-{members}.pt"
         if not file.exists():
             folder.mkdir(parents=True, exist_ok=True)
@@ -66,7 +66,7 @@ class Task:
 
 
 def kitti(root: Path, out: Path, *, smoke: bool = False) -> Task:
-    """Drives of KITTI's layout below ``root``, and drives rendered along its eleven official trajectories.
+    """Returns drives in KITTI's layout below ``root``, and drives rendered along its eleven official trajectories.
 
     Eight drives rendered along invented trajectories are for choices. No filter and no sensor has seen any of them.
     """
@@ -79,7 +79,7 @@ def kitti(root: Path, out: Path, *, smoke: bool = False) -> Task:
         trained = from_pretrained("car-odometry")
         assert isinstance(trained, CarFilter)
         car = car_filter(replace(trained.settings, ensemble_size=members))
-        # What each member believes of its calibration are quantiles, as many as members.
+        # The members' calibrations are quantiles, one per member.
         car.load_state_dict({k: v for k, v in trained.state_dict().items() if "quantiles" not in k}, strict=False)
         return car.eval()
 
@@ -107,7 +107,7 @@ def drive(car: CarFilter, root: Path, name: str, cache: Path) -> TensorDict:
 
 
 def ur5(out: Path, *, smoke: bool = False) -> Task:
-    """Whole demonstrations of the table's UR5: those of the test side, and a ninth of the others for choices."""
+    """Returns demonstrations of the UR5 at its table: the test split, and a ninth of the others for validation."""
 
     def model(members: int) -> UR5TableFilter:
         trained = from_pretrained("ur5-table")
@@ -134,7 +134,7 @@ def ur5(out: Path, *, smoke: bool = False) -> Task:
 
 
 def side_by_side(recordings: Iterable[tuple[str, TensorDict]]) -> Group:
-    """Recordings of one length in one batch each."""
+    """Returns recordings of one length in one batch each."""
     lengths: dict[int, list[tuple[str, TensorDict]]] = {}
     for name, recording in recordings:
         lengths.setdefault(len(recording), []).append((name, recording))

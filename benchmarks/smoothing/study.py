@@ -31,13 +31,13 @@ class Study:
     seeds: int = 4
     cycles: int = 2000  # of which the first 64 (Lorenz-63) or 133 (Lorenz-96) do not count
     processes: int = 1
-    real: bool = False  # recordings in the place of chaotic systems
+    real: bool = False  # recordings instead of chaotic systems
     root: Path | None = None  # of --real: folder with KITTI's sequences and poses
     smoke: bool = False  # a few cycles: does it run?
 
 
 def page(rows: Sequence[dict], study: Study) -> str:
-    """Means over the seeds."""
+    """Returns means over the seeds."""
     lines = [
         "# Smoothers on chaotic systems",
         "",
@@ -63,7 +63,7 @@ def page(rows: Sequence[dict], study: Study) -> str:
 
 
 def main() -> None:
-    """Runs the study; one that was broken off goes on."""
+    """Runs the study; an interrupted one resumes."""
     study = parse(Study)
     if study.smoke:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="smoothing-")), cycles=26, seeds=2)

@@ -36,7 +36,7 @@ PAIRS = (
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 #: How many processes, one after the other, measure a pair: a ratio that jumps from run to run is their median.
 RUNS = {"against_cuthbert": 3}
-LIMIT_S = 2400  # for a pair: four compiled filters take twenty minutes beside other jobs
+LIMIT_S = 2400  # for a pair: four compiled filters take twenty minutes next to other jobs
 
 
 def in_this_process(name: str, seconds: float, out: Path) -> None:
@@ -85,7 +85,7 @@ def in_own_process(name: str, seconds: float) -> list[dict] | dict:
 
 
 def measured(name: str, seconds: float) -> list[dict]:
-    """The rows of a pair; of several runs each row is the one with the middle ratio, and ``range`` the outer two."""
+    """Returns the rows of a pair: of several runs the median ratio, and as ``range`` the lowest and the highest."""
     runs = [{row["name"]: row for row in in_own_process(name, seconds)} for _ in range(RUNS.get(name, 1))]
     rows = []
     for row in runs[0]:

@@ -1,4 +1,4 @@
-"""A step over a sequence against what the machine needs at least: operations over peak, or bytes over bandwidth."""
+"""Compares the time of a step to the roofline bound: operations over peak rate, or bytes over bandwidth."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ def rows(seconds: float) -> list[Row]:
         product, flops = matrix_product()
         ours = sequences(batch)
         timings = interleave({**ours, "peak": product}, seconds=seconds)
-        # The median peak of the same rounds: a machine that is slow for now is slow for both.
+        # The peak is measured in the same rounds: a machine that is slow at the time is slow for both.
         peak = flops / (1e-6 * timings.micro("peak"))
         floor = max(operations(batch) / peak, traffic(filter, batch) / (1e9 * measure()["bandwidth_gb_s"]))
-        note = f"{operations(batch) / 1e6:.2f} MFLOP a step at {peak / 1e9:.0f} GFLOP/s"
+        note = f"{operations(batch) / 1e6:.2f} MFLOP per step at {peak / 1e9:.0f} GFLOP/s"
         for kind in ours:
             taken = timings.micro(kind, STEPS)
             name = f"{kind} sequence / floor, B={batch}"

@@ -37,7 +37,7 @@ def filter_and_smooth(way: str) -> dict[str, float]:
 
 
 def rows(seconds: float) -> list[Row]:
-    """Rows of the table."""
+    """Returns rows of the table."""
     found = []
     for way in WAYS:
         with tempfile.TemporaryDirectory() as cache:

@@ -24,7 +24,7 @@ class Row:
     Attributes:
         name: what is compared, with its size.
         ratio: ours over theirs; below 1 ours is faster.
-        target: the ratio must not exceed it; ``None`` where there is none to meet.
+        target: the ratio must not exceed it; ``None`` if there is none to meet.
         least: nor be below this, where it is no ratio of times.
         aim: the ratio hoped for.
         ours_us: microseconds of processor time that ours takes, a step unless the name says otherwise.
@@ -48,7 +48,7 @@ class Row:
 
     @property
     def met_text(self) -> str:
-        """The same in a table."""
+        """Returns the same in a table."""
         return MET[self.met]
 
     def as_dict(self) -> dict:
@@ -63,16 +63,16 @@ class Timings:
     rounds: dict[str, list[float]]
 
     def micro(self, name: str, per: int = 1) -> float:
-        """Median microseconds of a candidate; ``per`` is the number of steps in a call."""
+        """Returns the median microseconds of a candidate; ``per`` is the number of steps in a call."""
         return 1e6 * median(self.rounds[name]) / per
 
     def ratio(self, ours: str, theirs: str) -> float:
-        """Median over the rounds of ours over theirs."""
+        """Returns the median over the rounds of ours over theirs."""
         pairs = zip(self.rounds[ours], self.rounds[theirs], strict=True)
         return median(ours_time / theirs_time for ours_time, theirs_time in pairs)
 
     def row(self, name: str, ours: str, theirs: str, *, per: int = 1, **fields) -> Row:
-        """The table's line for two of the candidates."""
+        """Returns the table's line for two of the candidates."""
         times = {"ours_us": self.micro(ours, per), "theirs_us": self.micro(theirs, per)}
         return Row(name, self.ratio(ours, theirs), **times, **fields)
 
@@ -117,7 +117,7 @@ def interleave(
 
 
 def against(ours: Mapping[str, Call], name: str, theirs: Call, title: str, *, how: dict, **fields) -> list[Row]:
-    """A line for each of ours beside another package's.
+    """Returns a line for each of ours and of another package's.
 
     Args:
         ours: by kind.

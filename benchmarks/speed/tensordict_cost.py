@@ -1,6 +1,6 @@
 """The filter on a tensordict against its own functional step, where pandas is not installed.
 
-tensordict looks for pandas on some writes, which costs most where there is none: here the search never finds it.
+tensordict looks for pandas on some writes, which costs most if there is none: here the search never finds it.
 """
 
 from __future__ import annotations

@@ -61,18 +61,18 @@ class Reading(Transform):
 
 
 def kitti_filter() -> DEnKF:
-    """The README's, with Table I's stochastic head on a reading in the place of the image sensor."""
+    """Returns the README's, with Table I's stochastic head on a reading instead of the image sensor."""
     return car_filter(lambda: VectorSensor(2, 2, in_key="reading"))
 
 
 def kitti_env(folder: str) -> EnvBase:
-    """A rendered drive of 200 frames, 150x50, held in memory; its frames are emitted, and nothing reads them."""
+    """Returns an environment of a rendered drive in memory, 200 frames of 150x50; no module reads the frames."""
     render_drives(folder, names=["00"], frames=200, processes=1, progress=None)
     return TransformedEnv(KITTIReplayEnv(folder, sequence="00", cache=None), Reading())
 
 
 def reacher_env() -> EnvBase:
-    """The arm with noisy encoders of examples/append_to_env.py."""
+    """Returns the arm with noisy encoders of examples/append_to_env.py."""
     return TransformedEnv(
         DMControlEnv("reacher", "easy"),
         Compose(
@@ -111,7 +111,7 @@ def example_step(env: EnvBase, filter: DEnKF) -> TensorDict:
 
 
 def steppers(make_env, make_filter, folder: str) -> dict[str, Stepper]:
-    """The environment in its three ways."""
+    """Returns the environment in its three ways."""
     filter = make_filter()
     example = example_step(make_env(), filter)
     path = export_step(filter, example, Path(folder) / f"{id(filter)}.pt2")
@@ -130,7 +130,7 @@ def measure(rounds: int = 41, steps: int = 50) -> dict[str, Timings]:
 
 
 def cost_ms(timings: Timings, kind: str) -> float:
-    """Median over the rounds of what the transform adds to a step."""
+    """Returns the median over the rounds of what the transform adds to a step."""
     return 1e3 * median(b - a for a, b in zip(timings.rounds["without"], timings.rounds[kind], strict=True))
 
 
@@ -144,28 +144,28 @@ def rows_of(name: str, timings: Timings) -> dict[str, Row]:
             TARGETS_MS[kind],
             ours_us=timings.micro(kind),
             theirs_us=timings.micro("without"),
-            note=f"not a ratio; {rates['without']} steps a second without, {rates[kind]} with",
+            note=f"not a ratio; {rates['without']} steps per second without, {rates[kind]} with",
         )
         for kind in ("filter", "packaged")
     }
 
 
 def rows(seconds: float) -> list[Row]:
-    """The same for ``make bench``, which takes as long as it takes."""
+    """Returns the rows for ``make bench``; ``seconds`` does not limit them."""
     return [row for name, timings in measure().items() for row in rows_of(name, timings).values()]
 
 
 def table(found: dict[str, Timings], command: str, elapsed: float) -> str:
-    """The Markdown page."""
+    """Returns the Markdown page."""
     lines = [
-        "# What DEnKFTransform costs",
+        "# Cost of DEnKFTransform",
         "",
         "One environment, E = 32, one thread, processor time, no image read; medians over rounds of all three kinds in",
         "turn. A step is `env.step_and_maybe_reset(env.rand_action(...))`. Filter: `DEnKFTransform(filter)`; packaged:",
         "`DEnKFTransform(filter, packaged=load_step(export_step(filter, example, path)))`.",
         "Quietest: between the fastest rounds of either kind, which other work disturbed least.",
         "",
-        *head("environment and filter", "step", "steps/s without", "with", "added, ms a step", *LAST),
+        *head("environment and filter", "step", "steps/s without", "with", "added, ms per step", *LAST),
     ]
     for name, timings in found.items():
         for kind, row in rows_of(name, timings).items():

@@ -41,7 +41,7 @@ STEPS = 20  # of a sequence
 
 
 def make_filter(scheme: str = "sensor") -> DEnKF:
-    """The filter, with fixed weights; its gain is small enough that long sequences stay bounded.
+    """Returns the filter, with fixed weights; its gain is small enough that long sequences stay bounded.
 
     Args:
         scheme: ``"sensor"`` reads samples ``("sensor", "ensemble")``; ``"perturbed"`` one reading a frame, of the
@@ -59,7 +59,7 @@ def make_filter(scheme: str = "sensor") -> DEnKF:
 
 
 def car_filter(sensor: Callable[[], SubModel]) -> DEnKF:
-    """The README's filter of a vehicle: state [x, y, theta, v, theta_dot], Table I's networks and noise."""
+    """Returns the README's filter of a vehicle: state [x, y, theta, v, theta_dot], Table I's networks and noise."""
     return DEnKF(
         transition=UnicycleTransition(velocity=StochasticMLP(2, 2), dt=0.103),
         sensor=sensor(),
@@ -71,7 +71,7 @@ def car_filter(sensor: Callable[[], SubModel]) -> DEnKF:
 
 
 def make_gaussian_filter(kind: str) -> EKF | UKF:
-    """A filter with a mean and a covariance on the same networks, without dropout, and constant Q and R.
+    """Returns a filter with a mean and a covariance on the same networks, without dropout, and constant Q and R.
 
     Its first belief is N(0, I), which its first reading updates.
 
@@ -96,14 +96,14 @@ def make_gaussian_filter(kind: str) -> EKF | UKF:
 
 
 def make_frames(batch: int, steps: int = STEPS, *, samples: bool = True) -> TensorDict:
-    """Frames ``[batch, steps]`` with the sensor's samples, or one reading each."""
+    """Returns frames ``[batch, steps]`` with the sensor's samples, or one reading each."""
     generator = torch.Generator().manual_seed(1)
     shape = (batch, steps, MEMBERS, OBSERVATION) if samples else (batch, steps, OBSERVATION)
     return TensorDict({("sensor", "ensemble"): torch.randn(shape, generator=generator)}, [batch, steps])
 
 
 def start(filter: DEnKF, batch: int) -> Tensor:
-    """An ensemble to start from, ``[batch, E, S]``."""
+    """Returns an initial ensemble, ``[batch, E, S]``."""
     torch.manual_seed(2)
     return filter.initial(TensorDict({}, [batch])).get(("belief", "ensemble"))
 

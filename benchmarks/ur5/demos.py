@@ -49,12 +49,12 @@ class Collections:
             collect_ur5_demos(self.root / "real_like-sequences", self.real, domain="real_like", **common)
 
     def replay(self, name: str, split: str, **kwargs) -> UR5ExperienceReplay:
-        """One collection: ``"sim-frames"``, ``"sim-sequences"`` or ``"real_like-sequences"``."""
+        """Returns one collection: ``"sim-frames"``, ``"sim-sequences"`` or ``"real_like-sequences"``."""
         return UR5ExperienceReplay(self.root / name, split=split, cache=self.out / "cache", **kwargs)
 
 
 def sequences_of(data: UR5ExperienceReplay, first: int) -> Tensor:
-    """States ``[N, T, 10]`` of demos from number ``first`` on: they need no pictures."""
+    """Returns states ``[N, T, 10]`` of demos from number ``first`` on: they need no pictures."""
     parts = [data.storage[e.start : e.start + e.length]["state"] for e in data.episodes if e.demo >= first]
     return torch.stack(parts)
 
@@ -68,7 +68,7 @@ class FramePool:
 
     @classmethod
     def of(cls, data: UR5ExperienceReplay, chosen: Sequence[int]) -> FramePool:
-        """Frames with a picture of chosen demos, of a replay with ``frames_only``."""
+        """Returns frames with a picture of chosen demos, of a replay with ``frames_only``."""
         wanted = torch.tensor([episode.demo in chosen for episode in data.episodes])
         rows = wanted[data.storage[:]["episode"]].nonzero().squeeze(-1)
         if not len(rows):
@@ -88,12 +88,12 @@ class FramePool:
         return FramePool(torch.cat(parts), self.state)
 
     def rows(self, index: Tensor) -> TensorDict:
-        """Frames with float pixels, ``[n]``."""
+        """Returns frames with float pixels, ``[n]``."""
         pixels = self.pixels[index].float() / 255
         return TensorDict({"pixels": pixels, "state": self.state[index]}, batch_size=[len(index)])
 
     def sample(self, generator: torch.Generator, batch: int) -> TensorDict:
-        """Random frames ``[batch]``."""
+        """Returns random frames ``[batch]``."""
         return self.rows(torch.randint(len(self), (batch,), generator=generator))
 
 

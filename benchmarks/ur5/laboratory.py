@@ -86,13 +86,13 @@ def foreground(pixels: np.ndarray, behind: np.ndarray) -> np.ndarray:
 
 
 def look_of(numbers: np.ndarray) -> Domain:
-    """A camera by its place and target, m, its roll, rad, its field, degrees, and its lens's first number."""
+    """Returns a camera by its place and target, m, its roll, rad, its field, degrees, and its lens's first number."""
     x, y, z, to_x, to_y, to_z, roll, field, bend = (float(value) for value in numbers)
     return Domain(camera=(x, y, z), target=(to_x, to_y, to_z), roll=roll, field=field, distortion=(bend, 0.0))
 
 
 def find_camera(pixels: np.ndarray, joints: np.ndarray, levels: Levels = LEVELS) -> tuple[Domain, float]:
-    """The camera that saw frames ``[N, S, S, 3]`` of the arm at joints ``[N, 7]``; and the share that does not fit.
+    """Fits the camera of frames ``[N, S, S, 3]`` to joints ``[N, 7]``; also returns the share that does not fit.
 
     Gauss-Newton steps on silhouettes that are blurred less and less, from the simulator's camera on.
     """
@@ -162,7 +162,7 @@ class Pasted:
         self.grain = float(np.median(np.abs(frames - self.behind))) / 0.67 / 2  # much of it is light
 
     def __call__(self, states: Tensor, seed: int = 0) -> Tensor:
-        """Pictures, uint8 ``[N, 3, H, W]``, of states ``[N, 10]``, in colours that vary a little."""
+        """Returns pictures, uint8 ``[N, 3, H, W]``, of states ``[N, 10]``, in colours that vary a little."""
         rng, out = np.random.default_rng(seed), torch.empty(len(states), 3, *self.behind.shape[:2], dtype=torch.uint8)
         for index, state in enumerate(states.numpy()):
             held = state[7:] + 0.01 * rng.standard_normal(3) if rng.random() < HELD else None

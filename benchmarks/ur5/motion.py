@@ -49,7 +49,7 @@ class Motion(ArmMotion):
         return self.loc[JOINTS:] + self.scale[JOINTS:] * self.kinematics(features)
 
     def forward(self, states: Tensor) -> Tensor:
-        """States ``[*, 24]`` of states ``[*, 24]``."""
+        """Returns states ``[*, 24]`` of states ``[*, 24]``."""
         joints, place, rates, accelerations = states.split((JOINTS, 3, JOINTS, JOINTS), -1)
         angles = (joints - self.loc[:JOINTS]) / self.scale[:JOINTS]
         parts = [angles, rates / self.rate, accelerations / self.acceleration]
@@ -60,7 +60,7 @@ class Motion(ArmMotion):
         return torch.cat([moved, place, faster, faster - rates], -1)
 
     def losses(self, rows: TensorDict) -> dict[str, Tensor]:
-        """Errors of the rates, and of the kinematics."""
+        """Returns errors of the rates, and of the kinematics."""
         true = rows["path"][:, 1]
         place = self.place(true[:, :JOINTS]) - true[:, JOINTS:STATE]
         return {**super().losses(rows), "loss_place": place.abs().mean() / PLACE_UNIT}

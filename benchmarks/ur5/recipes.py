@@ -91,7 +91,7 @@ class UR5Recipe(ArmRecipe):
         )
 
     def build(self) -> Filter:
-        """The filter, with its own sensor in front."""
+        """Returns the filter, with its own sensor in front."""
         model = super().build()
         parts = OrderedDict(sensor=self.sensor, **{name: model[name] for name in model.module})
         return Filter(parts, initial=model.initial)

@@ -47,18 +47,18 @@ class Shrink(nn.Module):
     """Averages pixels until a picture is at most :data:`COARSE` wide."""
 
     def forward(self, images: Tensor) -> Tensor:
-        """Pictures ``[N, 3, H / n, W / n]``."""
+        """Returns pictures ``[N, 3, H / n, W / n]``."""
         times = images.shape[-1] // COARSE
         return nn.functional.avg_pool2d(images, times) if times > 1 else images
 
 
 def keypoint_trunk() -> nn.Module:
-    """The coarse trunk of both presets."""
+    """Returns the coarse trunk of both presets."""
     return nn.Sequential(Shrink(), KeypointTrunk(3, channels=(32, 48, 96, 128), keypoints=64, features=256))
 
 
 def glimpse_trunk(side: int) -> GlimpseTrunk:
-    """The trunk that looks at the gripper in pictures of a side of so many pixels."""
+    """Returns the trunk that looks at the gripper in pictures of a side of so many pixels."""
     return GlimpseTrunk(keypoint_trunk(), CloseLook(side, REACH), 256, raised=RAISE)
 
 
@@ -83,7 +83,7 @@ class TurnedWrist(nn.Module):
     """
 
     def forward(self, state: Tensor) -> Tensor:
-        """Readings ``[*, 13]`` of states ``[*, 10 or more]``: J1..J5, cos and sin twice, the opening, x, y, z."""
+        """Returns readings ``[*, 13]`` of states ``[*, >= 10]``: J1..J5, cos and sin of 2 J6, the opening, x, y, z."""
         once = state[..., WRIST : WRIST + 1]
         wrist = [0.5 * (2 * once).cos(), 0.5 * (2 * once).sin(), once.cos(), once.sin()]
         return torch.cat([state[..., :WRIST], *wrist, state[..., WRIST + 1 : STATE]], -1)
@@ -104,7 +104,7 @@ def side_of(reading: Tensor, near: Tensor | None = None) -> Tensor:
 
 
 def wrist_of(reading: Tensor, near: Tensor) -> Tensor:
-    """States ``[*, 10]`` of readings ``[*, 13]``; of the two J6 half a turn apart, that next to ``near`` ``[*]``."""
+    """Returns states ``[*, 10]`` from readings ``[*, 13]``; of two J6 half a turn apart the one next to ``near``."""
     angle = torch.atan2(reading[..., WRIST + 1], reading[..., WRIST]) / 2
     angle = angle + torch.pi * ((near - angle) / torch.pi).round()
     return torch.cat([reading[..., :WRIST], angle.unsqueeze(-1), reading[..., WRIST + 4 :]], -1)
@@ -134,7 +134,7 @@ def unit_of(dim: int) -> Tensor:
 
 
 def _moments(facts: Statistics) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of what :class:`TurnedWrist` reads."""
+    """Returns the mean and standard deviation of what :class:`TurnedWrist` reads."""
     loc, scale = facts.loc, facts.scale
     middle = torch.zeros(4), torch.tensor([0.35, 0.35, 0.7, 0.7])
     return tuple(
@@ -146,7 +146,7 @@ CELLS = (128, 64)
 
 
 def keypoint_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
-    """A better one: places of features beside a coarse view, coordinate channels, J6 by twice its angle."""
+    """Returns a better network: keypoints and a coarse view, coordinate channels, J6 by twice its angle."""
     head = {"num_cells": CELLS, "layer": "dropout", "rate": 0.05}
     return camera_sensor(facts, keypoint_trunk(), samples, *_moments(facts), **head)
 
@@ -158,7 +158,7 @@ def glimpse_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
 
 
 def paper_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
-    """The paper's: Table I on the frame, which reads all ten numbers of the state."""
+    """Returns the paper's: Table I on the frame, which reads all ten numbers of the state."""
     return camera_sensor(facts, convolutional_trunk(3), samples, facts.loc, facts.scale)
 
 
@@ -205,7 +205,7 @@ class NearForecast(SubModel):
         self.preset, self.factor = preset, 1.0  # on the samples' distances from their mean
 
     def compute(self, samples, forecast, *, batch_size):
-        """The states ``[*B, E, 10]``."""
+        """Returns the states ``[*B, E, 10]``."""
         angle = forecast[..., WRIST]
         if angle.ndim > len(batch_size):
             angle = angle.mean(-1)

@@ -1,4 +1,4 @@
-"""Trained filters with other members: their errors against milliseconds a step, and how many they need."""
+"""Trained filters with other members: their errors against milliseconds per step, and how many they need."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ THRESHOLDS = (1.0, 1.5, 2.0, 3.0)
 
 
 def frontier(study: Study) -> list[Path]:
-    """Draws error against milliseconds a step of what the table left in ``--out``: frontier.csv, frontier.png.
+    """Draws error against milliseconds per step of what the table left in ``--out``: frontier.csv, frontier.png.
 
     Nothing is trained again. An update that a filter was not trained with gets its own inflation, chosen as training
     chooses it, with the table's number of members.
@@ -88,7 +88,7 @@ def members(study: Study) -> list[Path]:
 
 
 def members_page(frame: pd.DataFrame) -> str:
-    """A table of the rows, with a column for each localisation."""
+    """Returns a table of the rows, with a column for each localisation."""
     frame = frame.assign(cell=[_cell(row) for row in frame.to_dict("records")])
     table = frame.set_index(["sensor", "trained", "members", "localisation"])["cell"].unstack("localisation")
     text = "Clean test demos. Cells: joints, deg / end effector, cm / coverage of 90 %, and the threshold, if any."

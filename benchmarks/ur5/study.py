@@ -1,4 +1,4 @@
-"""The study's options, and the jobs of its table, each of which can be broken off and resumed."""
+"""The study's options, and the jobs of its table, each of which can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ score_row = partial(scores.score_row, names=NAMES, unit=unit_of(STATE), circular
 class Study(Collections):
     """A UR5 that one camera watches: joints, gripper and end effector, with every filter that is registered.
 
-    collect: demos into --root. table: collect what is missing, train, test. pictures: plots of what a table left in
-    --out. frontier: error against milliseconds a step of the filters that a table left there. members: DEnKFs that are
-    trained with few members, by localisation. What was broken off goes on where it stopped. See the README.
+    collect: demos into --root. table: collect what is missing, train, test. pictures: plots of a finished table in
+    --out. frontier: error against milliseconds per step of its filters. members: DEnKFs trained with few members, by
+    localisation. An interrupted run resumes. See the README.
     """
 
     command: Positional[Literal["collect", "table", "pictures", "frontier", "members"]] = "table"
@@ -84,11 +84,11 @@ class Base:
 
     @cached_property
     def states(self) -> Tensor:
-        """States of the simulator's demos that the sensor may see, ``[N, T, 10]``."""
+        """Returns states of the simulator's demos that the sensor may see, ``[N, T, 10]``."""
         return sequences_of(self.study.replay("sim-frames", "train"), self.study.sequences)
 
     def _sensor(self) -> tuple[ImageSensor, Statistics]:
-        """The trained sensor. Its statistics lie beside it, so that a resumed study does not read the pictures."""
+        """Returns the trained sensor, whose statistics are saved with it, so that a resumed study reads no images."""
         out = self.folder(self.kind)
         if (out / "sensor.pt").exists() and (out / "facts.pt").exists():
             facts = Statistics(**read_checkpoint(out / "facts.pt"))
@@ -130,7 +130,7 @@ class Base:
         return self.study.out / "sensors" / f"{self.training}-{kind}-{self.seed}"
 
     def _pasted(self, pool: FramePool) -> tuple[FramePool, Domain]:
-        """Frames, and pictures of the simulator's states as the other domain's camera would take them; that camera."""
+        """Returns frames, images of the simulator's states by the other domain's camera, and that camera."""
         assert self.parent is not None
         states = self.parent.states.flatten(0, 1)
         generator = torch.Generator().manual_seed(self.seed)
@@ -142,7 +142,7 @@ class Base:
 
     @cached_property
     def motion(self) -> Motion:
-        """The motion, trained on true states."""
+        """Returns the motion, trained on true states."""
         if self.parent is not None:
             return self.parent.motion
         torch.manual_seed(self.seed)
@@ -151,7 +151,7 @@ class Base:
         return train_motion(motion, paths, AHEAD, out=out, seed=self.seed, updates=self.study.budget.motion)
 
     def codes(self, role: str, condition: str = "clean", domain: str | None = None) -> TensorDict:
-        """Features of the demos of a role, in a domain of which they may not be, with rates and accelerations."""
+        """Returns features of the demos of a role in a domain, with rates and accelerations."""
         domain = self.domain if domain is None else domain
         demos = getattr(self.roles if domain == self.domain else real_roles(self.study), role)
         salt = SaltAndPepper(generator=torch.Generator().manual_seed(0))
@@ -170,14 +170,14 @@ class Base:
 
     @cached_property
     def error(self) -> Tensor:
-        """Root mean square error of the sensor on the validation demos, ``[10]``."""
+        """Returns the root mean square error of the sensor on the validation demos, ``[10]``."""
         reading = read_all([self.sensor], self.codes("validation"), MEMBERS)
         truth = reading["state"]
         read = self.preset.state_of(reading["sensor", "ensemble"].mean(-2), truth[..., WRIST])
         return (read - truth).square().mean((0, 1)).sqrt()
 
     def recipe(self, name: str, size: int = MEMBERS) -> UR5Recipe:
-        """A filter's recipe, with a sensor of its own."""
+        """Returns a filter's recipe, with a sensor of its own."""
         return FILTERS[name](deepcopy(self.sensor), self.preset, self.facts, self.motion, self.error, size)
 
     def train(self, name: str, recipe: UR5Recipe | None = None) -> tuple[UR5Recipe, Filter, Path]:
@@ -227,7 +227,7 @@ def members_of(name: str) -> int:
 
 
 def sensor_rows(preset: Preset, readings: dict[str, TensorDict], names: dict) -> list[dict]:
-    """The sensor alone; where it sees nothing, its last reading stays."""
+    """Returns the sensor alone; where it sees nothing, its last reading stays."""
     rows = []
     for condition, reading in readings.items():
         truth, samples, seen = reading["state"], reading["sensor", "ensemble"], reading["observed"]
@@ -241,7 +241,7 @@ def sensor_rows(preset: Preset, readings: dict[str, TensorDict], names: dict) ->
 
 
 def size_row(base: Base, recipe: UR5Recipe, saved: dict, names: dict, chunk: int | None = None) -> dict:
-    """A row of a trained filter with other members on clean demos, and its CRPS on the validation demos.
+    """Returns a row of a trained filter with other members on clean demos, and its CRPS on the validation demos.
 
     With ``chunk``, ``ms_per_step`` is processor time of compiled chunks of so many steps, and ``eager_ms_per_step`` of
     eager steps; 0 compiles nothing.

@@ -37,13 +37,13 @@ class Budget:
 
 
 def with_missing(recipe: UR5Recipe, codes: TensorDict) -> TensorDict:
-    """Readings of clean demos, and the same with missing frames: what filters are validated on."""
+    """Returns readings of clean demos, and the same with missing frames: what filters are validated on."""
     readings = read_all([recipe.sensor], codes, recipe.members)
     return torch.cat([readings, fail(readings, "missing", seed=1)])
 
 
 class WithHead(nn.Module):
-    """The filter's objective with the sensor's head in front, and the head's own beside it."""
+    """The filter's objective with the sensor's head in front, and the head's own in addition."""
 
     def __init__(self, objective: nn.Module, recipe: UR5Recipe):
         super().__init__()
@@ -52,7 +52,7 @@ class WithHead(nn.Module):
         self.register_buffer("unit", unit_of(self.preset.dim))
 
     def forward(self, codes: TensorDict) -> dict[str, Tensor]:
-        """All terms, of windows ``[B, T]`` of features."""
+        """Returns all terms, of windows ``[B, T]`` of features."""
         windows = with_head([self.sensor], codes, self.size)
         own = crps_ensemble(windows["sensor", "ensemble"], self.preset.observe(codes["state"])) / self.unit
         return {**self.objective(windows), "loss_sensor": 0.5 * own[codes["observed"].squeeze(-1)].mean()}
@@ -68,7 +68,7 @@ def train_filter(
     budget: Budget,
     begin: Filter | None = None,
 ) -> Filter:
-    """Trains one filter on features of demos ``[N, T]``, or goes on where it was broken off.
+    """Trains one filter on features of demos ``[N, T]``, or resumes after an interruption.
 
     Args:
         recipe: with the trained sensor, whose head is changed.

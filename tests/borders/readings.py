@@ -1,7 +1,7 @@
 """Entries that are damaged and fed to what reads them: readings, masks, beliefs, noises, points of spaces, logs.
 
 A source is what reads them in one way: a filter that steps, takes a sequence or sits in an environment, a smoother, or
-what scores a filter. What is right is the result of other entries: of the sound ones, or of those with a mask.
+what scores a filter. The expected result is that of the undamaged or masked entries.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A packaged step gives the eager step's numbers where there is more to trace than plain arithmetic.
 
 Jacobians by automatic differentiation, a Gauss-Newton search, an LSTM cell: traced wrongly, each gives a package that
-runs without a word, and is wrong.
+runs silently, and is wrong.
 """
 
 import pytest
@@ -19,7 +19,7 @@ STATES = 3
 
 
 def bend(states):
-    """A known motion that is not linear."""
+    """Returns a known motion that is not linear."""
     x, y, z = states.unbind(-1)
     return torch.stack([x + 0.3 * y.sin(), 0.9 * y - 0.1 * x**3, z.cos() * x], -1)
 

@@ -68,7 +68,7 @@ def test_many_steps_equal_the_filters(package):
         torch.testing.assert_close(packaged["info.nis"], eager["info", "nis"], rtol=1e-3, atol=1e-4)
 
 
-def test_it_loads_and_runs_where_neither_tensordict_nor_torchrl_is_imported(package):
+def test_package_runs_without_tensordict_and_torchrl(package):
     _, _, path = package
     code = f"""
 import sys, torch

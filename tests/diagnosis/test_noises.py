@@ -14,7 +14,7 @@ WRONG = {"vector": [0.5, -1.0], "matrix": [[1.0, 2.0], [2.0, 1.0]]}
 
 
 def filter_and_frames(name, which, source, kind, wrong):
-    """A filter, its frames, and the words by which a message may name what is wrong."""
+    """Returns a filter, its frames, and the words by which a message may name what is wrong."""
     wrong = torch.tensor(wrong)
     fine = torch.tensor([0.5, 0.3]) if kind == "vector" else torch.tensor([[0.5, 0.1], [0.1, 0.3]])
     frames, modules = sound_frames(), {"R": Given("r", R), "Q": Given("q", Q)}
@@ -46,7 +46,7 @@ def test_a_module_that_makes_no_covariance_is_named(name, which, kind, way):
 
 @pytest.mark.parametrize("kind", ["vector", "matrix"])
 @pytest.mark.parametrize("name", GAUSSIAN)
-def test_a_reading_without_noise_is_believed(name, kind):
+def test_noise_free_reading_is_reproduced(name, kind):
     """A variance of zero is one: the limit of small ones."""
     zero = torch.zeros(2) if kind == "vector" else torch.zeros(2, 2)
     means = []

@@ -1,4 +1,4 @@
-"""The presets are made of the parts they say, parts that are there already are kept, and clones move along."""
+"""The presets are made of the parts they say, parts that are set already are kept, and clones move along."""
 
 import pytest
 import torch

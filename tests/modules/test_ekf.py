@@ -260,7 +260,7 @@ def test_an_error_in_a_jacobian_is_raised(error, wrapped):
         EKFAnalysis(model)(td)
 
 
-def test_a_sensor_without_errors_beside_one_that_has_some_knows_its_jacobian():
+def test_jacobian_of_an_unbiased_sensor_next_to_a_biased_one():
     model = OfOwnErrors(Select([1]), [], 1)
     states = torch.randn(4, 1, 3)
     _, jacobian, _ = linearise(model, {("forecast", "ensemble"): states}, Call(torch.Size([4])))

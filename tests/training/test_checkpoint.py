@@ -15,7 +15,7 @@ def file(tmp_path):
     return tmp_path / "last.pt"
 
 
-def test_what_was_written_is_read(file):
+def test_checkpoint_round_trip(file):
     content = read_checkpoint(file)
     assert content["update"] == 7
     assert torch.equal(content["weight"], torch.arange(1000.0))

@@ -46,7 +46,7 @@ def test_lengths_grow():
     assert Stage("fit", None, None, 10).length(3) is None
 
 
-def test_the_loss_says_what_is_trained():
+def test_loss_selects_the_trained_parameters():
     net = nn.Sequential(nn.Linear(1, 1), nn.Linear(1, 1))
     net[0].bias.requires_grad_(False)
     assert Stage("fit", net[0], None, 1).groups(net)[0]["params"] == [net[0].weight]
@@ -56,7 +56,7 @@ def test_the_loss_says_what_is_trained():
     assert once.groups(net) == once.groups(net) == [{"params": [net[1].bias]}]
 
 
-def test_only_trainable_restores_what_was():
+def test_only_trainable_restores_requires_grad():
     net = nn.Sequential(nn.Linear(1, 1), nn.Linear(1, 1))
     net[0].bias.requires_grad_(False)
     before = [p.requires_grad for p in net.parameters()]

@@ -38,7 +38,7 @@ def line_stage(net, name="fit", updates=6, spoil=(), **kwargs):
 
 
 def by_hand(stage, net, seed, number=0, spoil=()):
-    """The loop of examples/quickstart.py; returns the terms of every update."""
+    """Returns the loop of examples/quickstart.py; returns the terms of every update."""
     optimiser = torch.optim.AdamW(net.parameters(), lr=stage.lr, weight_decay=stage.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, stage.lr, total_steps=stage.updates)
     seen = []
@@ -58,7 +58,7 @@ def by_hand(stage, net, seed, number=0, spoil=()):
 
 
 @pytest.mark.parametrize("spoil", [(), (0,), (2, 3)])
-def test_it_is_the_loop_that_one_would_write(tmp_path, spoil, caplog):
+def test_trainer_equals_a_plain_loop(tmp_path, spoil, caplog):
     net, twin = nn.Linear(2, 1), nn.Linear(2, 1)
     twin.load_state_dict(net.state_dict())
     options = {"lr": 0.1, "weight_decay": 0.2, "clip": 0.5}

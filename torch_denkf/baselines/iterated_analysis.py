@@ -84,7 +84,7 @@ class IteratedAnalysis(Rotated):
         noise_variance_key: variances ``[*B, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         belief_prefix: prefix of what is written of the new time: ``ensemble``, ``mean``, ``var``; of the time before
-            the same stand under ``"smoothed"``, with ``age`` ``[*B, 1]``, 1 step.
+            the same are stored under ``"smoothed"``, with ``age`` ``[*B, 1]``, 1 step.
         info_prefix: prefix of ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``, of the forecast
             that has not seen the reading.
 

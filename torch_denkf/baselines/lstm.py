@@ -20,7 +20,7 @@ __all__ = ["LSTMFilter"]
 
 
 class LSTMFilter(Filter):
-    """A recurrent network that reads what a filter's sensor wrote and writes a Gaussian belief.
+    """A recurrent network that reads a sensor's outputs and writes a Gaussian belief.
 
     Its belief is ``("belief", "mean")`` ``[*B, S]``, ``("belief", "cov")`` (diagonal unless ``motion`` is given) and
     ``("belief", "var")``, and its memory ``("belief", "hidden")`` and ``("belief", "cell")`` ``[*B, num_layers,

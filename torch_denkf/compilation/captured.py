@@ -29,7 +29,7 @@ _WARM = 2
 
 
 class CudaRecorder:
-    """Records what a function launches, on one device."""
+    """Records the kernel launches of a function, on one device."""
 
     #: One for each device: each has a workspace of cuBLAS.
     streams: ClassVar[dict[torch.device, Any]] = {}
@@ -69,7 +69,7 @@ class CudaRecorder:
         return sorted({f"{w.filename}:{w.lineno}" for w in said if "called a synchronizing" in str(w.message)})
 
     def record(self, run: Callable) -> Callable:
-        """Returns a function that replays what ``run`` launches, and returns the tensors that it returned."""
+        """Returns a function that replays the launches of ``run``, and returns its tensors."""
         graph = torch.cuda.CUDAGraph()
         context = {"pool": self.pool, "stream": self.stream, "capture_error_mode": "thread_local"}
         with _no_collection(), self._prepared(), torch.cuda.graph(graph, **context):
@@ -194,7 +194,7 @@ def _at(entries: Entries, time: int, t: int) -> Entries:
 
 
 def _backward_again() -> AbstractContextManager:
-    """Keeps what a compiled backward pass reads: warm runs and the recording read it, one after the other."""
+    """Keeps the inputs of a compiled backward pass, for warm runs and the recording."""
     import torch._functorch.config as config
 
     return config.patch(donated_buffer=False)
@@ -215,7 +215,7 @@ class Captured:
         self.graphs: dict[tuple, list[Graph] | None] = {}
 
     def __call__(self, *inputs: Any) -> Any:
-        """Replays a graph that no pending backward pass needs; records one where there is none."""
+        """Replays a graph that no pending backward pass needs; records one if there is none."""
         values = list(tensors(inputs))
         state = [value for part in self.modules for value in _own_tensors(part)]
         gradients = torch.is_grad_enabled() and any(value.requires_grad for value in (*values, *state))
@@ -303,7 +303,7 @@ class Graph:
 
     @torch.no_grad()
     def forward(self, values: Sequence[Tensor]) -> list[Tensor]:
-        """Replays the forward pass; returns copies of what it wrote."""
+        """Replays the forward pass; returns copies of its outputs."""
         _copy(self.written, values)
         self.layout = self.replay()
         self.outputs = list(tensors(self.layout))
@@ -372,7 +372,7 @@ def _own_tensors(part: nn.Module) -> Iterator[Tensor]:
 
 @contextmanager
 def _in_place(aliases: Sequence[tuple[dict, dict]]) -> Iterator[None]:
-    """Puts aliases in the place of parameters and buffers."""
+    """Replaces parameters and buffers by aliases."""
     before = [(table, dict(table)) for table, _ in aliases]
     try:
         for table, others in aliases:

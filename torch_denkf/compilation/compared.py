@@ -32,7 +32,7 @@ def check_same_numbers(
     cure: str,
     maker: str = "torch's compiler",
 ) -> None:
-    """Raises unless a compiled function returns what it returns eagerly, up to rounding.
+    """Raises unless a compiled function returns the eager result, up to rounding.
 
     Both run on the inputs as they are. Where a frame is hidden, or nothing but zero, both run again with numbers in it:
     an update by zero, or by nothing, is right whatever the gain. Where one is not finite, they run on numbers alone.
@@ -155,7 +155,7 @@ def _results(
 
 
 def _waves(value: Tensor) -> Tensor:
-    """Numbers between -1 and 1, as many and of the kind of a tensor's."""
+    """Returns numbers between -1 and 1, as many and of the kind of a tensor's."""
     numbers = torch.arange(1, value.numel() + 1, dtype=torch.float64).sin()
     return numbers.reshape(value.shape).to(value.device, value.dtype)
 

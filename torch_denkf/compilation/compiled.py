@@ -30,8 +30,8 @@ _LOG = logging.getLogger("torch_denkf")
 #: Seconds of silence of a first call.
 PATIENCE = 2.0
 
-#: Where an episode goes on, among the names of what a chunk takes. It is compared like a frame's mask: where the first
-#: call resets all rows, nothing of the transition would show.
+#: Name of the mask of continuing episodes, among the inputs of a chunk. It is compared like an observed mask: a first
+#: call that resets all rows would not test the transition.
 _GOES_ON = ("start", "goes on")
 
 
@@ -80,7 +80,7 @@ class CompiledSteps:
         return dict(zip(writes, values, strict=True))
 
     def scan(self, steps: Steps, carry, inputs, call: Call, resets, starts, cuts, keep) -> tuple[Entries, Entries]:
-        """Returns what :meth:`Steps.scan` does, in chunks; all noise is among the inputs."""
+        """Returns the result of :meth:`Steps.scan`, in chunks; all noise is among the inputs."""
         time, batch, count = len(call.batch_size), call.batch_size, len(cuts)
         keys, start_keys, length = tuple(inputs), tuple(starts), self._length(count)
         whole, named = count, {**inputs}
@@ -210,7 +210,7 @@ class BoundSteps(NamedTuple):
 
 @contextmanager
 def said_when_long(text: str) -> Iterator[None]:
-    """Logs what is done where it takes longer than :data:`PATIENCE` seconds."""
+    """Logs a task that takes longer than :data:`PATIENCE` seconds."""
     timer = Timer(PATIENCE, _LOG.warning, (text,))
     timer.daemon = True
     timer.start()
@@ -240,7 +240,7 @@ def _pieces(value: Tensor, time: int, length: int, whole: int, mark: bool) -> Se
 
 
 def filled(value: Tensor, time: int, count: int, fill: bool | None = None) -> Tensor:
-    """Continues a value ``[*B, T, ...]`` to ``count`` steps, with its last one where it is not said what with."""
+    """Pads a value ``[*B, T, ...]`` to ``count`` steps, by default with its last one."""
     lack = count - value.shape[time]
     if lack <= 0:
         return value

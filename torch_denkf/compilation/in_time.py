@@ -70,9 +70,9 @@ def rts_in_time(
     *,
     follows: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Does what :func:`~torch_denkf.functional.smoothing.rts.rts_smooth` does for plain numbers and all later readings.
+    """Smooths as :func:`~torch_denkf.functional.smoothing.rts.rts_smooth`, for plain vectors and all later readings.
 
-    It takes three times the arithmetic of one step after the other, and one call for each level in the place of one for
+    It takes three times the arithmetic of one step after the other, and one call for each level instead of one for
     each step.
 
     Args:
@@ -112,7 +112,7 @@ def _backwards(value: Tensor, time: int) -> Tensor:
 
 
 def _one_after_the_other(later: Sequence[Tensor], earlier: Sequence[Tensor]) -> _Elements:
-    """Joins steps back in time; nothing of what is later, NaN neither, passes the end of an episode."""
+    """Combines steps backward in time; nothing, not even NaN, passes the end of an episode."""
     (gain, shift, rest, ends), (own_gain, own_shift, own_rest, own_ends) = later, earlier
     moved, left = own_gain @ shift + own_shift, own_gain @ rest @ own_gain.mT + own_rest
     return (
@@ -180,7 +180,7 @@ class StepsInTime(NamedTuple):
         return self.steps.step(entries, call)
 
     def scan(self, carry, inputs, call: Call, resets, starts, cuts, keep) -> tuple[Entries, Entries]:
-        """Returns what :meth:`Steps.scan` does: the beliefs of all times, and then each step from the one before."""
+        """Returns the result of :meth:`Steps.scan`: the beliefs of all times, then each step from its predecessor."""
         structure, time, count = self.steps.structure, len(call.batch_size), len(cuts)
         given = carry, inputs, call, resets, starts, cuts, keep
         if any(cuts) or FROM_STORED in inputs:
@@ -210,7 +210,7 @@ class StepsInTime(NamedTuple):
         return last, {key: out[key] for key in keep}
 
     def _elements(self, inputs: Entries, time: int, resets: Tensor | None, begin: Sequence[Tensor] | None):
-        """Returns A, b, C, eta, J and where nothing goes on, ``[*B, T, ...]``."""
+        """Returns A, b, C, eta, J and where nothing continues, ``[*B, T, ...]``."""
         move, q, matrix, r = self.motion.matrix, self.motion.noise, self.update.matrix, self.update.noise
         reading = inputs[self.update.in_keys[2]]
         if reading.ndim > time + 2:
@@ -245,7 +245,7 @@ class StepsInTime(NamedTuple):
 
 
 def _one_step_more(before: Sequence[Tensor], behind: Sequence[Tensor]) -> _Elements:
-    """Joins steps of a Kalman filter; nothing of what was before a reset, NaN neither, goes on behind it."""
+    """Combines steps of a Kalman filter; nothing, not even NaN, passes a reset."""
     (move, mean, cov, told, known, ends), (own_move, own_mean, own_cov, own_told, own_known, own_ends) = before, behind
     inverse = torch.linalg.inv(torch.eye(move.shape[-1], dtype=move.dtype, device=move.device) + cov @ own_known)
     on, back = own_move @ inverse, move.mT @ inverse.mT

@@ -86,7 +86,7 @@ def _cache_in_use() -> Path:
 
 
 def is_whole(library: Path) -> bool:
-    """Tells whether a file is a library (ELF, 64 bits) that reaches to the end of what its header announces."""
+    """Tells whether a file is a complete library (ELF, 64 bits), by the length in its header."""
     with library.open("rb") as stream:
         header, size = stream.read(_HEADER), os.fstat(stream.fileno()).st_size
         if len(header) < _HEADER or header[:4] != b"\x7fELF":

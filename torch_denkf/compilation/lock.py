@@ -53,7 +53,7 @@ def locked(folder: Path, name: str, doing: str) -> Iterator[None]:
     """Locks a folder for this process, until the block or the process ends.
 
     Args:
-        folder: made where it is not there.
+        folder: made if it does not exist.
         name: of the file that is the lock; it goes with it.
         doing: what holders of the lock do in the folder, for the message: ``"is writing to it"``.
 

@@ -48,7 +48,7 @@ def options_for_processors() -> dict[str, Any]:
 
 
 def worth_checking(guards: Sequence) -> list[bool]:
-    """Chooses what torch.compile checks before each call: all that a user may change; all takes longer than a step.
+    """Chooses the guards of torch.compile: all that a user may change; all guards take longer than a step.
 
     Tensors (also parameters: their type, whether they are trained), types, numbers and names that modules hold stay.
     What torch and this package define, a module's keys (part of what a function is kept under) and hooks do not.

@@ -117,7 +117,7 @@ def join_products(graph: Graph, sums: Mapping[Node, Sequence[Node]]) -> None:
 
 
 def _sums_of_products(graph: Graph) -> dict[Node, list[Node]]:
-    """Results of the graph that are sums of several g' x, both small."""
+    """Returns results of the graph that are sums of several g' x, both small."""
     sums = {}
     for root in graph.output_node().all_input_nodes:
         terms = _terms(root)

@@ -1,4 +1,4 @@
-"""Gradients of linear layers that all steps of a sequence share: one product at the end in the place of one a step.
+"""Gradients of linear layers that all steps of a sequence share: one product at the end instead of one a step.
 
 In each step of a backward pass a layer would launch a product for its weight, a sum over rows for its bias, and an
 addition of each to what later steps gave. On a GPU these launches are a third of a training step. Here a step keeps
@@ -83,7 +83,7 @@ class _Kept:
 
 
 class _Gather(torch.autograd.Function):
-    """Its backward pass runs after those of all products that were given what it returns."""
+    """A node whose backward pass runs after those of all products of its output."""
 
     @staticmethod
     def forward(ctx, weight: Tensor, bias: Tensor, kept: _Kept) -> Tensor:

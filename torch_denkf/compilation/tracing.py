@@ -9,7 +9,7 @@ __all__ = ["trace_below_autograd"]
 
 
 def trace_below_autograd(module: nn.Module, values: tuple[Tensor, ...]) -> torch.export.ExportedProgram:
-    """Records what a module does once automatic differentiation is done.
+    """Records a module's operations after automatic differentiation.
 
     ``torch.export.export`` records above it. There a Jacobian that is taken inside the module becomes a constant, the
     example's, and inductor compiles an LSTM cell to other numbers (torch 2.13): packages that run, and are wrong.

@@ -44,7 +44,7 @@ def stamp(file: Path) -> tuple[int, int]:
 
 
 def cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
-    """Opens a cache entry; where there is none, or a damaged one, reads its content again and stores it.
+    """Opens a cache entry; if there is none, or a damaged one, reads its content again and stores it.
 
     Args:
         entry: folder of the entry.
@@ -64,7 +64,7 @@ def cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
 
 
 def entries_of(folder: Path) -> list[Path]:
-    """Returns the entries in a folder, sound or not, by name; what is not the cache's is left out."""
+    """Returns the entries in a folder, valid or damaged, by name; what is not the cache's is left out."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if path.is_dir() and is_entry(path))
@@ -89,7 +89,7 @@ def _load(entry: Path) -> TensorDict | None:
 
 
 def _set_aside(entry: Path) -> None:
-    """Removes a damaged entry, but not the sound one that another process may have put in its place meanwhile."""
+    """Removes a damaged entry, but not a valid one by which another process may have replaced it meanwhile."""
     with _errors_of(entry), place_beside(entry) as aside, contextlib.suppress(DamagedEntry, FileNotFoundError):
         entry.rename(aside)
         open_entry(aside)

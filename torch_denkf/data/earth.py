@@ -53,7 +53,7 @@ def to_degrees(metres: np.ndarray, origin: Sequence[float]) -> np.ndarray:
 
 
 def _whole(values: np.ndarray | Sequence[float]) -> np.ndarray:
-    """A copy with a third number, zero where there is none, ``[*, 3]``."""
+    """Returns a copy with a third number, zero if there is none, ``[*, 3]``."""
     values = np.asarray(values, float)
     if values.shape[-1:] not in ((2,), (3,)):
         raise ValueError(

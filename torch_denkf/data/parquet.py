@@ -42,7 +42,7 @@ def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
 
 
 def parquet_names(file: Path) -> list[str]:
-    """Names of the columns of a parquet file; raises as :func:`read_parquet`."""
+    """Returns names of the columns of a parquet file; raises as :func:`read_parquet`."""
     read_parquet(file, [])
     import pyarrow.parquet as parquet
 

@@ -41,7 +41,7 @@ def sound(times: np.ndarray) -> np.ndarray:
 
 
 def filled(times: np.ndarray, good: np.ndarray, step: float) -> np.ndarray:
-    """Interpolates times that are not sound on straight lines between the others, and extrapolates beyond these.
+    """Interpolates invalid times on straight lines between the others, and extrapolates beyond these.
 
     Args:
         times: ``[N]``, of which one at least is sound.
@@ -134,7 +134,7 @@ def _between(begin: float, end: float, streams: Mapping[str, np.ndarray], clock:
         return times[(times >= begin - SLACK) & (times <= end + SLACK)]
     if (end - begin) * clock > MOST_ROWS:
         raise ValueError(
-            f"{clock:g} rows a second from {begin:.15g} to {end:.15g} s are more than {MOST_ROWS:.0e}; pass a lower "
+            f"{clock:g} rows per second from {begin:.15g} to {end:.15g} s are more than {MOST_ROWS:.0e}; pass a lower "
             "clock=, or unit= for tables whose times are not in s"
         )
     return begin + np.arange(int((end - begin + SLACK) * clock) + 1) / clock
@@ -152,7 +152,7 @@ def last_reading(
         taken: when the readings were taken, s, ``[m]``; by default they arrive at once.
 
     Returns:
-        Its index ``[n]``, -1 where there is none, and whether it is new, bool ``[n]``.
+        Its index ``[n]``, -1 if there is none, and whether it is new, bool ``[n]``.
 
     Examples:
         >>> last_reading(np.array([0.0, 1.0]), np.array([0.0, 0.5, 1.0]), None)
@@ -226,7 +226,7 @@ def interpolate(
         tolerance: s; between readings that are farther apart there is no value.
 
     Returns:
-        Values ``[n, C]``, zero where there is none, and where there is one, bool ``[n]``.
+        Values ``[n, C]``, zero if there is none, and where there is one, bool ``[n]``.
 
     Examples:
         >>> interpolate(np.array([0.0, 1.0]), np.array([[0.0], [2.0]]), np.array([0.25, 1.0]), None)

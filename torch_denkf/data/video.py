@@ -21,7 +21,7 @@ NOT_DECODED = (
 def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Decodes a video once and pairs its frames with the times that are asked for.
 
-    By time and not by count: a damaged frame, which decoders leave out without a word, must not shift those after it.
+    By time and not by count: a damaged frame, which decoders leave out silently, must not shift those after it.
 
     Args:
         file: the video.

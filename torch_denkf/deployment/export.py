@@ -60,7 +60,7 @@ def export_step(
 
     A package draws everything random inside, from torch's generator, unless ``example`` holds the noise (see
     :meth:`~torch_denkf.filters.Filter.draw_noise`): then it is an input, and the step is a function of its inputs. In
-    an ONNX model noise is always an input. Its names begin with ``noise.``. Real numbers are standard normal, but for
+    an ONNX model noise is always an input. Its names begin with ``noise.``. Real numbers are standard normal, except
     ``uniform`` of a particle filter, which lies between 0 and 1; bytes are uniform, and booleans are fair coins.
 
     ONNX lacks factors of matrices. Small systems are written out: readings of up to 4 numbers, and covariances of up to

@@ -125,7 +125,7 @@ def replacing(file: str | Path) -> Iterator[Path]:
     with clear_errors(file, beside=file.parent / _WRITING), place_beside(file) as beside:
         beside.touch()
         yield beside
-        sync(beside)  # else a power failure could put an empty file in the place of a good one
+        sync(beside)  # else a power failure could put an empty file instead of a good one
         os.replace(beside, file)
         sync(file.parent)
 
@@ -200,7 +200,7 @@ def place_beside(target: Path) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> int:
-    """Removes what killed processes left half written next to the files and folders in a folder.
+    """Removes incomplete files of killed processes next to the files and folders in a folder.
 
     Returns:
         How many places that were.

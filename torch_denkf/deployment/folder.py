@@ -44,7 +44,7 @@ def save_folder(
 
     Args:
         model: the model.
-        folder: made where it is not there; a model in it is replaced, whole or not at all, also by a process that is
+        folder: made if it does not exist; a model in it is replaced, whole or not at all, also by a process that is
             killed.
         builder: name of the function that builds such a model from the settings.
         settings: plain values.
@@ -121,7 +121,7 @@ def _settle(folder: Path) -> None:
 
 
 def read_folder_config(folder: str | Path, builders: Mapping[str, object]) -> dict[str, Any]:
-    """Reads what :func:`save_folder` wrote next to the weights.
+    """Reads the description that :func:`save_folder` wrote next to the weights.
 
     Args:
         folder: with ``config.json``.

@@ -21,7 +21,7 @@ class Step(Protocol):
 
     @property
     def outputs(self) -> Sequence[str]:
-        """Names of what it returns."""
+        """Returns the names of the outputs."""
 
     def __call__(self, entries: Mapping[str, Tensor], /) -> Mapping[str, Tensor]:
         """Takes one step."""

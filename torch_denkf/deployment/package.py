@@ -70,7 +70,7 @@ class PackagedStep:
 
 
 def load_step(path: str | Path) -> PackagedStep:
-    """Loads what :func:`torch_denkf.deployment.export_step` wrote.
+    """Loads a package of :func:`torch_denkf.deployment.export_step`.
 
     A package is a program: loading it runs the native code in it, with all rights of this process, and a package that
     is not compiled may hold pickles, which run code, too. Load packages alone that you would also execute; nothing in

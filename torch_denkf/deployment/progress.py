@@ -46,7 +46,7 @@ class _Lines:
         self.file = file
 
     def write(self, text: str) -> None:
-        """Writes what is not blank."""
+        """Writes text that is not blank."""
         text = text.strip()
         if text:
             self.file.write(f"{text}\n")

@@ -28,7 +28,7 @@ def build_from(builder: Callable[..., nn.Module], settings: Mapping[str, Any]) -
 
 
 def check_rebuilt(model: nn.Module, name: str, builder: Callable[..., nn.Module], settings: Mapping[str, Any]) -> None:
-    """Raises a ``ValueError`` where a function of settings builds another model; the message names what differs."""
+    """Raises a ``ValueError`` if a function of settings builds another model; the message names the differences."""
     with torch.random.fork_rng(devices=[]):
         built = build_from(builder, settings)
     for label in ("builder", "settings"):  # which a model gets when it is loaded

@@ -171,7 +171,7 @@ class _Case(NamedTuple):
 
 
 def _checks(analysis: TensorDictModuleBase, case: _Case, tolerance: float) -> Iterator[tuple[str, float, float]]:
-    """Names of numbers, how far they are off, and how far they may be."""
+    """Yields names of numbers, how far they are off, and how far they may be."""
     keys, td = case.keys, case.draw((2,))
     yield from _moments("", analysis, case, td, tolerance)
     for batch in ((), (3,), (2, 3)):

@@ -34,7 +34,7 @@ def check_composition(modules: Sequence[Placed], structure: Structure) -> None:
 
 
 def _check_both(read: Sequence[NestedKey], carry: Sequence[NestedKey], modules: Sequence[Placed]) -> None:
-    """Raises where an entry comes from outside and is written, too: the next step would read what this one wrote."""
+    """Raises if an entry is an input and an output: the next step would read this step's output."""
     for place, module in modules:
         both = [key for key in writes(module) if key in read and key not in carry]
         if both:
@@ -76,7 +76,7 @@ def _check_overwriting(modules: Sequence[Placed]) -> None:
 
 
 def _check_unused(update: Sequence[Placed], belief: Sequence[NestedKey]) -> None:
-    """Raises where nobody uses what an analysis writes: its reading would be lost."""
+    """Raises if no module uses the output of an analysis: its reading would have no effect."""
     used = set(belief)
     for place, module in reversed(update):
         info = role(module, Update).info_prefix

@@ -41,7 +41,7 @@ class UnreadMasks(Once):
         self._known: tuple[Structure | None, list[Any], list[tuple[NestedKey, NestedKey]]] = (None, [], [])
 
     def __call__(self, filter: Filter, record: Record) -> None:
-        """Looks at the masks in what a filter read."""
+        """Looks at the masks in the inputs of a filter."""
         structure, tensordict, name = filter.structure, record.tensordict, type(filter).__name__
         if self._known[0] is not structure:
             self._known = structure, list(_unmasked(structure)), [(key, _own(key)) for key in structure.readings]
@@ -125,7 +125,7 @@ class UnreadMasks(Once):
             )
 
     def _of_transforms(self, structure: Structure, env, name: str) -> None:
-        """Warns where a transform drops what the filter reads, and marks that in a mask the filter does not read."""
+        """Warns where a transform drops the inputs of the filter, and marks that in a mask the filter does not read."""
         read = {*structure.needed, *structure.optional}
         while isinstance(env, TransformedEnv):
             transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]

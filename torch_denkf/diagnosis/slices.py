@@ -40,7 +40,7 @@ def check_slices(tensordict: TensorDictBase, init_key: NestedKey) -> None:
     """Raises for a batch ``[N]`` that seems to hold several sequences and does not say where they begin.
 
     A filter would go from the end of one slice to the beginning of the next as if no time had passed. Frames without a
-    ``"next"`` part, a number of the episode and a clock are taken for one sequence, and so is what goes on without a
+    ``"next"`` part, a number of the episode and a clock are taken for one sequence, and so is what continues without a
     break: what was next at one step is there at the following one, as in ``env.rollout``.
 
     Args:
@@ -131,10 +131,10 @@ def _end(following: TensorDictBase, size: int) -> Tensor | None:
 
 
 def _chain(tensordict: TensorDictBase, following: TensorDictBase, inner: Tensor) -> tuple[bool, Tensor]:
-    """Compares the next step's entries with what follows: whether that is possible, and breaks ``[N - 1]``.
+    """Compares the next step's entries with the following rows: whether that is possible, and breaks ``[N - 1]``.
 
     A transform of sampled data may change one entry and not its next one, and a robot may stand still. So one entry
-    that moves and goes on is enough, and a step in which all are the same.
+    that moves and continues is enough, and a step in which all are the same.
     """
     pairs = []
     for key in map(unravel_key, following.keys(True, True)):

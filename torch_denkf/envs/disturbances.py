@@ -170,7 +170,7 @@ class Brightness(ImageDisturbance):
 
 
 class BlackFrames(ImageDisturbance):
-    """Makes whole frames black without a word: other than with ``MissingFrames``, no mask tells the filter.
+    """Makes whole frames black; unlike ``MissingFrames``, no mask tells the filter.
 
     Args:
         p: probability that a frame is black.

@@ -16,7 +16,7 @@ __all__ = ["HoldReading"]
 
 
 class HoldReading(Checked, Transform):
-    """Adds the last reading that arrived: what a network without a filter can read where readings are missing.
+    """Adds the last reading that arrived (zero-order hold), for networks without a filter.
 
     A missing reading is NaN or zero. A filter leaves it out; an LSTM that reads NaN returns NaN from then on, without
     an error. An episode begins with zeros where no reading has arrived yet. Nothing is kept on the transform: the held

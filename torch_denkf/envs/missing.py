@@ -63,7 +63,7 @@ class MissingFrames(FrameTransform):
         return next_tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds the mask where there is none."""
+        """Adds the mask if there is none."""
         if self.observed_key not in observation_spec.keys(True, True):
             shape = (*observation_spec.shape, 1)
             observation_spec[self.observed_key] = Binary(shape=shape, dtype=torch.bool, device=observation_spec.device)

@@ -22,7 +22,7 @@ _NOT_SHOWN = ("next", "done", "terminated", "truncated", "is_init", "action", "i
 
 
 class RecordedPolicy(TensorDictModuleBase):
-    """Commands what was commanded in the recording: copies ``("recorded", "action")`` to ``"action"``.
+    """Repeats the recorded commands: copies ``("recorded", "action")`` to ``"action"``.
 
     Examples:
         >>> now = TensorDict({"recorded": TensorDict({"action": torch.ones(3, 2)}, [3])}, [3])
@@ -47,10 +47,10 @@ class ReplayEnv(RowsEnv):
     ``"_reset"`` marks. Rewards are zero.
 
     Elements take the episodes in turn: with a batch of three, the first reset shows the first three, and each element
-    that ends goes on with the next one that none has had. ``set_seed`` restarts this turn and the random starts.
+    that ends continues with the next one that none has had. ``set_seed`` restarts this turn and the random starts.
     Each worker of a SerialEnv or ParallelEnv has a turn of its own: give each its ``episodes``.
 
-    **Actions.** A replay goes on as it was recorded, whatever is commanded.
+    **Actions.** A replay continues as it was recorded, whatever is commanded.
 
     Where the data set has an ``action``, the environment's has its shape. The recorded one is emitted as
     ``("recorded", "action")``: that which was sent in this row and led to the next. ``env.rollout(n)`` without policy
@@ -178,7 +178,7 @@ class ReplayEnv(RowsEnv):
 
 
 def _numbers(data: EpisodeReplay, episodes: Sequence[int | str] | int | str | None) -> list[int]:
-    """Numbers of episodes by number or name."""
+    """Returns numbers of episodes by number or name."""
     if episodes is None:
         return list(range(len(data.episodes)))
     numbers = {episode.name: number for number, episode in enumerate(data.episodes)}

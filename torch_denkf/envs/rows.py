@@ -47,7 +47,7 @@ class RowsEnv(Checked, EnvBase):
         raise NotImplementedError
 
     def _set_specs(self, row: Tensor, actions: int = 0, **specs: TensorSpec) -> None:
-        """Specs by what some rows show.
+        """Derives specs from some rows.
 
         Args:
             row: ``[*B]``, any.
@@ -72,7 +72,7 @@ class RowsEnv(Checked, EnvBase):
         self.rng.manual_seed(0 if seed is None else seed)
 
     def _draw(self, counts: Tensor) -> Tensor:
-        """Numbers ``[*B]``, each uniform in 0 to ``counts - 1``."""
+        """Returns integers ``[*B]``, each uniform in 0 to ``counts - 1``."""
         draw = torch.rand(self.batch_size, generator=self.rng, dtype=torch.float64).to(counts.device)
         return (draw * counts).long().minimum(counts - 1)
 

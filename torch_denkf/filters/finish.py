@@ -32,7 +32,7 @@ class Record(NamedTuple):
     Attributes:
         way: ``"step"``, ``"sequence"``, ``"policy"`` or ``"environment"``; ``"data"`` for a batch that a loss or a
             replay buffer is about to filter: nothing is written then.
-        tensordict: what the filter read from, as it was given.
+        tensordict: the inputs of the filter from, as it was given.
         batch_size: of the entries; differs from the tensordict's where slices lie end to end.
         entries: what the modules read.
         written: what they wrote; of a sequence ``[*B, T, ...]``.
@@ -48,7 +48,7 @@ class Record(NamedTuple):
 
 
 def own(written: Entries, given: Iterable[Tensor] = ()) -> Entries:
-    """Clones entries that are views, or that the caller gave: what a filter writes is its own."""
+    """Clones entries that are views or the caller's, so that the filter's outputs own their memory."""
     if torch.compiler.is_compiling():  # what a graph returns is its own
         return written
     seen, out = set(map(id, given)), {}

@@ -66,7 +66,7 @@ def gather_rows(
     size: torch.Size,
     start_of: Callable[[Entries, Call], Entries],
 ) -> StepInputs:
-    """Finds where each element of a sequence starts from, and what its step reads.
+    """Collects the initial belief of each element of a sequence, and the inputs of its step.
 
     Args:
         structure: of the filter.
@@ -104,7 +104,7 @@ def gather_rows(
 
 
 def controls_of(structure: Structure, entries: Entries, time: int) -> Entries:
-    """Returns what drives the step to each time, which is stored one step earlier than it is read.
+    """Returns the controls of the step to each time, which are stored one step earlier than they are read.
 
     Args:
         structure: of the filter.

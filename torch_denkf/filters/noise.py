@@ -109,7 +109,7 @@ class Draws:
         return out
 
     def nothing(self, batch_size: Sequence[int]) -> Entries:
-        """Returns zeros for what the initial belief reads, where its shape alone counts."""
+        """Returns zeros for the inputs of the initial belief, where only shapes are needed."""
         told, like = role(self.filter.initial, Initial), self.filter.like()
         like = torch.zeros(()) if like is None else like
         zeros = like.new_zeros(*batch_size, told.input_dim or told.state_dim or 1)
@@ -117,7 +117,7 @@ class Draws:
 
     @torch.no_grad()
     def _trial(self, entries: Entries, size: torch.Size) -> Drawn:
-        """Finds which modules draw noise in a step, and of what sizes, by one step of the first element."""
+        """Finds the modules that draw noise, and its sizes, by one step of the first element."""
         row = {key: value for key, value in entries.items() if key[0] != "noise"}
         if size.numel():
             row = {key: value.flatten(0, len(size) - 1)[:1] if size else value for key, value in row.items()}

@@ -47,7 +47,7 @@ class ParticleFilter(Filter):
         process_noise: Q of the motion, besides the transition's own noise: standard deviations ``[S]`` (a number for
             all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
         **options: ``reading_space`` and ``observation_key``, for the default likelihood, ``observed_key``, which
-            resampling heeds, too, ``visibility``, for a Gaussian likelihood, ``sensor_error`` and what every filter
+            resampling uses, too, ``visibility``, for a Gaussian likelihood, ``sensor_error`` and what every filter
             takes, see :class:`~torch_denkf.filters.parts.ReadingOptions`.
 
     Raises:
@@ -187,7 +187,7 @@ class DPF(ParticleFilter):
 class MixtureParticleFilter(ParticleFilter):
     """Differentiable particle filters of Kloss et al. for the mixture loss: dPF-M and dPF-M-lrn.
 
-    Soft resampling in every step, so that the gradient goes on from step to step; "M" is the loss,
+    Soft resampling in every step, so that the gradient continues from step to step; "M" is the loss,
     :class:`torch_denkf.objectives.MixtureLoss`, and "lrn" the likelihood.
 
     Args:

@@ -51,7 +51,7 @@ class ReadingOptions(FilterOptions, total=False):
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, by default ``"observed"``; a nonlinear observation model
             may write it.
         visibility: a head next to the sensor that says whether it sees, :class:`~torch_denkf.imperfect.Visibility`; the
-            update heeds it, see :class:`~torch_denkf.imperfect.Visible`. ``None`` by default.
+            update uses it, see :class:`~torch_denkf.imperfect.Visible`. ``None`` by default.
         sensor_error: coloured errors of the sensor, such as a :class:`~torch_denkf.imperfect.FadingBias`: they become
             part of the state, behind its S components, of transition, process noise, observation and initial belief.
             All these are given for the state alone. ``None`` by default.
@@ -156,7 +156,7 @@ class FilterParts:
         return {name: value for name, value in found.items() if value is not None}
 
     def in_order(self, **others: TensorDictModuleBase | None) -> OrderedDict[str, TensorDictModuleBase]:
-        """Returns the modules by name, the ``others`` last, but for ``None``; the ``analysis`` heeds a visibility."""
+        """Returns the modules by name, without ``None``, the ``others`` last; ``analysis`` gets the visibility."""
         if self.visibility is not None:
             others["analysis"] = self.visibility.heeded_by(others["analysis"])
         named = {"sensor": self.sensor, "visibility": self.visibility, "noise": self.noise, **others}

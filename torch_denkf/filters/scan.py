@@ -37,7 +37,7 @@ class Steps(NamedTuple):
     update_at_reset: bool
 
     def run(self, modules: Iterable[Placed], entries: Entries, call: Call, partial: bool = False) -> Entries:
-        """Runs modules one after the other; each finds in ``entries`` what those before it wrote.
+        """Runs modules one after the other; each reads the outputs of those before it from ``entries``.
 
         Where the entries are ``partial``, some observations are missing: modules that read them are left out, and an
         update gets a mask instead.
@@ -139,9 +139,8 @@ class Steps(NamedTuple):
 
         Args:
             carry: the belief before the first step.
-            inputs: what each step reads in addition to the carry, ``[*B, T, ...]``, with what the frames' modules
-                wrote. What stands under ``("previous", ...)`` is where the step begins in rows that :data:`FROM_STORED`
-                marks.
+            inputs: inputs of each step in addition to the carry, ``[*B, T, ...]``, with outputs of the frames' modules.
+                Rows that :data:`FROM_STORED` marks start from the belief stored under ``("previous", ...)``.
             call: of one step ``[*B]``.
             resets: rows that are reset at each step, ``[*B, T, 1]``; ``[*B, 1, 1]`` where the first step alone has
                 some; ``None`` for none.
@@ -172,7 +171,7 @@ class Steps(NamedTuple):
         return carry, {key: torch.stack([out[key] for out in outputs], time) for key in keep}
 
     def blank(self, written: Entries, fresh: Tensor) -> None:
-        """Sets to zero what a step writes and an initial belief does not have: innovations and the like.
+        """Sets step outputs that an initial belief lacks, such as innovations, to zero.
 
         Args:
             written: by a step, or by those of a sequence; changed.
@@ -192,7 +191,7 @@ def _unbound(entries: Entries, time: int, count: int) -> list[Entries]:
 
 
 def _masked(module: Update, entries: Entries, call: Call) -> Entries:
-    """Returns the entries with ones in the place of missing observations, and a mask that says so."""
+    """Returns the entries with ones instead of missing observations, and a mask that says so."""
     like = next(entries[key] for key in module.in_keys if key in entries)
     dims = zip(module.reading_keys, module.reading_dims(entries, call), strict=True)
     ones = {

@@ -36,7 +36,7 @@ def takes_reading(module: TensorDictModuleBase) -> TypeGuard[Update]:
 
 
 class Structure(NamedTuple):
-    """A filter's modules in their order, sorted by what they read.
+    """A filter's modules in order, sorted by their inputs.
 
     Attributes:
         initial: the initial belief.
@@ -49,7 +49,7 @@ class Structure(NamedTuple):
         optional: keys that are used where they are there.
         controls: keys that drive the transition.
         required_controls: those of them that must be there.
-        carry: keys of the belief that go on from step to step.
+        carry: keys of the belief that continue from step to step.
         carried: the same, each with the kind of belief that knows what finite means there; ``None`` for all others.
         belief: keys of the belief; the carry, and what follows from it.
         forecast_of: the forecast of each carried entry, as far as the transition writes one.
@@ -94,7 +94,7 @@ class Structure(NamedTuple):
         return (*self.frames, self.transition, *self.update)
 
     def in_keys(self, init_key: NestedKey) -> list[NestedKey]:
-        """Returns all that a filter reads: also stored beliefs, those of a policy, and what marks a beginning."""
+        """Returns all inputs of a filter, including stored beliefs, those of a policy, and the marks of resets."""
         keys = [*self.needed, *self.controls, *self.carry, *map(previous_key, self.carry), HAS_PREVIOUS]
         keys += [*map(previous_key, self.controls), *self.belief, init_key, *self.optional]
         return list(dict.fromkeys(keys))
@@ -252,7 +252,7 @@ def _forecasts(
 
 
 def _check_forecasts(forecast_of: Mapping[NestedKey, NestedKey], kinds: Sequence[Belief]) -> None:
-    """Raises where the transition forecasts some entries of a belief and it is not clear what forecasts the others."""
+    """Raises if the transition forecasts some entries of a belief and the forecasts of the others are ambiguous."""
     for kind in kinds:
         lacking = [key for key in kind.carry if key not in forecast_of]
         if lacking and len(lacking) < len(kind.carry):
@@ -276,7 +276,7 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
 
 
 def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey]], dict]:
-    """Names of their own for the diagnostics of several analyses, and what to sum up."""
+    """Returns distinct names for the diagnostics of several analyses, and the entries to sum."""
     writers: dict[str, list[Placed]] = {}
     for place, module in steps:
         for part in in_sequences(module):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 class Whitened(NamedTuple):
-    """A reading and what the members predict of it; components that are not observed have innovation 0, variance 1.
+    """A whitened reading and the members' predictions; missing components have innovation 0 and variance 1.
 
     Attributes:
         predicted: HX, ``[*B, E, O]``.

@@ -116,7 +116,7 @@ def kalman_update(
 def innovation_update(
     cov: Tensor, innovation: Tensor, observation_matrix: Tensor, noise: Tensor, *, observed: Tensor | None = None
 ) -> GaussianUpdate:
-    """Does what :func:`kalman_update` does for a prior mean of zero; of what it takes the mask alone is checked.
+    """Updates as :func:`kalman_update`, for a prior mean of zero; checks the mask only.
 
     In deviations from the mean H m costs no digits where the state is far from zero.
     """
@@ -147,7 +147,7 @@ def innovation_update(
 
 
 def hide(observed: Tensor, noise: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns a mask of each component, R ``[*B, O, O]`` with ones in the place of the others, and how many they are.
+    """Returns a mask of each component, R ``[*B, O, O]`` with ones instead of the others, and how many they are.
 
     Args:
         observed: ``[*B, 1]`` or ``[*B, O]``.
@@ -165,7 +165,7 @@ def hide(observed: Tensor, noise: Tensor, shape: Sequence[int]) -> tuple[Tensor,
 
 
 def check_update(mean: Tensor, cov: Tensor, observation: Tensor, matrix: Tensor, noise: Tensor) -> None:
-    """Raises where what :func:`kalman_update` takes does not fit."""
+    """Checks the arguments of :func:`kalman_update`."""
     batch, size, dim = mean.shape[:-1], mean.shape[-1:], observation.shape[-1:]
     noise_shape = (*batch, *dim) if noise.ndim == mean.ndim else (*batch, *dim, *dim)
     plain = mean.dtype == cov.dtype == observation.dtype == matrix.dtype == noise.dtype

@@ -25,7 +25,7 @@ _SLOPES: dict[type, Callable[..., Tensor]] = {
 
 
 def jacobian_of_network(network: nn.Module, x: Tensor, size: int) -> tuple[Tensor, Tensor] | None:
-    """Returns what a network makes of ``x``, and the Jacobian by its first numbers, where that is a product.
+    """Returns a network's output for ``x`` and its Jacobian by the first inputs, if that is a product.
 
     Both can be differentiated. A network that has a method of its own, ``jacobian(x, size)``, is asked, unless a
     subclass has a new ``forward`` and no new Jacobian.
@@ -54,7 +54,7 @@ def jacobian_of_network(network: nn.Module, x: Tensor, size: int) -> tuple[Tenso
 def jacobian_of_layers(
     layers: Sequence[Any], x: Tensor, size: int, linear: tuple[type, ...] = (nn.Linear,)
 ) -> tuple[Tensor, Tensor] | None:
-    """Does what :func:`jacobian_of_network` does for layers in their order; those of types ``linear`` are W x + b."""
+    """Works as :func:`jacobian_of_network`, for layers in order; those of types ``linear`` are W x + b."""
     if any(not (type(layer) in linear or type(layer) in _SLOPES) or _hooked(layer) for layer in layers):
         return None
     identity = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)[:size]
@@ -76,7 +76,7 @@ def is_older(kind: type, names: Set[str], others: Set[str]) -> bool:
 
 
 def _flat(network: nn.Module) -> Iterator[nn.Module]:
-    """Yields the layers of sequences, and of those in them, but for the identity."""
+    """Yields the layers of sequences, and of those in them, except for the identity."""
     if type(network) is nn.Sequential and not _hooked(network):
         for layer in network:
             yield from _flat(layer)

@@ -18,7 +18,7 @@ from torch_denkf.functional.kernels.small_system import (
 
 
 def cholesky(matrix: Tensor) -> Tensor:
-    """Returns the lower Cholesky factor L of a symmetric positive definite matrix, NaN where there is none.
+    """Returns the lower Cholesky factor L of a symmetric positive definite matrix, NaN if there is none.
 
     ``torch.linalg.cholesky`` raises and so waits for the device; ``torch.linalg.cholesky_ex`` returns a
     half-finished factor. Here a failure shows: that matrix of the batch, and only that, becomes NaN.
@@ -84,7 +84,7 @@ def semidefinite_solve(cov: Tensor, right: Tensor, *, spare: float = 0) -> Tenso
     Args:
         cov: P, ``[*B, N, N]``, symmetric positive semi-definite.
         right: Y, ``[*B, N, M]``.
-        spare: is added to the correlations' diagonal where P is not positive semi-definite, but for rounding.
+        spare: is added to the correlations' diagonal where P is not positive semi-definite, up to rounding.
 
     Returns:
         X, ``[*B, N, M]``; NaN where P is not positive semi-definite.
@@ -357,7 +357,7 @@ class _SymmetricFunction(torch.autograd.Function):
 
 
 def product_of_known(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Returns H x, where what is NaN in x is so in those rows alone that have a coefficient for it.
+    """Returns H x; NaN in x affects only rows with a coefficient for it.
 
     Args:
         matrix: H, ``[O, S]``.

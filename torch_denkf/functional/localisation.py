@@ -65,7 +65,7 @@ class Neighbours(NamedTuple):
         taper: their weights in [0, 1], ``[S, L]``; 0 for those that fill up.
     """
 
-    index: Tensor  # type: ignore[assignment]  # in the place of tuple.index, which nobody needs here
+    index: Tensor  # type: ignore[assignment]  # instead of tuple.index, which nobody needs here
     taper: Tensor
 
 
@@ -181,7 +181,7 @@ def letkf(
         tile: components to analyse in one go; memory is ``E * L * tile`` for each element of the batch.
 
     Returns:
-        The analysis ensemble, ``[*B, E, S]``. A component without observations stays as it is, but for rounding.
+        The analysis ensemble, ``[*B, E, S]``. A component without observations stays as it is, up to rounding.
 
     Raises:
         ValueError: for shapes that do not fit.

@@ -112,7 +112,7 @@ class Updates:
 
     def _model(self, prefix: str, name: str, sensor: FusedSensor, wired: Wired) -> StateObservation:
         ensemble = (prefix, "ensemble")
-        # Without a delay only the mask of a state with a past must be told apart; a past elsewhere is not looked at.
+        # Without a delay only the mask of a state with a lag window differs.
         late = self.lag > 0 and (sensor.delay > 0 or sensor.late_key is not None or self.gaussian)
         return StateObservation(
             sensor.observation,

@@ -21,11 +21,11 @@ __all__ = ["BeliefAhead"]
 
 
 class BeliefAhead(Checked, TensorDictModuleBase):
-    """Writes the belief of the moment when the next action will run, beside the belief of now.
+    """Writes the belief of the moment when the next action will run, next to the belief of now.
 
     Between a reading and the action that follows from it a robot needs time, and moves on by the actions that were sent
     before. The belief of now is forecast through these, one step of the filter after the other, with its process noise:
-    the spread is that of the later moment. It stands under ``"ahead"``, e.g. ``("ahead", "belief", "mean")``.
+    the spread is that of the later moment. It is stored under ``"ahead"``, e.g. ``("ahead", "belief", "mean")``.
 
     * In a loop, call it on what :meth:`Filter.step` returned; on what :meth:`Filter.sequence` returned, it looks ahead
       from each element.
@@ -201,7 +201,7 @@ class BeliefAhead(Checked, TensorDictModuleBase):
             now.set(self.dt_key, self.dt * (wanted - k).clamp(0.0, 1.0))
 
     def _noise(self, now: TensorDictBase, size: torch.Size) -> TensorDictBase | None:
-        """Draws what one forecast takes."""
+        """Draws the noise of one forecast."""
         filter = self.filter
         if not filter.draws.places:
             return None

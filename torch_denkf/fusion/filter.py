@@ -52,15 +52,15 @@ class FusedFilter(Filter):
     :class:`~torch_denkf.smoothers.FixedLag` does; a mean and a covariance as one joint Gaussian, which for linear
     systems gives what readings in their order give. With process noise and few members, the sample covariances of an
     ensemble make a difference between late and in order, which falls with more members; with :class:`Refiltering` there
-    is none. Where there is a delay, the belief of L steps ago stands under ``("smoothed", ...)``. A reading that
+    is none. Where there is a delay, the belief of L steps ago is stored under ``("smoothed", ...)``. A reading that
     belongs to the time before the episode is not observed.
 
     An analysis' inflation and relaxation spread the belief of the present, once in each update that observes anything.
-    A late reading would have to spread a belief of the past, of which the updates since did not know: with a delay both
-    raise, and so they do with the lag of a mean and a covariance. :class:`Refiltering` and
+    A late reading would have to inflate an earlier belief, which the updates since did not include: with a
+    delay both raise, and so they do with the lag of a mean and a covariance. :class:`Refiltering` and
     :class:`~torch_denkf.smoothers.FixedLag` take them.
 
-    Diagnostics of the sensors stand under ``("info", NAME, ...)``, their sums under ``("info", "nis")`` and
+    Diagnostics of the sensors are stored under ``("info", NAME, ...)``, their sums under ``("info", "nis")`` and
     ``("info", "log_likelihood")``; with one sensor, or a joint update, ``("info", ...)``.
 
     Args:
@@ -77,7 +77,7 @@ class FusedFilter(Filter):
             for a mean and a covariance an observation model in front of them, as
             :class:`~torch_denkf.modules.EKFAnalysis`.
         weights: a network that says how much each reading counts, :class:`~torch_denkf.fusion.SensorAttention`; the
-            weights ``[*B, 1]`` stand under ``("weight", NAME)``. ``None``: readings count as their noise says.
+            weights ``[*B, 1]`` are stored under ``("weight", NAME)``. ``None``: readings count as their noise says.
         lag: L; by default the largest delay.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
             ``check_finite`` and ``prefix`` of :class:`Filter`.
@@ -85,8 +85,8 @@ class FusedFilter(Filter):
     Raises:
         ValueError: if there is no sensor, a delay is negative or beyond the lag, process noise is missing or given
             twice, an analysis inflates or relaxes where it must not or names a ``reading_space``, or a sensor has
-            errors that last and its readings live on a space.
-        TypeError: for particles, sensors that are no dict, an analysis in the place of what makes it, or one that
+            coloured noise and its readings live on a space.
+        TypeError: for particles, sensors that are no dict, an analysis instead of what makes it, or one that
             cannot correct earlier states.
 
     Example:
@@ -189,7 +189,7 @@ def _check_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, jo
 
 
 def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:
-    """Returns L: what is given, or the largest delay."""
+    """Returns L: the given lag, or the largest delay."""
     for name, sensor in sensors.items():
         check_count(f"delay of {name!r}", sensor.delay, least=0)
         if sensor.late_key is not None and sensor.delay < 1:

@@ -13,9 +13,9 @@ def joint_forecast(
 ) -> tuple[Tensor, Tensor]:
     """Moves a joint Gaussian of L + 1 states on by one step; its oldest state is forgotten.
 
-    The past enters the forecast through the last state alone: its covariance with an earlier state is G^T times that of
-    the last state with it, with the smoother's gain G (Särkkä 2013, section 8.2). Means may be points of a space;
-    covariances are then of their tangents.
+    The lag window enters the forecast through the last state alone: its covariance with an earlier state is G^T times
+    that of the last state with it, with the smoother's gain G (Särkkä 2013, section 8.2). Means may be points of a
+    space; covariances are then of their tangents.
 
     Args:
         mean: of the forecast, ``[*B, S]``, in the state's units.

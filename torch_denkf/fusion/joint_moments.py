@@ -46,8 +46,8 @@ def joint_space(space: Space | None, lag: int) -> Space | None:
 
 
 _MOMENTS = ("mean", "cov", "var")
-#: Mean ``[*B, (L + 1) S]`` and covariance of the present and the past states, the latest first; on a space, points and
-#: the covariance of all their tangents.
+#: Mean ``[*B, (L + 1) S]`` and covariance of the present and the states of the lag window, the latest first; on a
+#: space, points and the covariance of all their tangents.
 JOINT_PAST = Past(("joint_mean", "joint_cov"), _MOMENTS, _copies, _present_and_oldest, present=_MOMENTS)
 
 

@@ -35,9 +35,9 @@ def message_rows(
     motion must read it. The first row is the start of the filter; no message stands there. A sensor that says two
     things about one time gets two rows, the second with a ``dt`` of zero.
 
-    A sensor's reading stands under its name, ``[T, O]``, and its mask under NAME_observed, as
+    A sensor's reading is stored under its name, ``[T, O]``, and its mask under NAME_observed, as
     :class:`~torch_denkf.fusion.FusedSensor` expects them; rows without one hold NaN. Where messages bring their noise,
-    that stands under NAME_noise: the name to give to ``FusedSensor(noise=...)``.
+    that is stored under NAME_noise: the name to give to ``FusedSensor(noise=...)``.
 
     Args:
         messages: ``(stamp, sensor, value)`` or ``(stamp, sensor, value, noise)``, in any order: the stamp, the
@@ -158,7 +158,7 @@ class _Stream:
         return np.stack([self.times, before.astype(float)], 1)
 
     def rows(self, name: str, place: np.ndarray, count: int) -> dict[str, np.ndarray]:
-        """Readings, their mask, and their noise, in the rows in which they stand."""
+        """Returns readings, their mask, and their noise, in the rows in which they stand."""
         value, observed = np.full((count, *self.values.shape[1:]), np.nan), np.zeros((count, 1), bool)
         value[place], observed[place] = self.values, True
         found = {name: value, f"{name}_observed": observed}

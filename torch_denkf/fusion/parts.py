@@ -84,7 +84,7 @@ class OfOwnErrors(Wrapper):
         return written, whole.index_add(-1, _places(self.own, begin, whole), matrix[..., begin:]), sides
 
     def _seen(self, entries: Entries) -> tuple[NestedKey, Tensor]:
-        """Returns the key and the value of what the sensor sees of the state."""
+        """Returns the key and the value of the state that the sensor observes."""
         key = unravel_key(self.in_keys[0])
         system, errors = self.required(entries, key).tensor_split([-self.total], -1)
         return key, torch.cat([system, errors[..., self.own]], -1)
@@ -132,15 +132,15 @@ class StateObservation(Wrapper, Update):
 
     Args:
         observation: observes ensembles, e.g. :class:`Select`; it reads its first key, and writes its first.
-        ensemble_key: the states to observe, ``[*B, E, S]``; without ``past_key`` they hold the past themselves, the
-            latest first: ``[*B, E, (L + 1) S]``.
+        ensemble_key: the states to observe, ``[*B, E, S]``; without ``past_key`` they hold the lag window themselves,
+            the latest first: ``[*B, E, (L + 1) S]``.
         predicted_key: predicted observations, ``[*B, E, O]``.
         reading_keys: what is compared with them, and its noise.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         delay: by how many steps readings are late.
         late_key: optional entry that says it for each, ``[*B, 1]`` int64, 0 to L.
         past_key: the last L states, ``[*B, E, L, S]``.
-        state_dim: S, where there is a past: then the mask is written, too.
+        state_dim: S, where there is a lag window: then the mask is written, too.
         seen_key: the mask ``[*B, O]`` or ``[*B, 1]`` that is written: a reading that belongs to the time before the
             episode, or before the lag, is not observed.
         age_key: by how many steps the oldest state lay back one step ago, ``[*B, 1]``.
@@ -209,7 +209,7 @@ class StateObservation(Wrapper, Update):
         return None if found is None else ({self.predicted_key: found[0][self._out_key]}, *found[1:])
 
     def seen(self, entries: Entries, call: Call) -> tuple[Tensor, Tensor | None]:
-        """Returns the predicted observations ``[*B, E, O]``, and the mask of what is observed, if there is one."""
+        """Returns the predicted observations ``[*B, E, O]``, and the observed mask, if there is one."""
         written = run_module(self, entries, call)
         mask = entries.get(self.observed_key) if self.state_dim is None else written[unravel_key(self.out_keys[1])]
         return written[self.predicted_key], mask

@@ -24,7 +24,7 @@ class RefilteringWindow(NamedTuple):
     """The last steps of a filter.
 
     Attributes:
-        rows: what each step read, with its noise and the readings that came later; the oldest first.
+        rows: the inputs of each step, with its noise and the readings that came later; the oldest first.
         beliefs: the belief before the first of them, and what each wrote.
     """
 
@@ -92,7 +92,7 @@ class Refiltering(Checked):
         """Returns the window at the start of an episode: no steps yet, and the initial belief.
 
         Args:
-            row: what :meth:`Filter.initialise` reads, ``[*B]``.
+            row: inputs of :meth:`Filter.initialise`, ``[*B]``.
 
         Returns:
             The window, whose ``belief`` is the initial one.
@@ -104,7 +104,7 @@ class Refiltering(Checked):
 
         Args:
             window: the last steps; it is not changed.
-            row: what :meth:`Filter.step` reads, ``[*B]``, besides the belief.
+            row: inputs of :meth:`Filter.step`, ``[*B]``, besides the belief.
 
         Returns:
             The window with this step, whose ``belief`` is that of t.
@@ -128,7 +128,7 @@ class Refiltering(Checked):
         return RefilteringWindow(tuple(rows), tuple(beliefs))
 
     def sequence(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Filters one episode ``[*B, T]`` and writes what each step wrote when it was made first.
+        """Filters one episode ``[*B, T]`` and writes the outputs of each step before later corrections.
 
         Raises:
             ValueError: if another episode begins within it.

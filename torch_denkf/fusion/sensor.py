@@ -82,7 +82,7 @@ def noise_key_of(sensor: FusedSensor) -> NestedKey | None:
 
 
 def wire(name: str, sensor: FusedSensor) -> Wired:
-    """Puts what a sensor's modules write under ``("sensor", name, ...)``."""
+    """Puts the outputs of a sensor's modules under ``("sensor", name, ...)``."""
     reading = unravel_key(name if sensor.observation_key is None else sensor.observation_key)
     observed = unravel_key(f"{name}_observed" if sensor.observed_key is None else sensor.observed_key)
     names: dict[NestedKey, NestedKey] = {"observed": observed}

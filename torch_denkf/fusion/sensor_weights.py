@@ -39,9 +39,9 @@ class SensorAttention(nn.Module):
 
     It learns only what its recordings show. Put the failures that you fear into them. In some windows leave a sensor
     out, so that the others learn to do without it. A window must hold several readings of the slowest sensor: of
-    a GPS at 1 Hz one second shows nothing. The belief that a window starts from must be as wrong as it says. A filter
-    that starts far off learns to believe whatever pulls it back. Good features are in the sensor's standard deviations,
-    such as by how much its last readings differ, and how many of them are exactly the same.
+    a GPS at 1 Hz one second shows nothing. The initial belief of a window must be consistent: a filter
+    that starts with a large error learns to trust any reading that corrects it. Good features are in units of the
+    sensor's standard deviations, such as the spread of its last readings, and the number of equal ones.
 
     Args:
         observations: O of each sensor, by name, in the order of the filter's sensors.

@@ -85,7 +85,7 @@ class FadingBias(nn.Module):
     def from_residuals(
         cls, residuals: Tensor, *, trainable: bool = True, per_run: bool = False
     ) -> tuple[FadingBias, Tensor]:
-        r"""Returns the biases that explain how long a sensor's errors last, and what is left: white noise.
+        r"""Fits biases to the autocorrelation of a sensor's errors, and returns them with the remaining white noise.
 
         The autocovariance of :math:`b + w` at lag k is :math:`\sigma^2 e^{-k / \tau}`, and at lag 0 it is more by the
         white variance. Size and time are those of the least squares over lags of one step and more, each lag counted
@@ -94,7 +94,7 @@ class FadingBias(nn.Module):
 
         Args:
             residuals: reading minus what it should have been, ``[N, T, K]``, N runs of T steps, on data that the sensor
-                was not trained on; NaN where there is none. Their mean is not taken off.
+                was not trained on; NaN if there is none. Their mean is not taken off.
             trainable: see the class.
             per_run: whether the errors also have a part that is the same for a whole run, as those of a learned sensor
                 in new surroundings have. There are then 2 K biases, K that last 100 times as long as a run and K that
@@ -145,7 +145,7 @@ class FadingBias(nn.Module):
 
     @property
     def variance(self) -> Tensor:
-        """Returns the variance of what is new in a step, ``[K]``: with it the biases stay as large as they are."""
+        """Returns the variance of the process noise, ``[K]``, that keeps the biases stationary."""
         return (2 * self.log_std).exp() * -torch.expm1(-2 * (-self.log_time).exp())
 
     def augmented(
@@ -478,7 +478,7 @@ def _fit(covariance: Tensor, count: Tensor, component: int, per_run: bool) -> tu
 def _linearised(
     wrapper: Wrapper, bias: FadingBias, entries: Entries, inside: Call
 ) -> tuple[Entries, Tensor, Tensor] | None:
-    """Returns what the module inside writes, its Jacobian by the state alone, and the biases; ``None`` if not known."""
+    """Returns the inside module's outputs, its Jacobian by the state, and the biases; ``None`` if not known."""
     key = unravel_key(wrapper.in_keys[0])
     state, slow = _split(wrapper.required(entries, key), bias, wrapper)
     found = linearise(wrapper.module, {**entries, key: state}, inside)

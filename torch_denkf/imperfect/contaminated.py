@@ -56,7 +56,7 @@ class Contaminated(MixedUpdate):
     mean and covariance    the mixture's, that of both means' distance included; on a space those of the tangents at the
                            forecast's mean. For a linear Gaussian system that is the exact posterior's
     ensemble               members with the mixture's mean and sample covariance, see
-                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a past that is corrected, too
+                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a lag window that is corrected, too
     particles              the exact posterior: each particle's likelihood is the mixture. The analysis runs three times
     =====================  =============================================================================================
 
@@ -76,10 +76,10 @@ class Contaminated(MixedUpdate):
             its noise are kept.
         share: :math:`\epsilon` in [0, 1], ``[*B, 1]`` in an entry.
         width: w, by how much outliers are wider than R says, ``[*B, 1]`` in an entry.
-        noise: W, in the place of ``width``: standard deviations ``[O]``; in an entry variances ``[*B, O]``.
-        divergence: probability that the filter has diverged, 0.01 for example: a sound reading then is expected from a
+        noise: W, instead of ``width``: standard deviations ``[O]``; in an entry variances ``[*B, O]``.
+        divergence: probability that the filter has diverged, 0.01 for example: a good reading then is expected from a
             forecast of three times the standard deviations. One Gaussian for a mixture forgets the smaller peak; where
-            that was the true one, it may take many sound readings for outliers. It costs a third run.
+            that was the true one, it may take many good readings for outliers. It costs a third run.
         trainable: whether those that are numbers are parameters: the logit of the share, logarithms of the others.
 
     Raises:
@@ -188,11 +188,11 @@ class Contaminated(MixedUpdate):
         return {**out, **both, (self.info_prefix, "outlier"): outlier}
 
     def _run(self, entries: Entries, call: Call) -> Entries:
-        """Returns what the analysis writes; an ensemble's predictions and reading are plain numbers already."""
+        """Returns the outputs of the analysis; an ensemble's predictions and reading are plain numbers already."""
         return (self.module.on_aligned if self.kind == "members" else self.module.on_entries)(entries, call)
 
     def _of_sound(self, entries: Entries, call: Call, seen: Tensor | None) -> Entries:
-        """Returns what the analysis writes with R, of the forecast and of the one that has diverged."""
+        """Returns the outputs of the analysis with R, of the forecast and of the one that has diverged."""
         out = self._run(entries, call)
         if not self.divergence:
             return out
@@ -252,7 +252,7 @@ class Contaminated(MixedUpdate):
 
 
 class _Quantity(nn.Module):
-    """Numbers that are given or trained, an entry, or what a module writes.
+    """Numbers that are given or trained, an entry, or the outputs of a module.
 
     Args:
         name: for messages, and of the place of the module's noise.

@@ -39,7 +39,7 @@ class MixedUpdate(Around):
             probability: of the first before the reading is known, ``[*B, 1]``. With 1 the first belief comes out, and
                 with 0 the second, without rounding.
             share: that after the reading is known.
-            out: what the update wrote, the first belief.
+            out: the outputs of the update, the first belief.
             other: the second, under the keys of ``out``.
             seen: where anything is observed, ``[*B, 1]``; elsewhere the first belief comes out. ``None``: everywhere.
         """
@@ -72,10 +72,10 @@ class MixedUpdate(Around):
         return {**mixed, keys[2]: mixed[keys[1]].diagonal(dim1=-2, dim2=-1)}
 
     def _mixed_members(self, entries: Entries, never: Tensor, share: Tensor, out: Entries, other: Entries) -> Entries:
-        """Returns ensemble, mean and variances; a past, and a covariance, where the analysis writes them."""
+        """Returns ensemble, mean and variances; a lag window, and a covariance, where the analysis writes them."""
         analysis, space, batch = self.module, self.space, len(share.shape) - 1
         pairs = [(analysis.in_keys[0], analysis.out_keys[0])]
-        pairs += [(key, key) for key in analysis.in_keys if key in analysis.out_keys]  # the past is corrected in place
+        pairs += [(key, key) for key in analysis.in_keys if key in analysis.out_keys]  # lag window, in place
         first, second = ([belief[key] for _, key in pairs] for belief in (out, other))
         if space is not None:
             centers = [_center(space, entries[key], batch) for key, _ in pairs]
@@ -141,7 +141,7 @@ def wider_forecast(analysis: Update, entries: Entries, factor: Tensor, *, member
 
 
 def wider_past(analysis: Update, entries: Entries, factor: Tensor) -> Entries:
-    """Returns the entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
+    """Returns the entries with the lag window of a :class:`LaggedAnalysis` spread likewise."""
     if not isinstance(analysis, LaggedAnalysis):
         return entries
     key, space = analysis.in_keys[-1], analysis.space
@@ -200,7 +200,7 @@ def _like(mask: Tensor, value: Tensor) -> Tensor:
 
 
 def _center(space: Space, members: Tensor, batch: int) -> Tensor:
-    """Returns a point ``[*B, 1, P]`` near members ``[*B, E, P]``, or one for each time of a past ``[*B, E, L, P]``."""
+    """Returns a point ``[*B, 1, P]`` near members ``[*B, E, P]``, or one per time of a lag window ``[*B, E, L, P]``."""
     if members.ndim == batch + 2:
         return space.near(members).unsqueeze(-2)
     return space.near(members.movedim(-3, -2)).unsqueeze(-3)

@@ -93,8 +93,8 @@ def mix_members(share: Tensor, members: Tensor, other: Tensor) -> Tensor:
     :math:`\Delta` the ways, E x S. The anomalies :math:`A_0` are therefore multiplied by :math:`L_0^{-T} L^T`, with
     :math:`L_0 L_0^T = A_0^T A_0` and L the factor of what is to come out: :math:`A^T A = L L^T`. That asks for at most
     E - 1 directions in which the members differ, as updates without localisation leave them; where there are more, the
-    ensemble cannot hold the mixture. No component depends on one behind it, so that a past behind the present leaves
-    the present as it is. It costs about :math:`S^3 + E S^2`, in double precision.
+    ensemble cannot hold the mixture. No component depends on one behind it, so that a lag window behind the present
+    leaves the present as it is. It costs about :math:`S^3 + E S^2`, in double precision.
 
     Args:
         share: q, of the first, ``[*B, 1]``; with 1 the first comes out, with 0 the second, to rounding.

@@ -41,7 +41,7 @@ class RejectReadings(Checked, Transform):
     of the tensordict that it is given, and leaves the tensors alone: ``reject(td.copy())`` keeps the NaN in ``td``.
 
     In a loop, call it on the frame before that is merged: ``filter.step(belief.update(reject(frame)))``. A tensordict
-    that goes on from step to step, also that of a policy, keeps the mask of the step before. It is not taken for the
+    that continues from step to step, also that of a policy, keeps the mask of the step before. It is not taken for the
     mask of a new reading, unless the tensordict was cloned in between or the call is compiled.
 
     Args:
@@ -52,7 +52,7 @@ class RejectReadings(Checked, Transform):
             float16 have the largest number of their dtype as their limit, integers have none.
         by_component: readings ``[*B, O]``, or samples ``[*B, E, O]``, whose components are rejected one by one; their
             mask becomes ``[*B, O]``. Other readings are rejected as a whole, and keep the width of their mask,
-            ``[*B, 1]`` where there is none: a sensor network needs all of its input.
+            ``[*B, 1]`` if there is none: a sensor network needs all of its input.
         noises: for a reading the entry with its variances ``[*B, O]`` or its covariance ``[*B, O, O]``. Those of a
             reading that is rejected for them become one, and the identity.
         spaces: for a reading the space in which it is a point ``[*B, P]``. Its parts, such as the pose, are rejected as
@@ -182,7 +182,7 @@ class RejectReadings(Checked, Transform):
         Args:
             key: of the reading.
             tensordict: with the reading.
-            written: gets the reading, and its noise, with neutral numbers in the place of bad ones.
+            written: gets the reading, and its noise, with neutral numbers instead of bad ones.
         """
         size, value = tensordict.ndim, entry_of(tensordict, key, "RejectReadings", "Rename it in the constructor.")
         good, neutral = self._within(value), value.new_zeros(())
@@ -215,7 +215,7 @@ class RejectReadings(Checked, Transform):
         return value.abs() <= min(self.limit, torch.finfo(value.dtype).max)  # also false for NaN
 
     def _judged_noise(self, noise: Tensor, size: int) -> tuple[Tensor, Tensor]:
-        """Tells which variances ``[*B, O]`` are some, and returns them with ones in the place of others."""
+        """Tells which variances ``[*B, O]`` are some, and returns them with ones instead of others."""
         good = self._within(noise)
         if noise.ndim < size + 2:
             good = good & (noise >= 0)
@@ -231,7 +231,7 @@ class RejectReadings(Checked, Transform):
         usable: Mapping[NestedKey, Tensor],
         observed: Mapping[NestedKey, Tensor],
     ) -> Iterator[str]:
-        """Names the first bad number of each reading, and of its noise, that no mask hides."""
+        """Names the first invalid value of each reading, and of its noise, that the observed mask does not exclude."""
         for key, fine in usable.items():
             mask, noise = self.hidden_by[key], self.noises.get(key)
             lost = observed[mask] & ~fine
@@ -277,7 +277,7 @@ def _fits(given: Sequence[int], due: Sequence[int]) -> bool:
 
 
 def _whole_parts(space: Space, points: Tensor, tangents: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Widens what is known of points ``[*, P]``, and of their noise ``[*, D]``, to whole parts of the space."""
+    """Widens the mask of points ``[*, P]``, and of their noise ``[*, D]``, to whole parts of the space."""
     parts: list[tuple[Tensor, Tensor]] = []
     for place in places_of(space):
         point, tangent = points[..., place.point], None if tangents is None else tangents[..., place.tangent]

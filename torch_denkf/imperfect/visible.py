@@ -1,4 +1,4 @@
-r"""A sensor that says whether it sees, and updates that heed it.
+r"""A sensor that says whether it sees, and updates that use it.
 
 A camera that looks at a pillar still reads something. :class:`Visibility` is a head next to a sensor: it writes the
 probability p that this reading is about the state at all. :class:`Visible` goes around an analysis: the density of a
@@ -37,7 +37,7 @@ __all__ = ["Visibility", "Visible"]
 
 
 class Visibility(Sensor):
-    r"""The probability that a reading is about the state at all, from what the sensor encodes.
+    r"""Predicts the probability that a reading is about the state at all, from the sensor's encoding.
 
     Labels teach it where there are some: the term ``visible`` of the losses, a binary cross entropy. Where there are
     none, the likelihood of the readings does, ``nll``, and so does each score of the belief.
@@ -110,7 +110,7 @@ class Visible(MixedUpdate):
     mean and covariance    the mixture's, q (1 - q) d dᵀ of the way d between both means included; on a space those of
                            the tangents at the forecast
     ensemble               members with the mixture's mean and sample covariance, see
-                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a past that is corrected, too
+                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a lag window that is corrected, too
     particles              the exact mixture: each particle's likelihood is one
     =====================  =============================================================================================
 

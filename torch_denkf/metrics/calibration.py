@@ -1,7 +1,6 @@
-"""Does the spread of a belief say how wrong its mean is?
+"""Calibration of a belief: spread over skill, coverage of intervals, and statistics with a uniform distribution.
 
-Spread over skill, shares of intervals that hold the truth, and what is uniform for a calibrated belief. A truth that is
-NaN is not known, and does not count.
+A true state that is NaN is unknown, and does not count.
 """
 
 from __future__ import annotations

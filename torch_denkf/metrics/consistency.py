@@ -1,4 +1,4 @@
-"""Does the error of a Gaussian belief fit its covariance? Likelihood of the truth, and the NEES with its bounds."""
+"""Consistency of a Gaussian belief: the normalised estimation error squared (NEES) and its bounds."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class NEES(NamedTuple):
     """Holds the results of :func:`nees`; ``*M`` are the batch dims that are left after averaging.
 
     Attributes:
-        mean: ``[*M]``; S for a consistent filter.
-        lower: below it the filter is underconfident: its covariance is larger than its errors.
-        upper: above it the filter is overconfident: its covariance is smaller than its errors.
-        values: of each state, ``[*B]``.
+        mean: mean NEES, ``[*M]``; S for a consistent filter.
+        lower: bound below which the filter is underconfident: its covariance is larger than its errors.
+        upper: bound above which the filter is overconfident: its covariance is smaller than its errors.
+        values: NEES of each state, ``[*B]``.
     """
 
     mean: Tensor
@@ -38,7 +38,7 @@ def nees(
     level: float = 0.95,
     dim: int | None = None,
 ) -> NEES:
-    r"""Returns the normalised estimation error squared :math:`e^\top P^{-1} e`, its mean, and where that should lie.
+    r"""Returns the normalised estimation error squared :math:`e^\top P^{-1} e`, its mean, and bounds of the mean.
 
     The sum over N independent errors that fit their covariance is chi-square distributed with N S degrees of freedom,
     so that the mean lies between ``lower`` and ``upper`` with probability ``level``. The errors of one run at
@@ -52,8 +52,8 @@ def nees(
         mean: ``[*B, S]``.
         covariance: P, ``[*B, S, S]``, or the variances ``[*B, S]`` where the errors are uncorrelated.
         truth: ``[*B, S]``, in the same units.
-        space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. The covariance is then one of
-            tangents at the mean, S their number.
+        space: the space of mean and truth, points ``[*B, P]``; the covariance is then that of tangents at the mean, of
+            S dimensions. ``None`` for vectors.
         level: probability of the bounds.
         dim: batch dimension to average over; all of them by default.
 

@@ -57,7 +57,7 @@ def activation_bytes(trunk: nn.Module, frame: Tensor) -> int:
 
 
 def couples_frames(trunk: nn.Module) -> bool:
-    """Returns whether a batch norm makes a frame's features depend on what else is in its chunk."""
+    """Tells whether a batch norm makes a frame's features depend on other frames in its chunk."""
     return any(isinstance(module, _BATCH_NORMS) for module in trunk.modules())
 
 

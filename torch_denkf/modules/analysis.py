@@ -28,7 +28,7 @@ class EnsembleAnalysis(EnsembleUpdate):
             plus N(0, R)), ``"etkf"`` (symmetric square root) or ``"sakov"`` (Sakov & Oke's deterministic update).
         inflation: factor on the analysis anomalies, where anything is observed; 1 for none.
         inflated: components of the state that the inflation multiplies; ``None`` for all. Where nothing observes a
-            component, or where it is the past, which is not forecast again, factors pile up in it.
+            component, or where it is the lag window, which is not forecast again, factors pile up in it.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         rotate: random mean-preserving rotation of the anomalies (``"etkf"`` only).
         taper: localisation: factors on the covariances of state and observation ``[S, O]`` and of the observations
@@ -172,7 +172,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         return factor
 
     def move_past(self, past, predicted, observation, variance, observed=None, *, noise=None):
-        """Overrides :meth:`Update.move_past`; neither inflation nor relaxation touches the past."""
+        """Overrides :meth:`Update.move_past`; neither inflation nor relaxation touches the lag window."""
         center = None
         if self.space is not None:
             center = self.space.near(past.movedim(-3, -2)).unsqueeze(-3)  # of each time

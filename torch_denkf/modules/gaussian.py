@@ -29,7 +29,7 @@ class GaussianTransitionKeys(TypedDict, total=False):
         belief_prefix: prefix of ``mean`` ``[*B, S]`` and ``cov`` ``[*B, S, S]`` of the last analysis; ``"belief"`` by
             default.
         forecast_prefix: prefix of ``mean`` and ``cov`` of the forecast, ``"forecast"`` by default.
-        ensemble_key: what the transition reads, ``("belief", "ensemble")`` by default.
+        ensemble_key: the inputs of the transition, ``("belief", "ensemble")`` by default.
         forecast_ensemble_key: what it writes, ``("forecast", "ensemble")`` by default.
         space: in which the state lives; ``None`` by default, for plain numbers. Covariances and Q are of tangents.
     """
@@ -243,7 +243,7 @@ class GaussianAnalysis(Update):
         return written[self.predicted_key], self.mask_of(entries, written)
 
     def mask_of(self, entries: Entries, written: Entries) -> torch.Tensor | None:
-        """Returns the mask of what the observation model was given, and of what it wrote."""
+        """Returns the mask of the observation model, combined with the given one."""
         given, made = entries.get(self.observed_key), written.get(self.observed_key)
         return narrowed_mask(self.reading_space, given if made is None else made if given is None else made & given)
 

@@ -203,7 +203,7 @@ class KalmanAnalysis(Update):
         reading_space: in which the reading lives, one of numbers and angles such as ``Euclidean(1) * Circle()``;
             ``None`` for plain numbers.
         observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used; in a filter
-            these stand under a key whose last name is ``"ensemble"``.
+            these are stored under a key whose last name is ``"ensemble"``.
         noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``, where ``noise`` is ``None``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         forecast_prefix: prefix of ``mean`` and ``cov`` of the forecast.

@@ -29,7 +29,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
     kept; S local systems, E x E each, are solved ``tile`` at a time.
 
     ``nis`` and ``log_likelihood`` take each observation by itself, with the variance of its own forecast plus R: the
-    correlations that E members show between observations are what localisation does not believe. The expectation of
+    localisation suppresses the sample correlations of E members between observations. The expectation of
     ``nis`` is the number of observations, if the filter is consistent.
 
     Args:

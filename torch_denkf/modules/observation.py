@@ -56,7 +56,7 @@ class LearnedObservation(MemberNetwork):
         return self._run(self.features(ensemble), noise)
 
     def features(self, state: torch.Tensor) -> torch.Tensor:
-        """Returns what the network reads, ``[*, S]``."""
+        """Returns the network's inputs, ``[*, S]``."""
         state = state if self.loc is None else state - self.loc
         return state if self.scale is None else state / self.scale
 

@@ -69,9 +69,8 @@ class ResampledTransition(Transition):
     Only frames that are observed change weights, so that only in front of those there is something to resample; over
     missing frames particles and weights go on as they are.
 
-    A particle that the motion throws out of the numbers (so far that its cube would leave the precision) loses its
-    weight to the others, and goes on next to the heaviest. ``"transport"`` averages particles: one that runs away while
-    it has weight takes the others with it.
+    A particle that diverges (so far that its cube overflows) loses its weight to the others, and is moved to the
+    heaviest one. ``"transport"`` averages particles, so a diverging particle with weight displaces the others.
 
     Args:
         transition: forecasts an ensemble, ``("belief", "ensemble")`` to ``("forecast", "ensemble")``; its keys are
@@ -152,7 +151,7 @@ class ResampledTransition(Transition):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Names one uniform number, where the scheme needs it; for a jitter normal ones, too."""
+        """Declares one uniform number for schemes that need it, and normal numbers for a jitter."""
         if self.scheme not in ("systematic", "soft"):
             return ()
         return ("uniform", "normal") if self.jitter else ("",)

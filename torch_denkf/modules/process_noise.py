@@ -167,7 +167,7 @@ class NoiseThrough(Wrapper):
         return {**written, self.out_keys[0]: scaled @ matrix.mT}
 
     def unmapped(self, entries: Entries, call: Call) -> tuple[Entries, torch.Tensor]:
-        """Returns what the noise module inside writes, and G."""
+        """Returns the outputs of the noise module inside, and G."""
         written = self.run_inside(entries, call)
         noise = written[self.out_keys[0]]
         matrix = self._matrix(entries).to(noise.dtype)

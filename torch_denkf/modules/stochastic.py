@@ -193,7 +193,7 @@ class StochasticMLP(nn.Module):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Names the tensors that one call needs, see :class:`torch_denkf.modules.SubModel`."""
+        """Declares the noise tensors that one call needs, see :class:`torch_denkf.modules.SubModel`."""
         if not self.noise_size or not self.sample:
             return ()
         return ("",) if self.layer == "dropout" else ("signs", "perturbation")
@@ -273,7 +273,7 @@ class StochasticMLP(nn.Module):
         return jacobian_of_layers(layers, x, size, (nn.Linear, FlipoutLinear))
 
     def _perturbation_sizes(self) -> list[int]:
-        """Numbers of perturbed weights and biases; those of flipout's layers."""
+        """Returns numbers of perturbed weights and biases; those of flipout's layers."""
         return [layer.perturbation_size for layer in self.layers if isinstance(layer, FlipoutLinear)]
 
     def _flipout(self, noise: Mapping[str, torch.Tensor]) -> list[tuple[Callable[..., torch.Tensor], None]]:

@@ -76,7 +76,7 @@ def register_matrix(
 
 
 def check_untrained(name: str, value: Any, why: str) -> None:
-    """Raises where what is kept as a constant asks for a gradient: it would be accepted and never trained.
+    """Raises if a constant requires a gradient: it would be accepted and never trained.
 
     Raises:
         ValueError: if it does; ``name`` is the argument's.
@@ -109,7 +109,7 @@ def register_location_and_scale(
 
 
 def as_standard_deviations(name: str, value: Any) -> Tensor:
-    """Returns standard deviations ``[N]``, zero where there is none.
+    """Returns standard deviations ``[N]``, zero if there is none.
 
     Raises:
         ValueError: if they have another shape, or one is negative or not finite.
@@ -153,7 +153,7 @@ def check_dims(name: str, dims: Sequence[int], size: int | None = None, *, once:
 def variance_and_floor(
     owner: str, size: int, r: Tensor | Sequence[float] | float, floor: Tensor | Sequence[float] | float | None
 ) -> tuple[Tensor, Tensor]:
-    """Splits variances before training into what is above the floor, :math:`r^2 - c`, and the floor c, both ``[size]``.
+    """Splits initial variances into the part above the floor, :math:`r^2 - c`, and the floor c, both ``[size]``.
 
     Args:
         owner: who asks, for the message.
@@ -176,7 +176,7 @@ def mask_of(observed_key: NestedKey, out_key: NestedKey) -> dict[NestedKey, Nest
     """Maps a mask that a module derives to the mask that it derives it from, unravelled.
 
     Raises:
-        ValueError: if both have one key: what a step wrote would be taken for what was observed in the next.
+        ValueError: if both have one key: the outputs of a step would be taken for what was observed in the next.
     """
     given, made = unravel_key(observed_key), unravel_key(out_key)
     if given == made:

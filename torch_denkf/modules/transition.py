@@ -100,7 +100,7 @@ class LearnedTransition(MemberNetwork, Transition):
         return self._moved(state, self._run(self.features(state, action), noise), action, dt)
 
     def features(self, state: torch.Tensor, action: Any) -> torch.Tensor:
-        """Returns what the network reads, ``[*B, E, S]`` or ``[*B, E, S + A]``, of states and an action."""
+        """Returns the network's inputs, ``[*B, E, S]`` or ``[*B, E, S + A]``, from states and an action."""
         features = state if self.loc is None else state - self.loc
         features = features if self.scale is None else features / self.scale
         if self.action_key is None:

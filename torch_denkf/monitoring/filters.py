@@ -23,7 +23,7 @@ __all__ = ["Gated", "Monitored"]
 
 
 class Monitored(Filter):
-    """A filter with a monitor behind its analyses: next to the belief it writes an alarm, and what speaks for it.
+    """A filter with a monitor behind its analyses, which writes an alarm and its evidence next to the belief.
 
     It is a :class:`Filter` itself: steps, sequences, masks, resets, policies, transforms, replay buffers and compiled
     steps work as with any other. The belief is that of the filter, bit for bit. The modules are the filter's own, not
@@ -91,7 +91,7 @@ class Monitored(Filter):
 
 
 class Gated(Filter):
-    """A filter whose analyses believe a reading as far as its last innovations deserve it.
+    """A filter that gates each reading by its last normalised innovations.
 
     Each analysis becomes a :class:`~torch_denkf.monitoring.GatedAnalysis`, in its place. The filter is a
     :class:`Filter` itself, like :class:`Monitored`, which goes around this one: ``Monitored(Gated(filter), monitor)``,
@@ -110,7 +110,7 @@ class Gated(Filter):
     Raises:
         TypeError: if the filter has no analysis that can be gated.
         ValueError: if the number of components is not known, an option is out of range, or ``adapt_inflation`` is asked
-            of a filter that observes states of the past, a :class:`FusedFilter` with a delay.
+            of a filter that observes states of the lag window, a :class:`FusedFilter` with a delay.
 
     Example:
         >>> import torch
@@ -190,7 +190,7 @@ class Gated(Filter):
 
 
 def _with_past(part: torch.nn.Module) -> bool:
-    """Returns True if a module observes states of the past, or present and past as one."""
+    """Returns True if a module observes states of the lag window, or present and past as one."""
     return isinstance(part, StateObservation) and part.state_dim is not None
 
 

@@ -33,20 +33,20 @@ class GateOptions(TypedDict, total=False):
     Attributes:
         response: what happens to an outlier: ``"reject"`` takes it out, ``"student"`` and
             ``"huber"`` enlarge its variances, see :func:`~torch_denkf.monitoring.gating.disbelief`; ``"student"`` by
-            default. ``"reject"`` may take surprising motions for faults, and the belief then runs away.
+            default. ``"reject"`` may mistake large motions for faults, after which the belief diverges.
         window: observed steps whose normalised innovations squared are summed up; 3 by default.
-        rate: probability that the sum of a sound sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
-            acts.
+        rate: false-alarm rate, the probability that a fault-free sensor exceeds its limit; 1e-3 by default. 0 turns
+            the gate off.
         freedom: of Student's t; 4 by default.
         patience: after so many steps in a row at which a reading was rejected the gate opens: the forecast, and the
-            past states that are carried next to it, are spread until they reach the reading, and the window is emptied.
-            Set more than the longest fault has readings; 50 by default.
+            states of the lag window that are carried next to it, are spread until they reach the reading, and the
+            window is emptied. Set more than the longest fault has readings; 50 by default.
         by_component: whether each component of the reading is judged by itself; for ensembles alone, False by default.
         adapt_noise: rate at which the reading's variances are adapted to its innovations, about the inverse of the
             steps that are remembered; 0 by default, for none.
         adapt_inflation: rate at which the forecast's spread is adapted to the innovations, never below its own;
-            likewise. It acts where a reading is used: the forecast alone, not the past. Innovations tell that something
-            is too small, not what: use one of the two.
+            likewise. It acts where a reading is used: the forecast alone, not the lag window. Innovations tell that
+            something is too small, not what: use one of the two.
         gate_prefix: prefix of the state, ``"gate"`` by default.
     """
 
@@ -273,7 +273,7 @@ class GatedAnalysis(Around):
         return {**out, **dict(zip((*self.state_keys, *self._further), own, strict=True))}
 
     def _analyse(self, entries: Entries, call: Call) -> Entries:
-        """Returns what the analysis writes; an ensemble's predictions and reading are plain numbers already."""
+        """Returns the outputs of the analysis; an ensemble's predictions and reading are plain numbers already."""
         return (self.module.on_aligned if self.of_ensemble else self.module.on_entries)(entries, call)
 
     def _with_noise(self, entries: Entries, call: Call) -> Entries:
@@ -323,8 +323,8 @@ class GatedAnalysis(Around):
         """Takes the distribution of the innovations, and of their windows, from clean data.
 
         Args:
-            clean: recordings ``[*B, T]``, time last, of ``(gate_prefix, "part_nis")``: what the filter wrote while the
-                gate did nothing.
+            clean: recordings ``[*B, T]``, time last, of ``(gate_prefix, "part_nis")``: the outputs of the filter while
+                the gate did nothing.
             margin: factor on the limits.
 
         Returns:

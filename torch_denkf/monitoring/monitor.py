@@ -61,7 +61,7 @@ class MonitoredSensor(NamedTuple):
 
 
 class InnovationMonitor(SubModel):
-    r"""Are a sensor's innovations what the filter expects of them? Tests for each sensor, and one alarm.
+    r"""Tests the consistency of each sensor's innovations with the filter, and raises one alarm.
 
     * The *normalised innovation squared* :math:`d^T S^{-1} d`, summed over a window of observed steps: a chi-square
       variable while the filter is right.
@@ -75,8 +75,8 @@ class InnovationMonitor(SubModel):
     Each is compared with its own distribution. A real filter's innovations are distributed more widely than in theory:
     members are few, models wrong and errors slow. :meth:`calibrate` takes the distributions from clean data.
 
-    The monitor keeps nothing on itself. Its state lies under ``(monitor_prefix, sensor, ...)`` and goes on from step to
-    step where :class:`~torch_denkf.monitoring.Monitored` puts the monitor into a filter. A step at which a sensor is
+    The monitor is stateless: its state is under ``(monitor_prefix, sensor, ...)`` and is carried from step to step
+    where :class:`~torch_denkf.monitoring.Monitored` puts the monitor into a filter. A step at which a sensor is
     not observed leaves its entries as they are.
 
     ============================== ========= ===========================================================================
@@ -214,7 +214,7 @@ class InnovationMonitor(SubModel):
         return dict(zip(keys, values, strict=True))
 
     def claim_score(self, name: str, noise: Tensor) -> Tensor:
-        """Returns the standard normal score of what a sensor claims its variances to be ``[*B, O]``, ``[*B, 1]``.
+        """Returns the standard normal score of a sensor's claimed variances ``[*B, O]``, ``[*B, 1]``.
 
         It is that of the mean logarithm, among those of the clean data that the monitor was calibrated on.
         """
@@ -268,9 +268,9 @@ class InnovationMonitor(SubModel):
         stricter.
 
         Args:
-            clean: recordings ``[*B, T]``, time last: what a filter wrote, with the entries that the monitor reads; an
-                episode begins at the first step, and where ``is_init`` says so. To know a limit takes about ten times
-                as many steps as lie between two false alarms.
+            clean: recordings ``[*B, T]``, time last: the outputs of a filter, with the entries that the monitor reads;
+                an episode begins at the first step, and where ``is_init`` says so. To know a limit takes about ten
+                times as many steps as lie between two false alarms.
             margin: factor on the limits, where the data are fewer or less varied than what will come.
 
         Returns:
@@ -324,7 +324,7 @@ class InnovationMonitor(SubModel):
 
     @torch.no_grad()
     def replay(self, recorded: TensorDictBase) -> TensorDictBase:
-        """Returns the monitor's entries on what a filter has written before, ``[*B, T]``, time last."""
+        """Returns the monitor's entries from a filter's outputs ``[*B, T]``, time last."""
         batch, entries = recorded.batch_size[:-1], _entries(recorded)
         read = [key for key in (*self.in_keys, *self.optional_keys, "is_init") if key not in self.state_keys]
         rows = recorded.select(*(key for key in read if key in entries)).unbind(-1)

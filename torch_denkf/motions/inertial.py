@@ -29,7 +29,7 @@ __all__ = ["AttitudeMotion", "InertialMotion", "move_inertially"]
 
 
 class InertialMotion(Motion):
-    r"""Orientation, velocity and position, moved by what a gyro and an accelerometer read: inertial navigation.
+    r"""Inertial navigation: orientation, velocity and position, driven by gyro and accelerometer.
 
     The state is a point of ``Product(SE23(), Euclidean(3), Euclidean(3))``, 16 numbers: orientation, velocity in m/s
     and position in m, both in the world's axes; then what the gyro reads too much, in rad/s, and the accelerometer, in
@@ -127,7 +127,7 @@ class InertialMotion(Motion):
 
 
 class AttitudeMotion(Motion):
-    r"""An orientation, moved by what a gyro reads: :math:`R' = R \exp((\omega - b) \Delta t)`.
+    r"""Motion of an orientation driven by a gyro: :math:`R' = R \exp((\omega - b) \Delta t)`.
 
     The state is a point of ``Product(SO3(), Euclidean(3))``, 7 numbers: the orientation, and what the gyro reads too
     much, in rad/s. The tangent has 6 numbers. See :class:`InertialMotion` for velocity and position, and for what a

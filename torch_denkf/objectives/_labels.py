@@ -67,7 +67,7 @@ class Reading(NamedTuple):
         samples: its key.
         observed: its mask.
         noise: its R.
-        model: module that predicts it, with an ``observe()`` method; ``None`` where there is none.
+        model: module that predicts it, with an ``observe()`` method; ``None`` if there is none.
     """
 
     samples: NestedKey = ("sensor", "ensemble")
@@ -103,7 +103,7 @@ class Labels(NamedTuple):
     """True values, as far as they are known and count.
 
     Attributes:
-        values: ``[*B, N]``; zero where there is no label. Points ``[*B, P]`` of a space, neutral where there is none.
+        values: ``[*B, N]``; zero where there is no label. Points ``[*B, P]`` of a space, neutral if there is none.
         mask: ``[*B, N]``, True where there is one. N are the tangents' components of a space.
         dims: of the N components those that count.
         scale: ``[N]``, finite, by which errors are divided; ``None`` for one.
@@ -184,7 +184,7 @@ class Labels(NamedTuple):
 
 
 class Targets:
-    """Holds the labels of a batch that terms are scored against, and what the filter wrote.
+    """Holds the labels of a batch, against which terms are scored, and the filter's outputs.
 
     Args:
         loss: whose names of entries, dimensions, scales and spaces count.
@@ -230,7 +230,7 @@ class Targets:
         return labels if mask is None else labels._replace(mask=labels.mask & mask.any(-1, keepdim=True))
 
     def whole_state(self) -> Labels:
-        """Returns the true state for what reads all of it; ``mask`` ``[*B, 1]`` says where that is known.
+        """Returns the true state for models that read all of it; ``mask`` ``[*B, 1]`` marks where it is known.
 
         Raises:
             ValueError: if the labels lack dimensions.
@@ -247,7 +247,7 @@ class Targets:
         return labels._replace(mask=labels.mask.all(-1, keepdim=True))
 
     def observed_state(self, observe: Callable[[Tensor], Tensor]) -> Tensor:
-        """Observes the true state by a model; what it makes of NaN is NaN: no label."""
+        """Applies an observation model to the true state; NaN results are no labels."""
         # The components of a space are those of tangents: its points are whole.
         values, dims = self.entry(self.keys.state, given=True), self.loss.dims if is_flat(self.loss.space) else None
         size = max(self.state_size() or 0, values.shape[-1], 1 + max(dims or [0]))
@@ -279,7 +279,7 @@ class Targets:
         return Labels(points if flat else on.normalise(points), mask & counting, dims, space=space)
 
     def _known(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None) -> Tensor:
-        """Returns labels ``[*B, N]`` in the places of their components, ``[*B, size]``, NaN where there is none.
+        """Returns labels ``[*B, N]`` in the places of their components, ``[*B, size]``, NaN if there is none.
 
         They are of the leading N components; or of ``dims``, in their order, where that is N components of which the
         last are beyond the first N.
@@ -346,7 +346,7 @@ def mask_of(key: NestedKey) -> NestedKey:
 
 
 def mean_of(values: Tensor, mask: Tensor) -> Tensor:
-    """Returns the mean over the last dimension of what a mask leaves in, ``[*]``; zero of nothing.
+    """Returns the masked mean over the last dimension, ``[*]``; zero if nothing is left.
 
     Example:
         >>> mean_of(torch.tensor([1.0, 5.0]), torch.tensor([False, True]))

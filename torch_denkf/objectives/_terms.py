@@ -32,7 +32,7 @@ BELIEFS = (
 
 
 class OfBelief(Term):
-    """A term of a belief, a forecast or a smoothed belief, which stands under the ``key`` of this name."""
+    """A term of a belief, a forecast or a smoothed belief, which is stored under the ``key`` of this name."""
 
     def __init__(self, name: str, key: str, weight: float = 1.0):
         self.name, self.key = name, key
@@ -148,7 +148,7 @@ class Visible(Term):
 
 
 class Observation(Term):
-    """The squared error of what the observation model reads of the true state."""
+    """The squared error of the observation model at the true state."""
 
     name = "observation"
     of_frames = True
@@ -290,13 +290,13 @@ def score_ensemble(truth: Targets, ensemble: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def score_moments(truth: Targets, mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
-    """Scores a mean ``[*B, S]`` and a covariance ``[*B, S, S]`` against the true state, and marks what has one."""
+    """Scores a mean ``[*B, S]`` and a covariance ``[*B, S, S]`` against the true state; also returns the label mask."""
     labels = truth.state(mean.shape[-1])
     return score_gaussian(labels.errors(mean), labels.mask, cov, truth.loss.score, labels.scale), labels.rows
 
 
 def sensor_samples(truth: Targets) -> tuple[Tensor, Labels]:
-    """Returns the sensor's samples ``[*B, E, O]``, and what they should be where it observed all.
+    """Returns the sensor's samples ``[*B, E, O]``, and their targets in observed rows.
 
     Raises:
         KeyError: if there are no samples, or no true observation.

@@ -130,7 +130,7 @@ class Term(nn.Module):
         """Returns the term's value in each element.
 
         Args:
-            out: the batch ``[*B]`` with what the filter wrote.
+            out: the batch ``[*B]`` with the outputs of the filter.
             truth: the labels: ``truth.state(S)`` and ``truth.observation(target, O)`` give true values, where they are
                 known, and errors with the loss's scales and spaces.
 
@@ -140,7 +140,7 @@ class Term(nn.Module):
         raise NotImplementedError
 
     def exists(self, loss: FilterLoss) -> bool:
-        """Tells whether there is what the term scores, for a weight of ``None``."""
+        """Tells whether the term has anything to score, for a weight of ``None``."""
         return True
 
 
@@ -301,7 +301,7 @@ class FilterLoss(Checked, LossModule):
     # ------------------------------------------------------------------------ what a loss of a part has otherwise
 
     def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns the batch with what the filter, or its part, writes."""
+        """Returns the batch with the outputs of the filter, or of its part."""
         self.filter.observe(Record("data", tensordict, tensordict.batch_size, {}, {}))
         return self.filter.inside(self._filters().sequence(tensordict.copy(), detach_every=self.detach_every))
 

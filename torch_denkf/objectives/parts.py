@@ -32,7 +32,7 @@ __all__ = ["ObservationLoss", "SensorLoss", "TransitionLoss"]
 
 
 class ObservationLoss(FilterLoss):
-    r"""Scores what a filter's observation model reads of true states, ``[*B]``.
+    r"""Scores a filter's observation model on true states, ``[*B]``.
 
     Its term ``loss_observation`` is the squared error of :math:`h_\psi(x_t)` against the true observation, the term of
     that name in :class:`~torch_denkf.objectives.DEnKFLoss`. The parameters of the loss are those of the model.

@@ -179,7 +179,7 @@ def entry_of(source: TensorDictBase | Tensor, value: Any, default: str) -> Any:
 
 
 def _to_rows_of_states(parts: dict[str, Tensor], age: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-    """Moves what row t says of the state of t - age to that state's row, from the latest row that says something of it.
+    """Moves the smoothed entries of row t to the row of their time, t - age; later rows have priority.
 
     Returns:
         The parts, NaN where no row says anything, and where any does, ``[*B]``.
@@ -196,7 +196,7 @@ def _to_rows_of_states(parts: dict[str, Tensor], age: Tensor) -> tuple[dict[str,
 
 
 def _summarise(parts: dict[str, Tensor], space: Space | None) -> dict[str, Tensor]:
-    """Adds mean and variance where they follow from what is there."""
+    """Adds mean and variance if they can be computed."""
     if space is not None:
         space.check(**{name: parts[name] for name in ("mean", "ensemble") if name in parts})
     ensemble, weight, cov = parts.get("ensemble"), parts.get("log_weight"), parts.get("cov")

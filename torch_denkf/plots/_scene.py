@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Scene:
-    """The figure of a video: everything is drawn once, and each frame shows what has happened until then."""
+    """Figure of a video: everything is drawn once, and each frame shows the data until its time."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Scene:
             figure.suptitle(title)
 
     def freeze(self, seen: Tensor | None, seconds: np.ndarray) -> None:
-        """Fixes layout and limits, and draws once what stands still, with the bands and without."""
+        """Fixes layout and limits, and draws the static parts once, with and without the bands."""
         self.seen, self.bounds = seen, step_bounds(seconds)
         if self.camera is not None:  # a path that is drawn on it stretches nothing
             height, width = self.image.get_size()
@@ -145,7 +145,7 @@ class Scene:
         return picture
 
     def _uncover(self, picture: np.ndarray, axes: Axes, until: float) -> None:
-        """Copies into the picture what is drawn in the Axes at the left of ``until``."""
+        """Copies the drawing in the Axes left of ``until`` into the image."""
         box, height = axes.get_window_extent(), len(picture)
         right = min(axes.transData.transform((until, 0))[0], box.x1)
         rows, columns = slice(round(height - box.y1), round(height - box.y0)), slice(round(box.x0), round(right))

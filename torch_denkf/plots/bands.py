@@ -1,4 +1,4 @@
-"""Components of a belief over time, with the band that should hold the truth."""
+"""Components of a belief over time, with a credible band."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def plot_bands(
             the ensemble where its members have equal weights and are enough for ``level``.
         space: whose points the states are; ``None`` for plain numbers. Components are then those of tangents, with
             angles, and roll, pitch and yaw of a quaternion, in degrees, between -180 and 180: a line that leaves at one
-            end goes on at the other. ``readings`` of angles are in rad.
+            end continues at the other. ``readings`` of angles are in rad.
         legend: whether to add one above the first Axes.
         ax: as many Axes as components; ``None`` makes a figure.
 
@@ -206,7 +206,7 @@ def _unwrap(angle: Tensor) -> Tensor:
 
 
 def _turns(drawn: Sequence[Tensor | None], column: int) -> list[int]:
-    """Returns the turns, 0 from -pi to pi, of unwrapped angles: of what is drawn, ``[T, K]`` each, in a column."""
+    """Returns the turns that a column of unwrapped angles ``[T, K]`` covers; turn 0 is -pi to pi."""
     values = torch.cat([value[:, column] for value in drawn if value is not None])
     values = values[values.isfinite()]
     if not len(values):

@@ -18,7 +18,7 @@ __all__ = ["draw_log"]
 def draw_log(
     steps: Mapping[str, np.ndarray], changes: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
 ) -> Figure:
-    """Draws the time steps of each stream, and what several streams know.
+    """Draws the time steps of each stream, and quantities that several streams share.
 
     Args:
         steps: times of the readings by stream, s.

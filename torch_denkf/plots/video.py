@@ -28,7 +28,7 @@ def write_video(file: str | Path, frames: Iterable[Tensor | np.ndarray], fps: fl
         file: ``.mp4`` is written by OpenCV as MPEG-4, ``.gif`` by pillow with 256 colours a frame. Its folder is made.
         frames: pictures of one size, ``[H, W]``, ``[H, W, C]`` or ``[C, H, W]``, uint8 or floats in [0, 1]; see
             :func:`belief_video` for C. Odd heights and widths of an MP4 grow by one row or column.
-        fps: frames a second; at most 50 for a GIF, whose times are hundredths of a second.
+        fps: frames per second; at most 50 for a GIF, whose times are hundredths of a second.
 
     Returns:
         The file.
@@ -95,7 +95,7 @@ def belief_video(
             pixels from the middle of the upper left one: the column to the right, then the row downwards.
         bands: keywords of :func:`plot_bands`, such as ``{"dims": [3, 4]}``; ``None`` leaves them out.
         title: headline.
-        fps: frames a second; by default those of the sequence's own speed, 10 where ``time`` is not given.
+        fps: frames per second; by default those of the sequence's own speed, 10 where ``time`` is not given.
         every: draw every n-th step; the default of ``fps`` follows.
         size: of a frame, width and height in inches.
         dpi: pixels an inch.
@@ -146,7 +146,7 @@ def _panel_count(bands: Mapping[str, Any] | None, state_dim: int) -> int:
 
 
 def _own_speed(time: float | Tensor | None, every: int) -> float:
-    """Returns frames a second at which the sequence goes by as fast as it did."""
+    """Returns frames per second at which the sequence goes by as fast as it did."""
     if time is None:
         return 10.0 / every
     dt = float(torch.as_tensor(time).flatten().diff().median()) if isinstance(time, Tensor) else time

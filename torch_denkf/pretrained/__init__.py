@@ -1,4 +1,4 @@
-"""Trained filters that come with the library, and folders of your own: weights as data, built from plain numbers."""
+"""Trained pretrained filters, and folders of your own: weights as data, built from plain numbers."""
 
 import lazy_loader
 

@@ -17,7 +17,7 @@ __all__ = ["available", "from_pretrained", "save_pretrained"]
 
 
 def available() -> list[str]:
-    """Names of the filters that come with the library, for :func:`from_pretrained`.
+    """Returns names of the pretrained filters, for :func:`from_pretrained`.
 
     Example:
         >>> available()

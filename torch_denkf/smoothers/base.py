@@ -19,12 +19,12 @@ __all__ = ["Smoother"]
 
 
 class Smoother(Checked, TensorDictModuleBase):
-    """Filters a sequence ``[*B, T]``, then says what each state looks like given what came later.
+    """Filters a sequence ``[*B, T]``, then corrects each state by the later readings.
 
     It writes all that the filter writes, and ``("smoothed", "mean")`` and ``("smoothed", "var")`` ``[*B, T, S]``, with
     ``("smoothed", "cov")`` or ``("smoothed", "ensemble")`` where there is one. At a time t that is the belief of the
     state *of t*, given the readings up to t + lag. (:class:`FixedLag` writes at t the belief of t - lag.) Nothing
-    flows back over the border of an episode or a slice: those that :meth:`Filter.sequence` heeds. The gradient flows
+    flows back over the border of an episode or a slice: those that :meth:`Filter.sequence` uses. The gradient flows
     through filter and smoother.
 
     A subclass writes :meth:`_smooth`, and :meth:`_extended` where the filter must say more than it does by itself.
@@ -59,7 +59,7 @@ class Smoother(Checked, TensorDictModuleBase):
     def sequence(
         self, tensordict: TensorDictBase, *, detach_every: int | None = None, keep: Sequence[NestedKey] | None = None
     ) -> TensorDictBase:
-        """Filters and smooths ``[*B, T]``; takes what :meth:`Filter.sequence` takes.
+        """Filters and smooths ``[*B, T]``; its arguments are those of :meth:`Filter.sequence`.
 
         Args:
             tensordict: frames, see there.
@@ -97,7 +97,7 @@ class Smoother(Checked, TensorDictModuleBase):
     def _filter_for(self, count: int) -> Filter:
         """Returns the filter that runs on sequences of ``count`` steps; made again where a module has been replaced."""
         own = self.lag if self.lag is not None else max(count - 1, 1)
-        lag = own if self._by_lag else None  # another filter would compile anew
+        lag = own if self._by_lag else None  # another filter would compile again
         if self._running[0] != lag or self._running[1] is not self.filter.structure:
             self._running = (lag, self.filter.structure, self._extended(lag))
         filter, compiled = self._running[2], self.filter.compiled
@@ -106,14 +106,14 @@ class Smoother(Checked, TensorDictModuleBase):
         return filter
 
     def _extended(self, lag: int | None) -> Filter:
-        """Returns the filter, or one of the same modules that also writes what the smoother needs."""
+        """Returns the filter, or one of the same modules that also writes the smoother's inputs."""
         return self.filter
 
     def _smooth(self, entries: Entries, follows: Tensor, out: TensorDictBase) -> tuple[Tensor, ...]:
         """Returns the smoothed belief, in the order of ``smoothed_keys``.
 
         Args:
-            entries: ``[*B, T, ...]``, what is read and what the filter wrote.
+            entries: ``[*B, T, ...]``, what is read and the outputs of the filter.
             follows: which elements are a step on from those before them, ``[*B, T]``; the first is not read.
             out: the same as a tensordict.
         """

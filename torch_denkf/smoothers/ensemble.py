@@ -17,7 +17,7 @@ __all__ = ["EnKS", "EnRTS"]
 
 
 class EnRTS(Smoother):
-    """Ensemble Rauch-Tung-Striebel smoother: one pass back over what the filter wrote.
+    """Ensemble Rauch-Tung-Striebel smoother: one pass back over the outputs of the filter.
 
     The gain of each step back is a regression of members on their own forecasts. It asks nothing of the analysis, and
     costs about as much as the filter's analysis. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, ``mean`` and
@@ -82,10 +82,10 @@ class EnRTS(Smoother):
 
 
 class EnKS(Smoother):
-    """Ensemble Kalman smoother: each analysis corrects the members of the past L steps, too.
+    """Ensemble Kalman smoother: each analysis corrects the members of the lag window L steps, too.
 
-    It is :class:`FixedLag`, put into the order of a recording. Random rotations of the members turn the past as well,
-    so that pairs stay pairs. Where the lag is that of the whole sequence, memory grows with its square: take
+    It is :class:`FixedLag`, put into the order of a recording. Random rotations of the members turn the lag window as
+    well, so that pairs stay pairs. Where the lag is that of the whole sequence, memory grows with its square: take
     :class:`EnRTS` for long recordings. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, ``mean`` and ``var``,
     see :class:`Smoother`.
 

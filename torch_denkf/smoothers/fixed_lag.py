@@ -28,14 +28,14 @@ class FixedLag(Filter):
     =====================  ========================================================================  ==================
     belief                 smoother                                                                  further entries
     =====================  ========================================================================  ==================
-    ensemble               ensemble Kalman smoother: each analysis corrects the past's members, too  ``ensemble``
+    ensemble               ensemble Kalman smoother: each analysis also corrects the lag window      ``ensemble``
     mean and covariance    Rauch-Tung-Striebel, forward in time                                      ``cov``
     particles              their ancestors, with the present weights (Kitagawa 1996)                 ``ensemble``
     =====================  ========================================================================  ==================
 
     It is a :class:`~torch_denkf.filters.Filter` itself: steps, sequences, masks, resets, policies, transforms, replay
-    buffers and compiled steps work as with any other, and the gradient goes through it. The past is part of what it
-    carries. Its modules are the filter's own, not copies. To smooth recordings, where what is later is there already,
+    buffers and compiled steps work as with any other, and the gradient goes through it. The lag window is part of what
+    it carries. Its modules are the filter's own, not copies. To smooth recordings, where what is later is set already,
     use :class:`EnKS`, :class:`EnRTS`, :class:`RTSSmoother` or :class:`ParticleSmoother`.
 
     Args:
@@ -155,7 +155,7 @@ def prefix_of(filter: Filter, kind: str, owner: object) -> str:
 
 
 def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> OrderedDict[str, TensorDictModuleBase]:
-    """Modules whose analyses correct the past, too; also those inside plain sequences.
+    """Modules whose analyses correct the lag window, too; also those inside plain sequences.
 
     Raises:
         TypeError: if there is no analysis of an ensemble among them, or one that cannot.

@@ -23,11 +23,11 @@ from torch_denkf.submodel import Call, Entries
 
 __all__ = ["ParticleSmoother"]
 
-_STILL = 1e-12  # variance in the place of none
+_STILL = 1e-12  # variance instead of none
 
 
 class ParticleSmoother(Smoother):
-    r"""Backward weights of a particle filter: the particles stay, those that lead to what came later count for more.
+    r"""Backward smoothing of particles: particles stay, and ancestors of likely later particles gain weight.
 
     It needs the density of the motion, :math:`p(x_{t+1} | x_t)`, and so a
     :class:`~torch_denkf.modules.NoisyTransition` with noise in every dimension, added after a motion that is

@@ -4,7 +4,7 @@ r"""A filter that also carries its last L states, which each new reading correct
 
     transition -- past (moves on by one) -- observation, analysis (of present and past) -- lagged belief
 
-The past of the first steps of an episode is the episode's first state.
+In the first steps of an episode the lag window holds the episode's first state.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torch_denkf.submodel import Entries, Initial, SubModel, Update, role
 __all__ = ["ENSEMBLE_PAST", "EnsemblePast", "LaggedAnalysis", "LaggedBelief", "Past", "lagged", "with_past"]
 
 
-#: The pasts of the members on their way through a step, and how old what is smoothed is.
+#: Keys of the members' lag window within a step, and of the age of the smoothed state.
 PAST_KEY, AGE_KEY = ("forecast", "past"), ("smoothed", "age")
 
 
@@ -51,7 +51,7 @@ class Past(NamedTuple):
 def with_past(
     initial: TensorDictModuleBase, lag: int, past: Past, *, age: int = 0, belief_prefix: str = "belief"
 ) -> AugmentedBelief:
-    """Returns an initial belief with a past: L copies of its state.
+    """Returns an initial belief with a lag window: L copies of its state.
 
     Args:
         initial: the initial belief.
@@ -59,7 +59,7 @@ def with_past(
         past: ``ENSEMBLE_PAST``, ``MOMENTS_PAST`` or ``JOINT_PAST``.
         age: steps between the first belief of an episode and the first state: 0, or -1 where that belief is yet to be
             updated with its own frame.
-        belief_prefix: prefix of what ``initial`` writes, and of the past.
+        belief_prefix: prefix of the outputs of ``initial``, and of the lag window.
 
     Raises:
         ValueError: if ``lag`` is not positive.
@@ -96,12 +96,12 @@ def _oldest(prefix: str, lag: int, entries: Entries, *, space: Space | None = No
     return ensemble, *moments_of(ensemble, entries.get((prefix, "log_weight")), space)
 
 
-#: The members of the past, ``[*B, E, L, S]``, the latest first, of an ensemble or of particles with log-weights.
+#: The members of the lag window, ``[*B, E, L, S]``, the latest first, of an ensemble or of particles with log-weights.
 ENSEMBLE_PAST = Past(("past",), ("ensemble", "mean", "var"), _copies, _oldest)
 
 
 class EnsemblePast(SubModel):
-    """The past moves on by one step: the last belief becomes its latest state, the oldest is forgotten.
+    """Moves the lag window on by one step: the last belief becomes its latest state, the oldest is dropped.
 
     Args:
         belief_prefix: prefix of ``ensemble`` ``[*B, E, S]`` and ``past`` ``[*B, E, L, S]``, the latest first.
@@ -117,14 +117,14 @@ class EnsemblePast(SubModel):
         super().__init__(nn.Identity(), [(belief_prefix, "ensemble"), (belief_prefix, "past")], [PAST_KEY])
 
     def compute(self, ensemble, past):
-        """Returns the past."""
+        """Returns the lag window."""
         return torch.cat([ensemble.unsqueeze(-2), past[..., :-1, :]], -2)
 
 
 class LaggedAnalysis(Around):
-    """An analysis that corrects the past with the same reading, by the past's covariance with the prediction.
+    """Corrects the lag window with the same reading, by its covariance with the predicted observation.
 
-    It is the ensemble Kalman smoother (Evensen & van Leeuwen 2000). The past is neither inflated nor relaxed.
+    It is the ensemble Kalman smoother (Evensen & van Leeuwen 2000). The lag window is neither inflated nor relaxed.
 
     Args:
         analysis: :class:`EnsembleAnalysis`, :class:`LocalEnsembleAnalysis`, or one of your own that updates an
@@ -158,7 +158,7 @@ class LaggedAnalysis(Around):
     updates_ensemble = True
 
     def on_entries(self, entries, call):
-        """Returns the belief, the diagnostics, and the past."""
+        """Returns the belief, the diagnostics, and the lag window."""
         return self.on_aligned(self.aligned(entries), call)
 
     def aligned(self, entries):
@@ -175,7 +175,7 @@ class LaggedAnalysis(Around):
 
 
 def lagged(analysis: Update) -> Update:
-    """Extends an analysis to correct the past, too; inside of what goes around it, such as a gate.
+    """Extends an analysis to correct the lag window, too; inside of wrappers such as a gate.
 
     Raises:
         TypeError: if it does not say what it does to other states.
@@ -210,7 +210,7 @@ class LaggedBelief(SubModel):
         self.space = space
 
     def compute(self, past, age, log_weight=None):
-        """Returns the past, and the belief of its oldest state."""
+        """Returns the lag window, and the belief of its oldest state."""
         check_age(age, past.shape[:-3])
         ensemble = past[..., -1, :]
         return past, ensemble, *moments_of(ensemble, log_weight, self.space), (age + 1).clamp(max=past.shape[-2])

@@ -86,15 +86,15 @@ def _oldest(cov: torch.Tensor, past_mean, past_cov, past_gain) -> tuple[torch.Te
     return past_mean[..., -1, :], smoothed, smoothed.diagonal(dim1=-2, dim2=-1)
 
 
-#: Means ``[*B, L, S]`` of the past, and V and D of above, ``[*B, L, S, S]``, the latest first.
+#: Means ``[*B, L, S]`` of the lag window, and V and D of above, ``[*B, L, S, S]``, the latest first.
 MOMENTS_PAST = Past(("past_mean", "past_cov", "past_gain"), ("mean", "cov", "var"), _copies, _oldest_carried)
 
 
 class MomentsPast(SubModel):
-    """The past moves on by one step: gains and what they leave open, through the transition that has just been made.
+    """Moves the lag window on by one step: gains and residual covariances through the last transition.
 
     Args:
-        belief_prefix: prefix of ``mean`` and of the past, see ``MOMENTS_PAST``.
+        belief_prefix: prefix of ``mean`` and of the lag window, see ``MOMENTS_PAST``.
         forecast_prefix: prefix of ``cov``, ``cross`` and ``open`` of the forecast, see :class:`CrossTransition`.
     """
 
@@ -104,7 +104,7 @@ class MomentsPast(SubModel):
         super().__init__(nn.Identity(), in_keys, [("past", name) for name in ("mean", "cov", "gain")])
 
     def compute(self, mean, cov, cross, open_cov, past_mean, past_cov, past_gain, age):
-        """Returns the past."""
+        """Returns the lag window."""
         check_age(age, mean.shape[:-1])
         # At the start of an episode, before its own frame, no step has been made.
         start = (age < 0).unsqueeze(-1)
@@ -118,10 +118,10 @@ class MomentsPast(SubModel):
 
 
 class LaggedMoments(SubModel):
-    """The past after a reading, and the smoothed belief of the state L steps ago.
+    """The lag window after a reading, and the smoothed belief of the state L steps ago.
 
     Args:
-        belief_prefix: prefix of ``mean``, ``cov`` and of the past that is carried on, see ``MOMENTS_PAST``.
+        belief_prefix: prefix of ``mean``, ``cov`` and of the lag window that is carried on, see ``MOMENTS_PAST``.
         forecast_prefix: prefix of ``mean`` of the forecast.
         space: in which the state lives; ``None`` for plain numbers.
     """
@@ -135,7 +135,7 @@ class LaggedMoments(SubModel):
         self.space = space
 
     def compute(self, mean, cov, forecast, past_mean, past_cov, past_gain, age):
-        """Returns the past, and the belief of its oldest state."""
+        """Returns the lag window, and the belief of its oldest state."""
         learned = mean - forecast if self.space is None else self.space.minus(mean, forecast)
         shift = (past_gain @ learned[..., None, :, None]).squeeze(-1)
         if self.space is None:

@@ -56,7 +56,7 @@ def hold_last(
     start: torch.Tensor,
     accept: Callable[[int, torch.Tensor], torch.Tensor] | None = None,
 ) -> torch.Tensor:
-    """Holds the last reading where there is none: what a filter has to beat.
+    """Repeats the last reading (zero-order hold), a baseline for a filter.
 
     Args:
         values: readings ``[*B, T, D]``.

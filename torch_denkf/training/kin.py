@@ -12,7 +12,7 @@ __all__ = ["take_weights"]
 
 
 def take_weights(filter: Filter, source: Filter) -> list[str]:
-    """Copies what was learned into a filter of the same parts: of another kind, delay or number of members.
+    """Copies trained weights into a filter of the same parts: of another kind, delay or number of members.
 
     A sub-model takes the weights of the one of its class, names and shapes; of several, of the one in its place, or of
     the one that comes as the first, second, ... of them. What has no parameters, such as a prior, stays as it is.

@@ -1,4 +1,4 @@
-"""A run's logs, which a resumed run continues as if it had never been broken off."""
+"""A run's logs, which a resumed run continues as if it had never been interrupted."""
 
 from __future__ import annotations
 

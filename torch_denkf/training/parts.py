@@ -24,7 +24,7 @@ def train_part(part: M, stage: Stage, *, out: Path | str, **settings: Any) -> M:
     Args:
         part: e.g. a sensor or a motion model; trained in place.
         stage: what is fitted; its name names the file ``out/<name>.pt`` with the finished part.
-        out: folder; a training that was broken off goes on from there.
+        out: folder; an interrupted training resumes from there.
         **settings: of :class:`FilterTrainer`.
 
     Returns:

@@ -44,8 +44,8 @@ class Stage:
             returns one of torch's schedulers; it is stepped after each update.
         clip: largest norm of the gradient; ``None`` for no limit.
         lengths: sequence lengths, ``{from_update: length}``, e.g. ``{0: 4, 500: 16}``: short ones first.
-        validate: in the place of the trainer's, e.g. where a sensor is trained alone.
-        monitor: in the place of the trainer's.
+        validate: instead of the trainer's, e.g. where a sensor is trained alone.
+        monitor: instead of the trainer's.
 
     Raises:
         ValueError: on a bad name, no updates, an unknown schedule, or lengths that say nothing about update 0.
@@ -165,7 +165,7 @@ class Stage:
 
 
 def why_no_gain(stage: Stage, first: float, value: float, update: int) -> str:
-    """Returns what a stage that gained less than 1 % is to be told, or nothing.
+    """Returns advice for a stage that gained less than 1 %, or nothing.
 
     Args:
         stage: the stage.

@@ -1,4 +1,4 @@
-"""Trains any filter, or a part of one, in stages; a training that was killed goes on as if it had not been."""
+"""Trains any filter, or a part of one, in stages; a training that was killed continues as if it had not been."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class FilterTrainer(HookPoints):
     starts from the best parameters of the one before, and those of the last are in the model at the end. A stage that
     lowered the monitored error by less than 1 % is logged as a warning, with what is likely.
 
-    **Resuming.** ``fit`` goes on from ``out/last.pt`` where there is one. After a kill at any point, parameters and
+    **Resuming.** ``fit`` continues from ``out/last.pt`` where there is one. After a kill at any point, parameters and
     CSV logs are bit for bit those of an unbroken run, on the same machine and number of threads; so are the checkpoint
     files, where no tensorboard's files, which are named after the time, are among the logs. On a GPU, as far as
     its kernels are deterministic (``torch.use_deterministic_algorithms``). The model's modules must not keep a state

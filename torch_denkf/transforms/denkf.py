@@ -63,7 +63,7 @@ class DEnKFTransform(Checked, Transform):
         check_finite: whether a belief that is not finite raises; on a GPU, which a step would wait for, none does.
             Where an environment emits readings that are not finite, put ``torch_denkf.imperfect.RejectReadings`` in
             front.
-        ahead: writes the belief of a later moment beside that of now: :class:`~torch_denkf.fusion.BeliefAhead`.
+        ahead: writes the belief of a later moment next to that of now: :class:`~torch_denkf.fusion.BeliefAhead`.
         packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step` (native code:
             load only what you would execute). At B=1 it is ten times as fast as the filter itself. It has the
             parameters of its export, is for environments of the batch size of the export, and not for use inside a
@@ -71,7 +71,7 @@ class DEnKFTransform(Checked, Transform):
 
     Raises:
         TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``.
-        KeyError: if the environment does not emit what the filter reads, or the belief got lost on the way.
+        KeyError: if the environment does not emit the inputs of the filter, or the belief got lost on the way.
         ValueError: if the filter's result is not finite, or shapes do not fit.
 
     Example:
@@ -246,7 +246,7 @@ class DEnKFTransform(Checked, Transform):
     # ------------------------------------------------------------------------------------------------- the specs
 
     def _add_specs(self, spec: Composite, keys: Sequence[NestedKey], observation_spec: Composite) -> Composite:
-        """Adds to ``spec`` what the filter writes under ``keys`` on observations that are all zero."""
+        """Adds to ``spec`` the outputs of the filter under ``keys`` on observations that are all zero."""
         dtypes = {p.dtype for p in (*self.filter.parameters(), *self.filter.buffers()) if p.is_floating_point()}
         probe = observation_spec.zero()
         row = TensorDict({}, observation_spec.shape, device=observation_spec.device)
@@ -276,7 +276,7 @@ class DEnKFTransform(Checked, Transform):
 
         Raises:
             ValueError: if the environment emits an entry of such a name already, or resets groups of agents alone; or
-                if a transform behind this one writes over the belief that the filter goes on with.
+                if a transform behind this one writes over the belief that the filter continues with.
         """
         keys = [key for key in self._keep if key not in self._dropped_keys]
         check_no_group_resets(self.parent.reset_keys, self.out_keys)

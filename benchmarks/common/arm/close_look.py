@@ -34,7 +34,7 @@ class CloseLook(nn.Module):
         self.register_buffer("grid", torch.stack(torch.meshgrid(side, side, indexing="xy"), -1), persistent=False)
 
     def forward(self, images: Tensor, centre: Tensor, raised: float = 0.0) -> Tensor:
-        """Features ``[N, 192]`` of images ``[N, 3, H, W]`` around places ``[N, 2]`` from -1 (left, top) to 1.
+        """Returns features ``[N, 192]`` of images ``[N, 3, H, W]`` around places ``[N, 2]`` from -1 (left, top) to 1.
 
         Args:
             images: at full resolution.
@@ -74,7 +74,7 @@ class GlimpseTrunk(nn.Module):
         self.raised, self.told = raised, told
 
     def forward(self, images: Tensor) -> Tensor:
-        """Features ``[N, 256]`` of images."""
+        """Returns features ``[N, 256]`` of images."""
         code = self.coarse(images)
         centre = self.centre(code)
         patch = self.close(images, centre.detach() if self.told else centre, self.raised)

@@ -15,7 +15,7 @@ from torch_denkf.training.parts import train_part
 
 
 def with_rates(states: Tensor, order: int) -> Tensor:
-    """States ``[*, T, D]`` with the joints' changes along time, and those of the changes; an episode begins at rest."""
+    """Returns states ``[*, T, D]`` with their first and second differences in time; an episode begins at rest."""
     parts, values = [states], states[..., :JOINTS]
     for _ in range(order):
         values = torch.cat([torch.zeros_like(values[..., :1, :]), values.diff(dim=-2)], -2)
@@ -76,7 +76,7 @@ class BiasedReading(nn.Module):
         self.read, self.size = motion.read, motion.size
 
     def forward(self, state: Tensor) -> Tensor:
-        """Readings ``[*, read]`` of states ``[*, size]`` or ``[*, size + read]``."""
+        """Returns readings ``[*, read]`` of states ``[*, size]`` or ``[*, size + read]``."""
         place, bias = state[..., : self.read], state[..., self.size :]
         return place + bias if bias.shape[-1] else place
 
@@ -85,7 +85,7 @@ class WithBias(nn.Module):
     r"""The motion of a state that also holds the sensor's slow errors, which fade: :math:`b_t = \rho \circ b_{t-1}`.
 
     A sensor that reads a pose wrongly reads it wrongly in the next frame, too. A filter that takes its errors for white
-    noise believes them more with each frame; here they are part of the state, and the reading is state plus bias
+    noise becomes ever more certain of them; here they are part of the state, and the reading is state plus bias
     ("coloured measurement noise": Bryson & Henrikson 1968).
 
     Args:
@@ -98,7 +98,7 @@ class WithBias(nn.Module):
         self.fading = nn.Parameter(torch.full((motion.read,), motion.fading).logit())
 
     def forward(self, features: Tensor) -> Tensor:
-        """States ``[*, size + read]`` of such states, or of states and commands."""
+        """Returns the next states ``[*, size + read]`` from such states, or from states and commands."""
         size, whole = self.motion.size, self.motion.size + self.motion.read
         moved = self.motion(torch.cat([features[..., :size], features[..., whole:]], -1))
         return torch.cat([moved, self.fading.sigmoid() * features[..., size:whole]], -1)

@@ -25,7 +25,7 @@ SIZES = {
 
 
 def page(frame: pd.DataFrame, methods: Sequence[str], joints: Sequence[str], lines: Sequence[str]) -> str:
-    """The tables of a study's rows, means over seeds.
+    """Returns the tables of a study's rows, means over seeds.
 
     Args:
         frame: rows of all conditions.

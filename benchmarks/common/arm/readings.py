@@ -22,7 +22,7 @@ BLACK, MISSING = 20, 0.3  # consecutive black frames; share of frames that do no
 
 
 def code_of(sensors: Sequence[ImageSensor], pixels: Tensor) -> Tensor:
-    """Features of the sensors' trunks, one behind the other, ``[N, F]``, of pictures ``[N, 3, H, W]``."""
+    """Returns features of the sensors' trunks, one behind the other, ``[N, F]``, of pictures ``[N, 3, H, W]``."""
     return torch.cat([sensor._features(pixels, None) for sensor in sensors], -1)
 
 
@@ -34,7 +34,7 @@ def read_codes(
     see: Callable[[TensorDict], TensorDict],
     file: Path,
 ) -> TensorDict:
-    """Features of all frames of some sequences ``[N, T]``, the shorter ones filled up; kept in a file.
+    """Returns features of all frames of some sequences ``[N, T]``, the shorter ones filled up; kept in a file.
 
     Args:
         sensors: whose trunks look.
@@ -42,7 +42,7 @@ def read_codes(
         sequences: rows of each.
         see: maps rows ``[n]`` of the data to ``"pixels"``, maybe of a failing camera, and other entries to keep.
         file: with ``"code"`` ``[N, T, F]``, these entries, and ``[N, T, 1]`` each: ``"observed"``, whether a picture is
-            new and not black, ``"arrived"``, whether one came, and ``"valid"``, whether the sequence goes on.
+            new and not black, ``"arrived"``, whether one came, and ``"valid"``, whether the sequence continues.
     """
     if not file.exists():
         check, parts = BlackIsMissing(), []
@@ -65,7 +65,7 @@ def read_codes(
 def read_heads(
     sensors: Sequence[ImageSensor], code: Tensor, size: int, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Samples ``[*B, size, O]`` and encoding ``[*B, F]`` of the sensors' heads, of features ``[*B, F]``.
+    """Returns samples ``[*B, size, O]`` and encoding ``[*B, F]`` of the sensors' heads, of features ``[*B, F]``.
 
     The samples are split among the sensors, which were trained from different random numbers: their spread is also that
     of what training leaves open.
@@ -83,7 +83,7 @@ def read_heads(
 def with_head(
     sensors: Sequence[ImageSensor], codes: TensorDict, size: int, generator: torch.Generator | None = None
 ) -> TensorDict:
-    """Codes with ``("sensor", "ensemble")`` and ``("sensor", "encoding")`` in the place of features."""
+    """Codes with ``("sensor", "ensemble")`` and ``("sensor", "encoding")`` instead of features."""
     samples, encoding = read_heads(sensors, codes["code"], size, generator)
     out = codes.exclude("code")
     out["sensor"] = TensorDict({"ensemble": samples, "encoding": encoding}, batch_size=out.batch_size)
@@ -104,7 +104,7 @@ def blackouts(lengths: Tensor, seed: int = 0) -> Tensor:
 
 
 def fail(readings: TensorDict, condition: str, seed: int = 0) -> TensorDict:
-    """Readings ``[N, T]`` of a camera that fails, ``"black20"`` or ``"missing"``; in other conditions as they are."""
+    """Returns readings ``[N, T]`` under a camera fault, ``"black20"`` or ``"missing"``; otherwise unchanged."""
     count, steps = readings.shape
     if condition == "missing":
         return without(readings, torch.rand(count, steps, 1, generator=torch.Generator().manual_seed(seed)) < MISSING)
@@ -115,7 +115,7 @@ def fail(readings: TensorDict, condition: str, seed: int = 0) -> TensorDict:
 
 
 def without(readings: TensorDict, lost: Tensor) -> TensorDict:
-    """Readings ``[N, T]`` without the frames that are ``lost`` ``[N, T, 1]``, of which nothing is left."""
+    """Returns readings ``[N, T]`` without the frames that are ``lost`` ``[N, T, 1]``, of which nothing is left."""
     out = readings.copy()
     for key in ("observed", "arrived"):
         out[key] = out[key] & ~lost
@@ -146,7 +146,7 @@ class Windows:
         self.weights = (shares / counts).repeat_interleave(counts)
 
     def sample(self, generator: torch.Generator, batch: int, length: int | None = None) -> TensorDict:
-        """Windows ``[batch, length]``: in half of them up to half of the frames are missing, in a third a stretch."""
+        """Returns windows ``[batch, length]``; half of them have missing frames, a third a gap."""
         length = length or self.length
 
         def draw(*shape: int) -> Tensor:

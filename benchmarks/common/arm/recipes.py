@@ -35,7 +35,7 @@ class AtRest(AroundInitial):
         self.input_dim = input_dim
 
     def on_entries(self, entries, call):
-        """The belief."""
+        """Returns the belief."""
         (key,) = self.in_keys
         state = self.required(entries, key)
         return self.run_inside({**entries, key: nn.functional.pad(state, (0, self.size - state.shape[-1]))}, call)
@@ -79,7 +79,7 @@ class ArmRecipe(Recipe):
 
     @property
     def moved(self) -> Sequence[Sequence[int]]:
-        """The first numbers of the state, as many as there are rates."""
+        """Returns the first numbers of the state, as many as there are rates."""
         return (range(len(self.rates)),)
 
     @property
@@ -88,7 +88,7 @@ class ArmRecipe(Recipe):
         return self.motion.size + self.motion.read * self.bias
 
     def transition(self) -> m.SubModel:
-        """The learned motion as a transition of ensembles."""
+        """Returns the learned motion as a transition of ensembles."""
         network = WithBias(self.motion) if self.bias else self.motion
         return m.LearnedTransition(network, residual=False, action_key="action" if self.actions else None)
 
@@ -108,12 +108,12 @@ class ArmRecipe(Recipe):
         raise NotImplementedError
 
     def initial(self, std: Tensor, state_key: NestedKey) -> TensorDictModuleBase:
-        """The belief around the numbers that are read, at rest, or around a whole state."""
+        """Returns the belief around the numbers that are read, at rest, or around a whole state."""
         whole = torch.cat([std, self.bias_std])[: self.size]
         return AtRest(self.belief(whole, state_key), self.size, self.motion.read, state_key)
 
     def build(self) -> Filter:
-        """The filter, on readings."""
+        """Returns the filter, on readings."""
         return Filter(self.modules(), initial=self.initial(self.first_std, self.first_key))
 
     def behind(self, model: Filter, *, training: bool = False) -> Filter:
@@ -122,7 +122,7 @@ class ArmRecipe(Recipe):
         return Filter(parts, initial=self.initial(self.start_std, "start") if training else model.initial)
 
     def begun(self, windows: TensorDict, generator: torch.Generator) -> TensorDict:
-        """Windows with the loss's ``"target"``, in which biases are zero, and the ``"start"`` of their beliefs."""
+        """Adds to windows the loss's ``"target"``, with biases of zero, and the ``"start"`` of their beliefs."""
         unknown = self.size - windows["motion"].shape[-1]
         windows["target"] = nn.functional.pad(windows["motion"], (0, unknown))
         windows["start"] = self.start(windows, generator)
@@ -170,7 +170,7 @@ class DEKF(ArmRecipe):
     Analysis: type = m.EKFAnalysis
 
     def forecast(self, noise: m.SubModel) -> m.SubModel:
-        """Mean and covariance a step on; its Jacobian is a constant to the gradient, as in Kloss et al."""
+        """Returns the mean and covariance a step on; its Jacobian is a constant to the gradient, as in Kloss et al."""
         return m.EKFTransition(self.transition(), noise, stop_jacobian_gradient=True)
 
     def modules(self):
@@ -194,7 +194,7 @@ class DUKF(DEKF):
     Analysis = m.UKFAnalysis
 
     def forecast(self, noise: m.SubModel) -> m.SubModel:
-        """Mean and covariance a step on."""
+        """Returns the mean and covariance a step on."""
         return m.UKFTransition(self.transition(), noise)
 
 

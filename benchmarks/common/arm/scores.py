@@ -30,7 +30,7 @@ READ = ("state", "motion", "valid", "arrived")  # what scores read, not filters
 
 @torch.no_grad()
 def run_filter(recipe: ArmRecipe, model: Filter, readings: TensorDict, chunk: int = 128) -> TensorDict:
-    """The readings ``[N, T]`` with the mean and variances of the belief about what is read."""
+    """Returns the readings ``[N, T]`` with the mean and variances of the belief about what is read."""
     behind, beliefs = recipe.behind(model), []
     hidden = [key for key in READ if key != recipe.first_key]
     with torch.random.fork_rng(devices=[]):
@@ -42,30 +42,30 @@ def run_filter(recipe: ArmRecipe, model: Filter, readings: TensorDict, chunk: in
 
 
 def estimated(readings: TensorDict, mean: Tensor, var: Tensor) -> TensorDict:
-    """The readings ``[N, T]`` with an estimate that no filter made, ``[N, T, D]``."""
+    """Returns the readings ``[N, T]`` with an estimate that no filter made, ``[N, T, D]``."""
     return readings.copy().set("belief", TensorDict({"mean": mean, "var": var}, readings.shape))
 
 
 def counted(out: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
-    """Means, variances and truth ``[M, D]`` of all rows but a sequence's first, which is given."""
+    """Returns means, variances and truth ``[M, D]`` of all rows but a sequence's first, which is given."""
     at = out["valid"].squeeze(-1).clone()
     at[:, 0] = False
     return out["belief", "mean"][at], out["belief", "var"][at].clamp_min(FLOOR), out["state"][at]
 
 
 def coverage(out: TensorDict) -> Tensor:
-    """Share of the true joints inside the belief's 90 % intervals."""
+    """Returns the share of the true joints inside the belief's 90 % intervals."""
     return interval_coverage(*(value[:, :JOINTS] for value in counted(out)), level=0.9).mean()
 
 
 def absolute_errors(mean: Tensor, truth: Tensor, circular: Sequence[int]) -> Tensor:
-    """Means of absolute errors, ``[D]``: degrees of the joints, cm of a place behind them; some joints wrap."""
+    """Returns means of absolute errors, ``[D]``: degrees of the joints, cm of a place behind them; some joints wrap."""
     error = state_errors(mean, truth, space=Flat(mean.shape[-1], circular=circular)).mae
     return torch.cat([error[:JOINTS].rad2deg(), 100 * error[JOINTS:]])
 
 
 def scores(out: TensorDict, names: Sequence[str], unit: Tensor, circular: Sequence[int] = ()) -> dict[str, float]:
-    """Errors, CRPS and coverage of beliefs ``[N, T]`` taken for Gaussians.
+    """Returns errors, CRPS and coverage of beliefs ``[N, T]`` taken for Gaussians.
 
     Args:
         out: of :func:`run_filter`.
@@ -83,7 +83,7 @@ def scores(out: TensorDict, names: Sequence[str], unit: Tensor, circular: Sequen
 
 
 def blackout(out: TensorDict, circular: Sequence[int] = ()) -> dict[str, float]:
-    """Error of the joints in the black frames, and their mean standard deviation before, at the end of, and after."""
+    """Returns the joint error in black frames, and the mean standard deviation before, at the end and after."""
     begin, steps, rows = blackouts(out["valid"].sum((1, 2))), out.shape[1] - 1, torch.arange(len(out))
     at = rows.unsqueeze(-1), (begin.unsqueeze(-1) + torch.arange(BLACK)).clamp(max=steps)
     error = absolute_errors(out["belief", "mean"][at].flatten(0, 1), out["state"][at].flatten(0, 1), circular)
@@ -94,20 +94,20 @@ def blackout(out: TensorDict, circular: Sequence[int] = ()) -> dict[str, float]:
 
 
 def score_row(out: TensorDict, condition: str, names: Sequence[str], unit: Tensor, circular=()) -> dict:
-    """A row of one condition."""
+    """Returns a row of one condition."""
     row = {"condition": condition, **scores(out, names, unit, circular), "episodes": len(out)}
     return row | (blackout(out, circular) if condition == "black20" else {})
 
 
 def filter_rows(recipe: ArmRecipe, model: Filter, readings: dict[str, TensorDict], row: Callable[..., dict]) -> list:
-    """Rows of a filter in all conditions; ``row`` maps a belief and the condition's name to one."""
+    """Returns rows of a filter in all conditions; ``row`` maps a belief and the condition's name to one."""
     costs = cost_of(recipe, model, readings["clean"])
     outs = run_filter(recipe, model, torch.cat(list(readings.values()))).split(len(readings["clean"]))
     return [{**row(out, condition), **costs} for condition, out in zip(readings, outs, strict=True)]
 
 
 def cost_of(recipe: ArmRecipe, model: Filter, readings: TensorDict) -> dict[str, float]:
-    """Parameters behind the sensor, and milliseconds a step of one sequence there."""
+    """Parameters behind the sensor, and milliseconds per step of one sequence there."""
     row = readings[:1, :TIMED]
     return cost(model, lambda: run_filter(recipe, model, row), row.shape[1])
 
@@ -127,7 +127,7 @@ def save_beliefs(recipe: ArmRecipe, model: Filter, readings: dict[str, TensorDic
 def filter_stage(
     recipe: ArmRecipe, model: Filter, windows: Windows, validation: TensorDict, updates: int, batch: int, lr: float
 ) -> Stage:
-    """A filter's training on windows of readings, validated on whole sequences by their CRPS."""
+    """Returns a filter's training on windows of readings, validated on whole sequences by their CRPS."""
     return Stage(
         "filter",
         recipe.loss(recipe.behind(model, training=True)),
@@ -154,7 +154,7 @@ def fit(
     every: int,
     **settings,
 ) -> Filter:
-    """Trains a filter, or goes on; then its inflation is chosen for the coverage. ``every`` updates are validated."""
+    """Trains a filter, or continues; then its inflation is chosen for the coverage. ``every`` updates are validated."""
     fit_filter(
         recipe,
         model,

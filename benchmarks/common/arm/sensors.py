@@ -54,7 +54,7 @@ class Statistics:
 
 
 def camera_sensor(facts: Statistics, trunk: nn.Module, samples: int, loc: Tensor, scale: Tensor, **head) -> ImageSensor:
-    """A sensor of numbers with a mean and a standard deviation each."""
+    """Returns a sensor of numbers with a mean and a standard deviation each."""
     return ImageSensor(
         len(loc),
         image_shape=(3, *facts.size),
@@ -71,7 +71,7 @@ def camera_sensor(facts: Statistics, trunk: nn.Module, samples: int, loc: Tensor
 
 @torch.no_grad()
 def clean_loss(sensor: ImageSensor, loss: nn.Module, held_out: Frames) -> float:
-    """The loss of frames as they are, from the same random numbers each time."""
+    """Returns the loss of frames as they are, from the same random numbers each time."""
     training, values = sensor.training, []
     sensor.eval()
     with torch.random.fork_rng(devices=[]):
@@ -94,7 +94,7 @@ def train_sensor(
     lr: float,
     weight_decay: float,
 ) -> ImageSensor:
-    """Trains a sensor, or goes on where that was broken off, or reads it where it was done.
+    """Trains a sensor, or resumes after an interruption, or reads it where it was done.
 
     Args:
         sensor: trained in place.

@@ -59,7 +59,7 @@ class KITTIRecipe(Recipe):
                 module.logarithm.fill_(logarithm)
 
     def transition(self, network: nn.Module) -> SubModel:
-        """Known motion of the pose; the velocities walk at random, with a trend."""
+        """Returns known motion of the pose; the velocities walk at random, with a trend."""
         facts = self.facts
         keys = {"history_key": HISTORY, "drift": False}
         return UnicycleTransition(network, dt=facts.dt, loc=facts.loc, scale=facts.scale, **keys)
@@ -70,11 +70,11 @@ class KITTIRecipe(Recipe):
         return torch.cat([torch.full((3,), torch.inf), self.unit])
 
     def build(self) -> Filter:
-        """The whole filter."""
+        """Returns the whole filter."""
         return Filter(OrderedDict(sensor=self.sensor, **self.modules()), initial=self.initial(INITIAL_STD, "state"))
 
     def part(self, model: Filter, *, sensor: bool, start_std: Tensor | None = None) -> Filter:
-        """The same filter, sharing all parameters, with or without its sensor; from a wrong ``"start"`` if told so."""
+        """Returns the same filter with shared parameters, with or without its sensor, or with a wrong ``"start"``."""
         names = [name for name in model.module if sensor or name != "sensor"]
         initial = model.initial if start_std is None else self.initial(start_std, "start")
         return Filter(OrderedDict((name, model[name]) for name in names), initial=initial)
@@ -85,7 +85,7 @@ class SpeedGain(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.register_buffer("logarithm", torch.zeros(()), persistent=False)  # it lies beside the weights
+        self.register_buffer("logarithm", torch.zeros(()), persistent=False)  # it lies next to the weights
 
     def forward(self, velocity: torch.Tensor) -> torch.Tensor:
         """Predicts (v, theta_dot) ``[*, 2]``."""

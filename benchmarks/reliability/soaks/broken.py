@@ -1,4 +1,4 @@
-"""Work that is broken off: by kills at random moments, by disks that are full or read-only, by a second process.
+"""Work that is interrupted: by kills at random moments, by disks that are full or read-only, by a second process.
 
 Each work writes to a folder. Started again, it is to end as if nothing had happened, and to leave nothing half written.
 """
@@ -49,7 +49,7 @@ class Work:
     """Something that writes to a folder.
 
     Args:
-        do: does it, or goes on with it.
+        do: does it, or continues with it.
         result: all that it leaves.
         words: one of them is in the message where it cannot write; none where disks are not tried.
         killed: whether it is killed, too.
@@ -182,7 +182,7 @@ def left_behind(folder: Path) -> list[str]:
 
 @contextmanager
 def two_folders() -> Iterator[tuple[Path, Path, Path]]:
-    """One folder for work that is broken off, one for work that is not, and a file for what is said."""
+    """One folder for work that is interrupted, one for work that is not, and a file for what is said."""
     with tempfile.TemporaryDirectory(prefix="broken-", ignore_cleanup_errors=True) as root:
         broken, sound = Path(root, "broken"), Path(root, "sound")
         broken.mkdir()
@@ -268,7 +268,7 @@ def on_disk(name: str, full: bool) -> dict[str, Any]:
 
 
 def two(name: str) -> dict[str, Any]:
-    """Two processes do the same in one folder at a time."""
+    """Runs the same job in two processes in one folder."""
     work = WORKS[name]
     with two_folders() as (broken, sound, log):
         logs = [log.with_suffix(f".{k}") for k in range(2)]
@@ -296,7 +296,7 @@ def kill_jobs(kills: int, seed: int) -> Rows:
 
 
 def disk_jobs() -> Rows:
-    """Each work on each kind of disk, and in two processes; what they start from is made here.
+    """Runs each job on each kind of disk, and in two processes.
 
     Raises:
         PermissionError: where one may not mount file systems.

@@ -33,12 +33,12 @@ CLOSE = 1e-4  # float32, another order of sums
 
 
 def plain(seed: int = 0) -> EnvBase:
-    """Rows without a filter; half of their readings are missing."""
+    """Returns rows without a filter; half of their readings are missing."""
     return base_env(seed=seed, missing=0.5, max_steps=LENGTHS, batch_size=[ROWS])
 
 
 def filtered(base: EnvBase | None = None, *, seed: int = 0) -> EnvBase:
-    """An environment with the filter in it."""
+    """Returns an environment with the filter in it."""
     base = plain(seed) if base is None else base
     return TransformedEnv(TransformedEnv(base, DEnKFTransform(linear_denkf("etkf"))), InitTracker())
 
@@ -137,7 +137,7 @@ class Reference:
 
 
 def _goes_on(end: TensorDictBase, start: TensorDictBase) -> bool:
-    """Tells whether a batch goes on where another ended: in the same episodes, which collectors number."""
+    """Tells whether a batch continues where another ended: in the same episodes, which collectors number."""
     episodes = [each.get(("collector", "traj_ids"), None) for each in (end, start)]
     if any(episode is None for episode in episodes):
         return True
@@ -146,7 +146,7 @@ def _goes_on(end: TensorDictBase, start: TensorDictBase) -> bool:
 
 
 def soak(name: str, steps: int) -> dict[str, Any]:
-    """A row of the table: a layout, for so many steps of all its environments together."""
+    """Returns a row of the table: a layout, for so many steps of all its environments together."""
     torch.manual_seed(0)
     reference = Reference()
     for batch in LAYOUTS[name](steps):

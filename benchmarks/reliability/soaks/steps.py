@@ -47,7 +47,7 @@ SAMPLED: dict[str, Callable[[], Filter]] = {
 
 
 def drawn(number: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """States, readings, and whether they arrive, NaN where not, of a chunk, which follow from its number alone."""
+    """Returns states, readings (NaN for missing ones) and observed masks of a chunk, seeded by its number."""
     F, Q, H, R = linear_system()
     random = torch.Generator().manual_seed(number)
     state, states = torch.zeros(2), []
@@ -61,7 +61,7 @@ def drawn(number: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def memory() -> int:
-    """The process's resident memory, bytes."""
+    """Returns the process's resident memory, bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
@@ -73,7 +73,7 @@ class Run:
         self.step, self.carry = step, {name: begun[tuple(name.split("."))].clone() for name in step.carry}
 
     def chunk(self, readings: torch.Tensor, observed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Means and variances, ``[CHUNK, 2]``."""
+        """Returns means and variances, ``[CHUNK, 2]``."""
         found = []
         for reading, seen in zip(readings.unbind(0), observed.unbind(0), strict=True):
             out = self.step({**self.carry, "observation": reading, "observed": seen})
@@ -95,7 +95,7 @@ def differs(step: PackagedStep, filter: Filter, readings: torch.Tensor, observed
 
 
 def soak(name: str, steps: int) -> dict[str, Any]:
-    """A row of the table."""
+    """Returns a row of the table."""
     make, exact = (EXACT | SAMPLED)[name], name in EXACT
     torch.manual_seed(0)
     filter, chunks = make(), steps // CHUNK

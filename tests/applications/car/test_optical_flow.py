@@ -31,7 +31,7 @@ def flow_env(drive, **kwargs):
 
 
 def same(out, expected, keys=("flow", "road")):
-    """Keeps the numbers but for half precision, in which a drive's motion is kept."""
+    """Keeps the numbers except for half precision, in which a drive's motion is kept."""
     for key in keys:
         assert out[key].dtype == torch.float32
         assert out[key].half().equal(expected[key]), key

@@ -91,7 +91,7 @@ def test_paths_that_lead_out_of_the_data_set_raise(tmp_path, version, key):
     assert len(open_all(root)) == 8
 
 
-def test_bombs_raise_before_they_are_unpacked(tmp_path):
+def test_decompression_bombs_raise_before_unpacking(tmp_path):
     write_version_2(tmp_path, [4, 4], images="bytes")
     file = tmp_path / "data/chunk-000/episode_000000.parquet"
     with patch.object(parquet_reader, "MOST_BYTES", 1000), patch.object(parquet_reader, "MOST_RATIO", 0.01):

@@ -27,7 +27,7 @@ def write_varying(av, file, times):
         container.mux(stream.encode())
 
 
-def test_no_frame_is_lost_where_the_rate_varies(tmp_path):
+def test_variable_frame_rate_loses_no_frame(tmp_path):
     av = pytest.importorskip("av")
     times = np.array([0.0, 0.5, 1.0, *(1.5 + np.arange(40) / 200)])
     write_varying(av, tmp_path / "run.mkv", times)
@@ -38,7 +38,7 @@ def test_no_frame_is_lost_where_the_rate_varies(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["run.mkv", "run.avi"])
-def test_a_video_that_lost_its_end_is_told(tmp_path, name):
+def test_truncated_video_is_reported(tmp_path, name):
     file = tmp_path / name
     write_video(file, 12)
     with warnings.catch_warnings():

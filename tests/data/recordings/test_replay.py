@@ -20,7 +20,7 @@ def truth(time):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A video at 10 Hz from 0 s on; x and y at 100 Hz from 0.155 s on; a command every 0.25 s."""
+    """Returns a video at 10 Hz from 0 s on; x and y at 100 Hz from 0.155 s on; a command every 0.25 s."""
     folder = tmp_path_factory.mktemp("run")
     write_video(folder / "run1.mkv", 20)
     time = 0.155 + np.arange(160) / 100

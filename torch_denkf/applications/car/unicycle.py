@@ -16,7 +16,7 @@ def unicycle_move(pose: Tensor, velocity: Tensor, dt: float | Tensor) -> Tensor:
         y' = y + v\,\Delta t \sin(\theta + \dot\theta \Delta t / 2), \quad
         \theta' = \theta + \dot\theta \Delta t
 
-    With ``-dt`` it is its own inverse, exactly but for rounding.
+    With ``-dt`` it is its own inverse, exactly up to rounding.
 
     Args:
         pose: (x m, y m, theta rad), ``[*, 3]``.

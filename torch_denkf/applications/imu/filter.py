@@ -62,7 +62,7 @@ class ImuSettings:
         gravity: in m/s^2.
         block: seconds of readings that make one step.
         latency: how old the readings are when they get their time stamp, in s; orientations are moved on by it.
-        heading_scale: factor on the standard deviation of the heading, so that the intervals hold.
+        heading_scale: factor on the standard deviation of the heading, which sets the coverage.
         heading_floor: least standard deviation of the heading, in degrees.
         tilt_scale: factor on the standard deviations of the inclination.
         tilt_floor: least standard deviation of the inclination about each axis, in degrees.
@@ -232,7 +232,7 @@ class MagnetometerNoise(Sensor):
         self.log_std = nn.Parameter(torch.tensor([settings.magnetometer, settings.magnetometer_rate]).log())
 
     def compute(self, gyro):
-        """The variances."""
+        """Returns the variances."""
         white, rate = (2 * self.log_std).exp().unbind(-1)
         return (white + rate * gyro.square().sum(-1, keepdim=True)).expand_as(gyro)
 
@@ -277,7 +277,7 @@ class ImuFilter(FusedFilter):
 
 
 def imu(**settings) -> ImuFilter:
-    """A filter of an inertial sensor's orientation, with 9 or 6 axes.
+    """Returns a filter of an inertial sensor's orientation, with 9 or 6 axes.
 
     Args:
         **settings: those of :class:`ImuSettings`.

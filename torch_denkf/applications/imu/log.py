@@ -50,7 +50,7 @@ def imu_rows(
         gyro: ``[T, 3]`` in rad/s, finite.
         acceleration: ``[T, 3]`` in m/s^2; rows with NaN are missing.
         magnetometer: ``[T, 3]`` in uT, likewise; ``None`` for 6 axes.
-        rate: readings a second.
+        rate: readings per second.
 
     Returns:
         Rows ``[N]``; readings behind the last whole block are left out.
@@ -132,7 +132,7 @@ def orientations(
         gyro: ``[T, 3]`` in rad/s.
         acceleration: ``[T, 3]`` in m/s^2.
         magnetometer: ``[T, 3]`` in uT; ``None`` for 6 axes, whose heading starts as north.
-        rate: readings a second.
+        rate: readings per second.
         smooth: whether all later readings count, too (Rauch-Tung-Striebel).
 
     Raises:

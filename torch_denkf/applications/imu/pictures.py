@@ -31,7 +31,7 @@ def orientation_picture(found: Orientations, rate: float, *, points: int = 4000)
 
     Args:
         found: of :func:`~torch_denkf.applications.imu.orientations`.
-        rate: readings a second.
+        rate: readings per second.
         points: at most as many are drawn.
     """
     every = max(1, len(found.quaternion) // points)

@@ -59,7 +59,7 @@ class LeggedErrors:
 
 
 class LeggedEnv(EnvBase):
-    """One robot in MuJoCo that emits what a legged robot reads, and the true motion of its base.
+    """Simulates one robot in MuJoCo; emits the readings of a legged robot, and the true motion of its base.
 
     Emits ``"imu"`` ``[6]`` (gyro in rad/s, accelerometer in m/s^2, in the sensor's axes: means over the step),
     ``"joints"`` and ``"joint_rates"`` ``[J]``, ``"force"`` ``[F]`` that presses each foot, in N, and ``"contact"``
@@ -169,7 +169,7 @@ class LeggedEnv(EnvBase):
         data, total = self.data, np.zeros(6)
         for _ in range(self.substeps):
             self._simulate()
-            # The simulator goes on with the turn at the end of its step, and with the force at its beginning.
+            # The simulator continues with the turn at the end of its step, and with the force at its beginning.
             total[:3] += self.to_sensor @ data.qvel[3:6]
             total[3:] += data.sensordata[self.force_at : self.force_at + 3]
         force = self._forces()

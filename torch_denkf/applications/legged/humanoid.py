@@ -76,7 +76,7 @@ def humanoid_env(
     turn: float = 0.0,
     seed: int = 0,
 ) -> HarnessedEnv:
-    """Returns dm_control's humanoid in a harness, with an inertial sensor next to its chest, 100 steps a second.
+    """Returns dm_control's humanoid in a harness, with an inertial sensor next to its chest, 100 steps per second.
 
     Its motors turn joints to the angles of the action, in rad.
 

@@ -131,7 +131,7 @@ class LearnedContacts(Sensor):
     def features(
         self, imu: Tensor, joints: Tensor, rates: Tensor, contact: Tensor, *, rows: int | None = None
     ) -> Tensor:
-        """Returns the network's inputs for each foot, ``[*B, F, 16 K]``; ``rows`` in the place of K."""
+        """Returns the network's inputs for each foot, ``[*B, F, 16 K]``; ``rows`` instead of K."""
         rows, kinematics = self.rows if rows is None else rows, self.kinematics
         like = kinematics.base
         sizes = 6, len(kinematics.joints), len(kinematics.joints), len(kinematics.feet)
@@ -152,7 +152,7 @@ class LearnedContacts(Sensor):
 
     @torch.no_grad()
     def standardise(self, log: TensorDictBase) -> None:
-        """Sets mean and scale of what the network reads, by a log with the last rows."""
+        """Sets mean and scale of the network's inputs, from a log with the last rows."""
         features = self.features(*(log["last", key] for key in _KEYS)).flatten(0, -2)
         self.module.loc.copy_(features.mean(0))
         self.module.scale.copy_(features.std(0).clamp(min=1e-3))
@@ -178,7 +178,7 @@ def check_rows(rows: int, every: int) -> None:
 
 
 def last_rows(rows: int, every: int = 1) -> Compose:
-    """Returns a transform of an environment that keeps the last rows of what :class:`LearnedContacts` reads.
+    """Returns a transform of an environment that keeps the last rows of the inputs of :class:`LearnedContacts`.
 
     Args:
         rows: K.
@@ -195,7 +195,7 @@ def _picked(frames: Tensor, rows: int, every: int) -> Tensor:
 
 
 def with_last_rows(log: TensorDictBase, rows: int, every: int = 1) -> TensorDictBase:
-    """Returns a log ``[*B, T]`` with the last rows of what :class:`LearnedContacts` reads.
+    """Returns a log ``[*B, T]`` with the last rows of the inputs of :class:`LearnedContacts`.
 
     The first row stands for those before it.
 

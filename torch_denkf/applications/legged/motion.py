@@ -226,7 +226,7 @@ class LeggedMotion(Motion):
 class LeggedMotionNoise(SubModel):
     """Process noise of a step of :class:`LeggedMotion`, given the foot contacts.
 
-    A foot that stands slips a little; one in the air is where its joints say but for their error.
+    A foot that stands slips a little; one in the air is where its joints say except for their error.
 
     Args:
         feet: F.

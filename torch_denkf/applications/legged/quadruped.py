@@ -33,7 +33,7 @@ def quadruped_env(
     pushes: float = 0.0,
     seed: int = 0,
 ) -> LeggedEnv:
-    """Returns dm_control's quadruped on a floor, with an inertial sensor next to its middle, 100 steps a second.
+    """Returns dm_control's quadruped on a floor, with an inertial sensor next to its middle, 100 steps per second.
 
     Args:
         errors: of the sensors.

@@ -17,7 +17,7 @@ __all__ = ["FeetInBody", "FeetRates", "LegReadings"]
 
 
 class LegReadings(SubModel):
-    """Writes what the filter reads of the joints, and the state in which a robot starts that stands still.
+    """Writes the inputs of the filter of the joints, and the state in which a robot starts that stands still.
 
     That state is upright as the accelerometer says, at the origin, with heading zero; where the accelerometer says
     nothing, as in a row that is rejected, the base's own z points up.
@@ -115,7 +115,7 @@ class FeetInBody(SubModel):
 class FeetRates(SubModel):
     r"""Observes standing feet's velocities in sensor axes, :math:`-R^\top v - (\omega - b) \times R^\top (f_i - p)`.
 
-    It is told by the joints' rates, and says the base's velocity at once.
+    It follows from the joints' rates, and says the base's velocity at once.
 
     Args:
         space: of the states, :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.

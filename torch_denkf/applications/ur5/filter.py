@@ -122,7 +122,7 @@ class UR5TableFilter(DEnKF):
 
 
 class _ArmTransition(LearnedTransition):
-    """Reads how far each joint is from its target, in the place of the target itself."""
+    """Reads how far each joint is from its target, instead of the target itself."""
 
     def __init__(self, settings: UR5TableSettings):
         s = settings

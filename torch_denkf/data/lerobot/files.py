@@ -60,7 +60,7 @@ class Layout:
 
     Attributes:
         root: the folder.
-        fps: rows a second.
+        fps: rows per second.
         features: of ``info.json``: dtype, shape and names by key.
         camera: key of the camera.
         episodes: by number.
@@ -77,7 +77,7 @@ class Layout:
     meta: tuple[Path, ...]
 
     def width(self, key: str) -> int:
-        """Numbers in a feature.
+        """Returns numbers in a feature.
 
         Raises:
             ValueError: if there is no such feature, or it is no vector.
@@ -92,7 +92,7 @@ class Layout:
         return int(width)
 
     def names(self, key: str) -> tuple[str, ...] | None:
-        """Names of a feature's numbers, where each has one: lists, lists in lists, or lists below a common name."""
+        """Returns the names of a feature's components from lists, nested lists, or lists under a common name."""
         names = self.features[key].get("names")
         if isinstance(names, dict):
             names = list(names.values())
@@ -125,7 +125,7 @@ def read_layout(root: Path, camera: str | None, chosen: Sequence[int] | None = N
         version, fps, features = info["codebase_version"], float(info["fps"]), dict(info["features"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{file} is malformed ({type(error).__name__}: {error}); download it again") from error
-    check_number(f"fps in {file}", fps, above=0, cure="It is the number of rows a second")
+    check_number(f"fps in {file}", fps, above=0, cure="It is the number of rows per second")
     _check_features(file, features)
     if not isinstance(version, str) or version not in VERSIONS:
         raise ValueError(f"{file} is of LeRobot's version {version!r}; this reader knows {', '.join(VERSIONS)}")

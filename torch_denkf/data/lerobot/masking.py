@@ -22,7 +22,7 @@ def repaired_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarr
 
     Args:
         times: as they are stored, s.
-        fps: rows a second.
+        fps: rows per second.
         source: file and episode, for the message.
 
     Raises:

@@ -46,7 +46,7 @@ class DecodedRecording:
             float32 ``[N,A]``, ``time`` float64 ``[N,1]`` s, ``frame`` int64 ``[N,1]``, counted from 0 in each episode,
             and ``episode`` int64 ``[N]``. Where a row's state or action is not finite, also the masks of
             :func:`~torch_denkf.data.lerobot.masking.mask_invalid_rows`.
-        fps: rows a second.
+        fps: rows per second.
         names: of the state's numbers, if they have any.
         source: folder that it was read from, if there is one.
     """

@@ -57,7 +57,7 @@ class LeRobotReplay(EpisodeReplay):
     ``pixels``            [n,3,H,W]    float32 in [0, 1], RGB; zeros where the frame is missing
     ``state``             [n,S]        float32, such as the joints' positions, in the recording's units
     ``action``            [n,A]        float32, where there are any
-    ``observed``          [n,1]        bool: the frame is there, and its row is sound
+    ``observed``          [n,1]        bool: the frame is there, and its row is valid
     ===================== ============ ===========================================================================
 
     Rows whose state or action is not finite, or whose time does not increase, keep their place and are not observed; a
@@ -103,7 +103,7 @@ class LeRobotReplay(EpisodeReplay):
 
     Attributes:
         episodes: of this split, with the recording's own ``number``.
-        fps: rows a second.
+        fps: rows per second.
         names: of the state's numbers that are kept, such as the joints; None where the recording names none.
         lag: as it was passed.
         repeats_masked: rows of this split that are not observed because their picture is a repeat.
@@ -239,7 +239,7 @@ def _pictures_of_rows(images: JoinedPictures, shown: Tensor, row: Tensor) -> dic
 
 
 def _places(argument: str, dims: Sequence[int | str], names: tuple[str, ...] | None, width: int) -> list[int]:
-    """Places of the numbers that are asked for by place or name."""
+    """Returns places of the numbers that are asked for by place or name."""
     places = {name: place for place, name in enumerate(names or ())}
     chosen = [places.get(dim, -1) if isinstance(dim, str) else int(dim) for dim in dims]
     if not chosen or not all(0 <= place < width for place in chosen):

@@ -83,7 +83,7 @@ def _opened(file: Path) -> Iterator[Any]:
 
 
 def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
-    """The numbers in a message, with their names."""
+    """Yields the numbers in a message, with their names."""
     if isinstance(value, (bool, int, float, np.number, np.bool_)):
         yield name, float(value)
     elif isinstance(value, np.ndarray) and len(value) <= _LONGEST and value.dtype.kind in "fiub":

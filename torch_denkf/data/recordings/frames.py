@@ -169,7 +169,7 @@ class Images(Frames):
     """A folder of images of one camera, in the order of their names; see :class:`Frames` for the arguments.
 
     Args:
-        rate: pictures a second, from ``start`` on, in the place of ``times``. Where the images are numbered, a number
+        rate: pictures per second, from ``start`` on, instead of ``times``. Where the images are numbered, a number
             that is missing is a picture that is missing; a warning counts them.
 
     Raises:

@@ -81,7 +81,7 @@ def clock_offsets(recording: Recording, *, most: float = 5.0) -> dict[str, Clock
         most: s, the largest delay between two streams.
 
     Returns:
-        By the names of the streams that have something in common: what to add to their times, beside the fastest one
+        By stream name, for streams with a common quantity: offset to add to their times, relative to the fastest one
         that knows turns.
 
     Raises:
@@ -112,7 +112,7 @@ def clock_offsets(recording: Recording, *, most: float = 5.0) -> dict[str, Clock
 
 
 def solved(delays: Sequence[Delay], tables: Mapping[str, Readings]) -> dict[str, ClockOffset]:
-    """Solves delays of pairs for offsets, by least squares, beside the fastest stream that knows turns."""
+    """Solves delays of pairs for offsets, by least squares, relative to the fastest stream that knows turns."""
     linked = {name: tables[name] for delay in delays for name in (delay.late, delay.early)}
     turning = [name for name, table in linked.items() if find(table.columns, "turn rate")] or list(linked)
     first = min(turning, key=lambda name: float(np.median(np.diff(linked[name].times))))
@@ -175,7 +175,7 @@ def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[De
 
 
 def changes_of(tables: Mapping[str, Readings], offsets: Mapping[str, float]) -> tuple[dict, dict]:
-    """Times of the streams, and the changes of heading and way that several know, all after correction.
+    """Returns times of the streams, and the changes of heading and way that several know, all after correction.
 
     Args:
         tables: readings by stream.

@@ -28,7 +28,7 @@ _DEGREES = 7.0  # rad: beyond are no headings in rad
 
 
 def quantity(name: str) -> str | None:
-    """The quantity that a column holds, by its name.
+    """Returns the quantity that a column holds, by its name.
 
     Examples:
         >>> quantity("twist.twist.angular.z"), quantity("yawrate"), quantity("Latitude (deg)"), quantity("hdop")
@@ -39,13 +39,13 @@ def quantity(name: str) -> str | None:
 
 
 def find(columns: Sequence[str], *wanted: str) -> list[int] | None:
-    """The places of the first columns that hold some quantities; ``None`` where one is not there."""
+    """Returns the places of the first columns that hold some quantities; ``None`` where one is not there."""
     found = [quantity(name) for name in columns]
     return [found.index(what) for what in wanted] if set(wanted) <= set(found) else None
 
 
 def speed_unit(name: str, scale: float = 1.0) -> str | None:
-    """The unit of a speed, by its column's name, of km/h also by a scale; ``None`` for m/s.
+    """Returns the unit of a speed, by its column's name, of km/h also by a scale; ``None`` for m/s.
 
     Examples:
         >>> speed_unit("SOG [kn]"), speed_unit("speed_kmh"), speed_unit("speed", 3.7), speed_unit("speed", 2.2)
@@ -58,5 +58,5 @@ def speed_unit(name: str, scale: float = 1.0) -> str | None:
 
 
 def in_radians(angles: np.ndarray) -> np.ndarray:
-    """Headings in rad: those beyond a turn are in degrees."""
+    """Returns headings in rad: those beyond a turn are in degrees."""
     return np.radians(angles) if np.abs(angles).max(initial=0.0) > _DEGREES else angles

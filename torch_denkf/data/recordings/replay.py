@@ -27,7 +27,7 @@ from torch_denkf.diagnosis.logs import look_at_repeats
 __all__ = ["Recording", "RecordingReplay"]
 
 _LITTLE = 0.2  # a share of readings: fewer of them in the common time are a mistake in the unit, more often than not
-_LOST = 0.02  # a share of readings, or of time, that may be lost without a word
+_LOST = 0.02  # a share of readings, or of time, that may be lost silently
 _LONG = 1.0  # s, of a recording however long, likewise
 _PICTURE = "_picture"  # entry of the rows while they are made: the number of each one's picture
 _TAKEN = (

@@ -226,7 +226,7 @@ def read_numbers(
 
 
 def _dates(source: Source) -> list[str]:
-    """The column whose first cell is a date, where there is one such column."""
+    """Returns the column whose first cell is a date, where there is one such column."""
     try:
         found = [name for name in source.names if seconds_of(str(source.cell(name, 0))) is not None]
     except (IndexError, NotImplementedError):  # no row, or no text

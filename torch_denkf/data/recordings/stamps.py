@@ -49,7 +49,7 @@ def time_columns(names: Sequence[str]) -> list[str]:
 
 
 def nanoseconds_beside(time: str, names: Sequence[str]) -> str | None:
-    """The column with the nanoseconds of a column of whole seconds, as ROS writes stamps.
+    """Returns the column with the nanoseconds of a column of whole seconds, as ROS writes stamps.
 
     Examples:
         >>> nanoseconds_beside("header.stamp.secs", ["x", "header.stamp.nsecs"])
@@ -62,7 +62,7 @@ def nanoseconds_beside(time: str, names: Sequence[str]) -> str | None:
 
 
 def seconds_of(text: str) -> float | None:
-    """A date, a time of the day, or both, in s, since 1970 in UTC where there is a date; ``None`` for another text.
+    """Parses a date, a time of the day, or both, to s, since 1970 in UTC if it has a date; ``None`` for other text.
 
     Examples:
         >>> seconds_of("2014-03-26T15:10:23.825Z"), seconds_of("0:01:02.5"), seconds_of("12.5")
@@ -87,7 +87,7 @@ def seconds_of(text: str) -> float | None:
 
 
 def unit_of(name: str, times: np.ndarray) -> Unit:
-    """The unit of times, by the name of their column, or where they are stamps since 1970 by their size.
+    """Returns the unit of times, by the name of their column, or where they are stamps since 1970 by their size.
 
     Examples:
         >>> unit_of("timestamp [ns]", np.zeros(1)), unit_of("time", np.array([1.4e15])), unit_of("t", np.zeros(1))

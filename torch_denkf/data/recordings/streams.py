@@ -36,7 +36,7 @@ class Stream(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Readings a second."""
+        """Returns the number of readings per second."""
         return 1 / float(np.median(np.diff(self.readings.times))) if len(self.readings.times) > 1 else 0.0
 
     def oddities(self) -> list[str]:

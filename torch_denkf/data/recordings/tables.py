@@ -82,7 +82,7 @@ class Table:
 
     Raises:
         ValueError: for an unknown ``unit``, ``sample`` or ``repeats``, tolerances that are not positive, an ``offset``
-            that is no time, and ``arrived`` beside another ``sample`` than ``"last"``.
+            that is no time, and ``arrived`` together with another ``sample`` than ``"last"``.
 
     Examples:
         >>> from tempfile import mkdtemp
@@ -217,7 +217,7 @@ def check_times(times: np.ndarray, place: Callable[[int], str], column: str) -> 
 def given_times(
     given: str | Path | Sequence[float], column: str | None, source: str, count: int, what: str
 ) -> tuple[np.ndarray, Callable[[int], str]]:
-    """Times that stand beside what they belong to, in their own unit, and where each is, for messages.
+    """Returns times in a file of their own, in their own unit, and where each is, for messages.
 
     Args:
         given: a table with a row each, or the times.

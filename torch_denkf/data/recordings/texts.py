@@ -91,7 +91,7 @@ _SAID = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "ba
 
 
 def _separator(head: str) -> str:
-    """The separator of the first line; blanks where there is no other."""
+    """Returns the separator of the first line; blanks where there is no other."""
     for mark in ("\t", ";", ",", "|"):
         if mark in head and not (mark == "\t" and "" in map(str.strip, head.strip().split("\t"))):
             return mark
@@ -99,7 +99,7 @@ def _separator(head: str) -> str:
 
 
 def _split(file: Path, lines: Sequence[str], mark: str) -> tuple[list[list[str]], list[int]]:
-    """The cells of all lines that have any, and the line at which each row ends."""
+    """Returns the cells of all lines that have any, and the line at which each row ends."""
     rows, ends = [], []
     if mark == " ":
         for place, line in enumerate(lines):
@@ -119,7 +119,7 @@ def _split(file: Path, lines: Sequence[str], mark: str) -> tuple[list[list[str]]
 
 
 def _pointed(cell: str) -> str:
-    """A number with a decimal comma, as files have it whose columns are separated by semicolons, with a point."""
+    """Replaces a decimal comma by a point, for files whose columns are separated by semicolons."""
     return re.sub(r"^(\s*[-+]?\d+),(\d+)", r"\1.\2", cell)
 
 
@@ -130,7 +130,7 @@ def _is_head(row: Sequence[str]) -> bool:
 
 
 def _named(file: Path, row: Sequence[str], comment: Sequence[str], columns: Sequence[str] | None) -> Sequence[str]:
-    """Names of the columns of a file without a header.
+    """Returns names of the columns of a file without a header.
 
     Raises:
         ValueError: if nothing says them.
@@ -154,7 +154,7 @@ def _named(file: Path, row: Sequence[str], comment: Sequence[str], columns: Sequ
 
 
 def numbered(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of columns, of which those that come again get a number, as pandas has them.
+    """Returns names of columns, of which those that come again get a number, as pandas has them.
 
     Examples:
         >>> numbered(["t", "x", "x"])
@@ -169,7 +169,7 @@ def numbered(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def as_number(text: str) -> float:
-    """A finite number that float32 can hold; NaN for what is none."""
+    """Returns a finite number that float32 can hold; NaN for what is none."""
     try:
         number = read_number(text)
     except ValueError:

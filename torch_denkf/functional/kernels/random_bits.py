@@ -127,7 +127,7 @@ def _orders(members: int, device: torch.device) -> torch.Tensor:
 
 
 def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torch.Tensor:
-    """Turns random bytes, or a mask of kept units, into what dropout multiplies with: 0, or 1 / (1 - rate) if kept.
+    """Turns random bytes, or a mask of kept units, into dropout factors: 0, or 1 / (1 - rate) if kept.
 
     A byte b is kept where ``b >= 256 * rate``. Written as a line in b that is cut off at both values, it runs in wide
     registers, which comparisons of bytes and products with booleans do not: that is half of what dropout costs.

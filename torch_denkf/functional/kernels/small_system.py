@@ -52,7 +52,7 @@ def on_gpu(tensor: Tensor) -> bool:
 
 
 def identity_of(matrix: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    """Returns the identity ``[N, N]`` beside matrices ``[*B, N, N]``; not to be written to."""
+    """Returns the identity ``[N, N]`` next to matrices ``[*B, N, N]``; not to be written to."""
     size, dtype, device = matrix.shape[-1], dtype or matrix.dtype, matrix.device
     return made_once(("identity", size, dtype, device), lambda: torch.eye(size, dtype=dtype, device=device))
 
@@ -136,7 +136,7 @@ class WrittenOut:
         self.lower = lower
 
     def factor(self) -> Tensor:
-        """Returns L, ``[*B, N, N]``, all NaN where there is none."""
+        """Returns L, ``[*B, N, N]``, all NaN if there is none."""
         last = self.lower[-1][-1]  # NaN where any pivot is not positive
         zero = torch.where(last > 0, torch.zeros_like(last), last)
         rows = [torch.cat([*row, *[zero] * (len(self.lower) - len(row))], -1) for row in self.lower]

@@ -102,7 +102,7 @@ class Opposite(Space):
 
 
 class _Made(Space):
-    """A space that is made of others: what each of them does, side by side."""
+    """Base of spaces made of others, whose methods work on each part."""
 
     @property
     def flat(self):
@@ -152,11 +152,11 @@ class _Made(Space):
         return self._diagonal("dual_basis", point)
 
     def _each(self, name: str, *values: Tensor) -> Tensor:
-        """Returns what a method of each part makes of its own numbers, side by side."""
+        """Applies a method of each part to the part's components, and concatenates the results."""
         raise NotImplementedError
 
     def _diagonal(self, name: str, value: Tensor) -> Tensor:
-        """Returns what a method of each part makes of its own numbers, as blocks of a diagonal."""
+        """Applies a method of each part to the part's components, and returns block-diagonal matrices."""
         raise NotImplementedError
 
 

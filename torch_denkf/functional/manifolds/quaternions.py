@@ -38,7 +38,7 @@ _TURNS = Table("123032301210", "---+-+++--++")
 _CROSS = Table("021200100", "0-++0--+0")
 #: Two products each, of which a rotation matrix is twice the sum, and the identity.
 _FIRST, _SECOND = Table("231010101320102012", "--+-++++--+-+-++--"), Table("232332231331323112", "+" * 18)
-#: The right Jacobian of a rotation but for its third term, of a quaternion times 2 sin(a/2) / a.
+#: The right Jacobian of a rotation except for its third term, of a quaternion times 2 sin(a/2) / a.
 BENT = Table("032301210", "++--+++-+")
 
 

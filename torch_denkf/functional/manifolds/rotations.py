@@ -179,7 +179,7 @@ class _RotationAndVectors(Space):
         return self._bent(turns, turns, point, torch.full_like(third, -0.5), third)
 
     def _bent(self, turn: Tensor, turns: Tensor, value: Tensor, half: Tensor, third: Tensor) -> Tensor:
-        """Returns a rotation, and what :func:`bend` makes of the vectors of a point or tangent."""
+        """Returns a rotation, and the :func:`bend` of the vectors of a point or tangent."""
         if not self.vectors:
             return turn
         vectors = self._vectors(value, value.shape[-1] - 3 * self.vectors)

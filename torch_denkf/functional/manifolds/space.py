@@ -69,7 +69,7 @@ class Space:
         raise NotImplementedError
 
     def exp_and_jacobian(self, tangent: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns :meth:`exp` and :meth:`right_jacobian`, which may share what they need."""
+        """Returns :meth:`exp` and :meth:`right_jacobian`, which may share computations."""
         return self.exp(tangent), self.right_jacobian(tangent)
 
     def adjoint(self, point: Tensor) -> Tensor:
@@ -89,7 +89,7 @@ class Space:
         raise NotImplementedError
 
     def normalise(self, point: Tensor) -> Tensor:
-        """Returns the nearest point to numbers ``[*, P]`` that are one but for rounding, or that a network gave."""
+        """Returns the nearest point to numbers ``[*, P]`` that are one up to rounding, or that a network gave."""
         return point
 
     def plus(self, point: Tensor, tangent: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Ensemble smoothers: the members of an earlier time, corrected by later readings.
 
-Both use that members are paired in time: member i at t + 1 is the forecast of member i at t. An update that mixes the
-pairing up, such as a random rotation of the members after each analysis, takes their ground away.
+Both use that members are paired in time: member i at t + 1 is the forecast of member i at t. An update that breaks the
+pairing, such as a random rotation of the members after each analysis, makes them invalid.
 
 Sources: Evensen & van Leeuwen 2000 (the ensemble Kalman smoother, which is an analysis of the past's members); Raanes
 2016, Q. J. R. Meteorol. Soc. 142 (the ensemble Rauch-Tung-Striebel smoother, and how the two compare).
@@ -31,8 +31,8 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping:
         forecast: X_f of t + 1, the same members one step on, ``[*B, E, S]``.
         smoothed: X_s of t + 1, ``[*B, E, S]``.
         damping: factor on the gain. Where the filter inflates its members by a factor r, the gains carry the inflation
-            back, r times more in each step, in directions that no reading holds: damping below 1 / r keeps a long way
-            back stable (``DeCorr`` in DAPPER).
+            back, r times more in each step, in unobserved directions: damping below 1 / r keeps a long backward pass
+            stable (``DeCorr`` in DAPPER).
 
     Returns:
         The smoothed members of t, ``[*B, E, S]``.

@@ -31,7 +31,7 @@ def backward_weights(log_weights: Tensor, log_transition: Tensor, log_smoothed: 
         ValueError: if the shapes do not fit.
 
     Examples:
-        Two particles, of which only the second can have led to the later one with all weight:
+        Two particles, of which only the second can be the ancestor of the later particle with all weight:
 
         >>> import torch
         >>> even = torch.tensor([0.5, 0.5]).log()
@@ -57,7 +57,7 @@ def backward_smooth(
         log_transition: log-density of each particle at t, in the columns, given each at t − 1, in the rows,
             ``[*B, T, E, E]``.
         follows: boolean ``[*B, T]``; False where an element is not a step on from the one before it. None: all follow.
-        lag: how many later readings count: the belief of t given those up to t + lag. None: all of the sequence.
+        lag: number of later readings: the belief of t given those up to t + lag. None: all of the sequence.
 
     Returns:
         The smoothed log-weights, ``[*B, T, E]``.

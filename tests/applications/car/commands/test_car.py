@@ -24,7 +24,7 @@ def odometry(root, checkpoint, out, *words):
     return main([str(word) for word in (*given, "--out", out, *words)])
 
 
-def test_a_training_says_its_roles_and_knows_its_command(root, training, capsys):
+def test_training_prints_roles_and_command(root, training, capsys):
     folder, said = training
     assert "roles: validation: " in said
     assert f"denkf evaluate --checkpoint {folder}" in said

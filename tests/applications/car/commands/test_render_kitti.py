@@ -17,7 +17,7 @@ cv2.setNumThreads(1)
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A folder with pose files of two drives."""
+    """Writes a folder with pose files of two drives."""
     folder = tmp_path_factory.mktemp("recorded")
     for seed, name in enumerate(("00", "01")):
         rng = np.random.default_rng(seed)

@@ -16,7 +16,7 @@ cv2.setNumThreads(1)
 
 
 def make(root, *, images=range(6), poses=None, camera="image_2", sequence="00", grey=False, size=(10, 30), times=True):
-    """A drive whose frame k is flat in colour (B, G, R) = (k, 50 + k, 100 + k) and which moves 1 m a frame."""
+    """Returns a drive whose frame k is flat in colour (B, G, R) = (k, 50 + k, 100 + k) and which moves 1 m a frame."""
     folder = root / "sequences" / sequence
     (folder / camera).mkdir(parents=True, exist_ok=True)
     (root / "poses").mkdir(exist_ok=True)
@@ -66,7 +66,7 @@ def test_the_pose_matrix_is_kittis():
     np.testing.assert_allclose(rotation[:, 2], [-math.sin(0.4), 0, math.cos(0.4)])  # forward, and left of it
 
 
-def test_dead_reckoning_undoes_the_differences():
+def test_dead_reckoning_integrates_the_differences():
     rng = np.random.default_rng(0)
     velocities = torch.tensor(np.stack([rng.uniform(-3, 15, 200), rng.uniform(-0.3, 0.7, 200)], -1))
     path = dead_reckoning(velocities, torch.tensor([3.0, -2.0, 1.0]).double(), 0.103)

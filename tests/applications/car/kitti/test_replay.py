@@ -22,7 +22,7 @@ open_dataset = partial(KITTIOdometryExperienceReplay, size=SIZE, cache=None)
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """Three drives; a gap in the town, and a second camera in the town and the lane."""
+    """Writes three drives with a gap in the town, and a second camera in the town and the lane."""
     folder = tmp_path_factory.mktemp("kitti")
     for name, frames in LENGTHS.items():
         write_drives(folder, name, frames=frames, size=SIZE)

@@ -25,7 +25,7 @@ def calibration_of(drive):
 
 
 def recorded(car):
-    """The filter, and a list that gets the noise of each of its steps."""
+    """Returns the filter, and a list that gets the noise of each of its steps."""
     noises, plain = [], car.draw_noise
 
     def draw(frame, **kwargs):
@@ -94,7 +94,7 @@ def test_times_with_a_gap_count_as_missing_frames(checkpoint, drive):
 
 @pytest.fixture(scope="module")
 def moving(tmp_path_factory):
-    """A drive with traffic, 45 frames of 50 x 150."""
+    """Returns a drive with traffic, 45 frames of 50 x 150."""
     folder = tmp_path_factory.mktemp("moving")
     render_drives(folder, names=["m"], frames=45, camera="image_0")
     return read_kitti_drive(folder, "m", colour=False, cache=None)

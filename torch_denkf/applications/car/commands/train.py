@@ -22,7 +22,7 @@ __all__ = ["Train"]
 
 @dataclass
 class Train(Command):
-    """Train a car's filter on recorded drives, rendered ones, or both; a repeated command goes on where it stopped."""
+    """Train a car's filter on recorded drives, rendered ones, or both; a repeated command resumes where it stopped."""
 
     out: Path  # folder of the filter, with everything that its training needs
     root: Path | None = None  # folder of recorded drives in KITTI's layout, with sequences/ and poses/

@@ -49,7 +49,7 @@ class StereoCamera:
                 check_number(f"each number of {name}", number)
 
     def corners(self, pixels: Tensor) -> Tensor:
-        """Returns corners ``[*, 3]`` of what a tracker gives, ``[*, 4]``: u left, v left, u right, v right."""
+        """Returns corners ``[*, 3]`` of tracked pixels ``[*, 4]``: u left, v left, u right, v right."""
         left, right = self._undistorted(pixels[..., :2]), self._undistorted(pixels[..., 2:])
         x, y = ((pixels[..., :2] - torch.tensor(self.center).to(pixels)) / self.focal).unbind(-1)
         powers = [torch.ones_like(x), x, y, x.square(), x * y, y.square(), (x.square() + y.square()).square()]

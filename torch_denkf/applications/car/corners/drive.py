@@ -91,7 +91,7 @@ def read_corner_drive(file: str | Path, rows: int | None = None) -> tuple[Tensor
 
 
 def corner_replay(drives: dict[str, TensorDict], **options) -> EpisodeReplay:
-    """Drives as episodes of one data set, which :class:`~torch_denkf.envs.ReplayEnv` replays; nothing is for tests.
+    """Returns drives as episodes of one data set for :class:`~torch_denkf.envs.ReplayEnv`, without a test split.
 
     Args:
         drives: rows ``[T]`` by the name of the drive, with what a filter is to read.

@@ -78,7 +78,7 @@ class CornerMotion(NamedTuple):
         motion: points of SE3 ``[*B, 7]``: the pose of the later row, seen from the earlier one.
         cov: of its tangent ``[*B, 6, 6]``, as the weights of the corners say.
         log_likelihood: of the corners, mean over those that are seen, ``[*B]``.
-        weight: of each corner ``[*B, N]``, about 1 for sound ones, 0 where not seen.
+        weight: of each corner ``[*B, N]``, about 1 for inliers, 0 for missing ones.
         stereo: the error of each corner's disparity that is the same in both rows, ``[*B, N]`` in pixels.
         stereo_var: of it.
     """
@@ -104,9 +104,9 @@ def corner_motion(
 ) -> CornerMotion:
     """Returns the most likely motion by Gauss-Newton, on the corners' places and disparities.
 
-    Each corner's place in space is known but for the noise of the earlier row. That noise goes through the motion into
-    what the later row should show, so that a far corner says much of the turn and little of the way. Students's t
-    weights a corner by what is left of it.
+    The position of each corner has the noise of the earlier row. The motion carries that noise into the prediction of
+    the later row, so that a far corner informs the rotation much and the translation little. Student's t weights each
+    corner by its residual.
 
     Args:
         before: corners (u, v, disparity) of the earlier row, ``[*B, N, 3]`` in pixels.
@@ -195,7 +195,7 @@ def corner_motions(
     steps: int = 6,
     memory: bool = True,
 ) -> CornerMotion:
-    """Returns the motion of each row since the row before; what a corner has shown of its disparity is remembered.
+    """Returns the motion of each row since the row before, and remembers each corner's disparity error.
 
     A corner that moves shows how far it is. So the error of its disparity, which stays with it, is known better from
     row to row.
@@ -262,7 +262,7 @@ def _covariance(by_disparity: Tensor, flow2: Tensor, stays: Tensor | float, nois
 def started_by_ransac(
     before: Tensor, after: Tensor, seen: Tensor, camera: StereoCamera, *, pixels: float = 1.5
 ) -> tuple[Tensor, Tensor]:
-    """Motions of rows one by one, by OpenCV's random samples of corners.
+    """Returns motions of rows one by one, by OpenCV's random samples of corners.
 
     Args:
         before: corners of the earlier rows ``[T, N, 3]``.

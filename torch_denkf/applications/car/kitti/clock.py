@@ -25,7 +25,7 @@ class Times(NamedTuple):
         times: s, increasing, ``[N]``; where a stamp is wrong, a value between its neighbours.
         dt: s since the frame before, ``[N]``: the median in all rows but those after a gap. The first row has the
             median, too.
-        sound: whether the stamp of the file is right, bool ``[N]``.
+        sound: whether the stamp of the file is valid, bool ``[N]``.
         median: s, the frame time.
     """
 
@@ -45,7 +45,7 @@ def read_times(file: Path, rows: int) -> Times:
         rows: how many frames need a time.
 
     Returns:
-        The times of the first ``rows`` frames. Their median is over all rows of the file, 0.103 s where there is none.
+        The times of the first ``rows`` frames. Their median is over all rows of the file, 0.103 s if there is none.
 
     Raises:
         ValueError: naming file and line, if the file has fewer rows, if a row is no finite number, if more than a

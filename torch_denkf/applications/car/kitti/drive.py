@@ -39,7 +39,7 @@ _FORMAT = 3  # part of the cache's key: raise it when what is stored changes
 
 
 def list_kitti_drives(root: str | Path) -> list[str]:
-    """Names of the sequences that have both images and poses.
+    """Returns names of the sequences that have both images and poses.
 
     Args:
         root: folder that holds ``sequences`` and ``poses``.

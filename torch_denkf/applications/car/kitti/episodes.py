@@ -38,7 +38,7 @@ class KITTIEpisode(Episode):
 
 
 def find_drives(root: Path, drives: Sequence[str | int] | str | int | None) -> list[str]:
-    """Names of the drives to read, in the order asked for; all that have images and poses by default.
+    """Returns the names of the drives to read, in the requested order; by default all with images and poses.
 
     Raises:
         FileNotFoundError: if there is none, saying what the drives below ``root`` lack.

@@ -75,7 +75,7 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
 
 
 def drive_frames(drive: TensorDictBase) -> TensorDict:
-    """Returns all frames of a drive as training data: what a replay from its first row emits.
+    """Returns all frames of a drive as training data, as a replay from its first row emits them.
 
     Args:
         drive: as :func:`torch_denkf.applications.car.read_kitti_drive` gives it, batch size ``[N]``.

@@ -13,7 +13,7 @@ __all__ = ["bridge_gaps", "steps_between"]
 
 
 def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
-    """Pairs each frame with the last one before it that is there, so that a gap hides no motion.
+    """Pairs each frame with the last existing one before it, so that a gap loses no motion.
 
     Without it a missing frame blinds two pairs of neighbours. What comes after,
     :func:`torch_denkf.applications.car.kitti.frames.frames_at`, :func:`torch_denkf.applications.car.with_motion` and
@@ -50,7 +50,7 @@ def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
 
 
 def after_gap(drive: TensorDictBase) -> Tensor | None:
-    """Masks rows that come after a gap in time, bool ``[N]``; ``None`` where there is none."""
+    """Masks rows that come after a gap in time, bool ``[N]``; ``None`` if there is none."""
     dt = drive.get("dt", None)
     if dt is None or not dt.numel():
         return None
@@ -59,7 +59,7 @@ def after_gap(drive: TensorDictBase) -> Tensor | None:
 
 
 def steps_between(valid: Tensor, longest: int) -> Tensor:
-    """Steps from each frame back to the last one that is there, int64 ``[*B, N]``: see :func:`bridge_gaps`.
+    """Returns steps from each frame back to the last one that is there, int64 ``[*B, N]``: see :func:`bridge_gaps`.
 
     Args:
         valid: whether a frame is there, bool ``[*B, N]``, time last.

@@ -11,7 +11,7 @@ _TWO_VIEW_SIGNS = (-1.0, 1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 1.0)  # left, up, aroun
 
 
 def mirror_drive(drive: TensorDictBase, *, width: int | None = None) -> TensorDict:
-    """Mirrors a drive: images are flipped, and what points to the left points to the right.
+    """Mirrors a drive: flips images, and left and right of all entries.
 
     A drive and its mirrored copy are two drives that might have been recorded; training on both doubles the data and
     leaves no preference for one side (Kloss, Martius & Bohg 2021, arXiv:2012.14313, do so on KITTI).

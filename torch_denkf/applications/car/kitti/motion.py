@@ -32,7 +32,7 @@ def with_motion(
     signs: bool = False,
     repair: bool = False,
 ) -> TensorDict:
-    """Adds what the flow sensor reads to a drive: the motion of each image since the one before.
+    """Adds the inputs of the flow sensor to a drive: the motion of each image since the one before.
 
     ========= =============== =========================================================================================
     key       shape           content
@@ -46,7 +46,7 @@ def with_motion(
     :func:`torch_denkf.applications.car.vision.epipolar.two_view_motion`.
 
     All are zero in rows whose image, or the one before, is missing; after
-    ``kitti.gaps.bridge_gaps`` the one before is the last that is there. They cost 9 ms a frame at 50 x 150 pixels and
+    ``kitti.gaps.bridge_gaps`` the one before is the last that is there. They cost 9 ms per frame at 50 x 150 pixels and
     25 ms at 125 x 414 and are kept in the cache, under a key made of the images themselves.
 
     Args:
@@ -55,7 +55,7 @@ def with_motion(
         height: of the camera over the road, in m.
         cache: as in :func:`torch_denkf.applications.car.read_kitti_drive`.
         keep_images: False leaves the images out of the result, which makes it light.
-        two_view: also track corners, for a sensor that reads them; 12 ms a frame at 125 x 414 pixels.
+        two_view: also track corners, for a sensor that reads them; 12 ms per frame at 125 x 414 pixels.
         signs: whether the images' signs of a failing camera are added.
         repair: whether the flow is continued over what stands still before the moving camera, see
             ``vision.signs.static_region``: dirt, or a box.

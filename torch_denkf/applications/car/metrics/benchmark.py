@@ -41,7 +41,7 @@ def kitti_pathlength_error(
 
     The translation is **blind** to where the path goes: a path in the wrong direction, or round a circle, at the right
     speed scores 0, and being too fast first and too slow later cancels. The rotation sees the last heading alone, whose
-    errors on the way may cancel; it is not wrapped, so that an estimate that is right but for a whole turn scores
+    errors on the way may cancel; it is not wrapped, so that an estimate that is right except for a whole turn scores
     360 deg, and wrapped angles must be unwrapped first. One run counts, from its first row. Report
     the mean of :func:`~torch_denkf.applications.car.metrics.odometry.kitti_endpoint_error` over the same windows
     next to it, which is what the other papers' numbers are.

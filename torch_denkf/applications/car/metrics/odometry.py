@@ -116,7 +116,7 @@ def kitti_endpoint_error(
 
 
 def dead_reckoning(velocities: Tensor, initial: Tensor, dt: float | Tensor) -> Tensor:
-    """Integrates speed and turn rate to a path: what odometry alone gives, without a filter.
+    """Integrates speed and turn rate to a path (dead reckoning, without a filter).
 
     Row t moves along the heading half way between rows t-1 and t, ``θ_{t-1} + θ_dot_t dt / 2``, which is exact for the
     chord of a circular arc. Differentiable in all arguments.

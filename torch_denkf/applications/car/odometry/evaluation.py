@@ -208,7 +208,7 @@ def _line(title: str, rows: Sequence[dict[str, Any]]) -> str:
 
 
 def write_rows(rows: Sequence[dict[str, Any]], file: str | Path) -> None:
-    """Writes rows of :func:`evaluate_car_filter` as CSV, with ``COLUMNS``; what a row lacks stays empty."""
+    """Writes rows of :func:`evaluate_car_filter` as CSV, with ``COLUMNS``; missing values are empty."""
     with replacing(file) as beside, beside.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, COLUMNS)
         writer.writeheader()

@@ -59,7 +59,7 @@ def track_failing_drive(
 
     Returns:
         ``[T]``: ``"belief"``; ``"state"`` ``[T, 5]``, the truth as seen from the first pose; ``"dead_reckoning"``
-        ``[T, 3]``, the path of the sensor's readings, of which the last is held where there is none; ``"observed"``
+        ``[T, 3]``, the path of the sensor's readings, of which the last is held if there is none; ``"observed"``
         ``[T, 1]``; ``"time"`` ``[T, 1]`` in s.
 
     Raises:

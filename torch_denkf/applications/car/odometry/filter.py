@@ -192,7 +192,7 @@ def car_filter(settings: CarSettings | None = None, **changes) -> CarFilter:
 
     Args:
         settings: sizes and constants; the defaults are those of the KITTI study's DEnKF.
-        **changes: single settings, in the place of those.
+        **changes: single settings, instead of those.
 
     Returns:
         The filter; its sensor is ``filter.sensor``, the rest of it ``filter.without_sensor()``.

@@ -137,7 +137,7 @@ class FrameSource:
     def stamps(self) -> list[float] | None:
         """Reads when the frames of a video were taken, as the file says.
 
-        All frames are decoded for it: 0.7 ms a frame of 1280 x 720 pixels.
+        All frames are decoded for it: 0.7 ms per frame of 1280 x 720 pixels.
 
         Returns:
             A time in s for each frame, from the first on; of a missing frame one between its neighbours'. ``None`` of a

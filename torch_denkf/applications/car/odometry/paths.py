@@ -29,7 +29,7 @@ def write_path(beliefs: Iterable[TrackedBelief], file: str | Path) -> Iterator[T
     """Writes beliefs to a CSV file as they come, and hands them on.
 
     Rows are in a hidden file next to ``file`` while they come, each when its belief does. That takes the place of
-    ``file`` at the end, or when the work is broken off: what was written is there, and what was there before is not
+    ``file`` at the end, or when the work is interrupted: what was written is there, and what was there before is not
     lost to a full disk. What a killed process left goes when the next file is written there. Numbers have nine digits,
     which float32 needs to be exact.
 
@@ -79,7 +79,7 @@ def _row(belief: TrackedBelief) -> list[Any]:
 
 
 def read_path(file: str | Path) -> TensorDict:
-    """Reads what :func:`write_path` wrote.
+    """Reads a file of :func:`write_path`.
 
     Args:
         file: ``path.csv``.

@@ -42,7 +42,7 @@ def assign_roles(names: Sequence[str]) -> dict[str, list[str]]:
 def recorded_drives(
     root: str | Path, names: Sequence[str] | None, leave_out: Sequence[str], *, height: float, **common: Any
 ) -> list[Drive]:
-    """Drives below ``root`` that may be seen.
+    """Returns the drives below ``root`` that training may use.
 
     Args:
         root: folder in KITTI's layout.

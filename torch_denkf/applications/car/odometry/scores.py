@@ -93,7 +93,7 @@ def gain_of(readings: TensorDict) -> Tensor:
 
 @torch.no_grad()
 def filter_readings(car: CarFilter, readings: Sequence[TensorDict], *, seed: int = 0) -> TensorDict:
-    """Filters readings of one length side by side, ``[K, N]``.
+    """Filters readings of equal length in one batch, ``[K, N]``.
 
     Each begins at its true pose, with the velocities of its first reading.
 
@@ -150,7 +150,7 @@ def _crps(car: CarFilter, runs: Sequence[TensorDict]) -> float:
 
 
 def _all(car: CarFilter, readings: Sequence[TensorDict]) -> list[TensorDict]:
-    """Filters each reading as it is and with missing frames; those of one length side by side, ``[K, N]``."""
+    """Filters each reading as recorded and with missing frames, in batches of equal length ``[K, N]``."""
     groups: dict[int, list[TensorDict]] = defaultdict(list)
     for seed, reading in enumerate(readings):
         groups[len(reading)] += [all_frames(reading), lose_frames(reading, seed)]

@@ -110,7 +110,7 @@ class Drive:
 
 
 def rows(data: TensorDict, index: Tensor, longest: int) -> TensorDict:
-    """Returns rows of a drive as the sensor reads them, and what it should read.
+    """Returns the sensor's inputs from rows of a drive, and their targets.
 
     ``"target_observation"`` ``[*B, 2]`` is the sum of the true velocities over all steps of the pair.
     """

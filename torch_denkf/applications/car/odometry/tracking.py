@@ -81,7 +81,7 @@ def track(
             ``None`` for a frame that is missing.
         calibration: focal lengths and principal point (fx, fy, cx, cy) in pixels of the images.
         times: of the frames in s, as many as frames.
-        fps: frames in a second, in the place of ``times``. Without both, frames are one filter step apart.
+        fps: frames in a second, instead of ``times``. Without both, frames are one filter step apart.
         height: of the camera over the road, in m.
         pitch: how far the camera looks up from the road, in rad; -0.04 to 0.02 are found out without.
         black_level: a frame counts as missing if it is black all over: at most a thousandth of its pixels is brighter

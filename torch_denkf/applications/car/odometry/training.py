@@ -80,10 +80,10 @@ def train_car_filter(
     1. the sensor alone, by the CRPS of its samples against the true velocities;
     2. the filter on the frozen sensor's readings, by the CRPS of its belief. Some frames are lost on purpose, and
        windows begin at a wrong velocity, or the filter would learn to ignore its sensor;
-    3. both end to end, but for the noise model, which knows by now how wrong the sensor is on new drives;
+    3. both end to end, except for the noise model, which knows by now how wrong the sensor is on new drives;
     4. one number, the inflation, by the CRPS of the velocities times the path's error on the validation drives.
 
-    A call that is repeated goes on where the last one ended, also after a kill, and leaves the same weights.
+    A call that is repeated continues where the last one ended, also after a kill, and leaves the same weights.
 
     Args:
         out: folder; gets the filter (see :func:`torch_denkf.pretrained.save_pretrained`), checkpoints and logs below
@@ -156,7 +156,7 @@ def train_car_filter(
 
 
 def _read(drives: Sequence[Drive], progress: bool) -> dict[Drive, TensorDict]:
-    """Returns flow, road and truth of each drive; 10 to 30 ms a frame the first time."""
+    """Returns flow, road and truth of each drive; 10 to 30 ms per frame the first time."""
     data = {}
     with progress_bar("optical flow", len(drives), unit=" drives", shown=progress) as bar:
         for drive in drives:

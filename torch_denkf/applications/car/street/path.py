@@ -75,7 +75,7 @@ class Path:
         return np.stack([-np.cos(self.heading), -np.sin(self.heading)], -1)
 
     def at(self, along: np.ndarray, aside: np.ndarray | float = 0.0) -> np.ndarray:
-        """Places on or next to the line.
+        """Returns places on or next to the line.
 
         Args:
             along: m from the line's first point, ``[T]``.

@@ -75,7 +75,7 @@ class Renderer:
         return cv2.LUT(averaged, table[None])
 
     def _travel(self, pose: np.ndarray, frame: int | None) -> None:
-        """Heights of the ground and of what stands on it, for the stretch where the camera is."""
+        """Returns heights of the ground and of objects on it, for the stretch around the camera."""
         terrain = self.scene.terrain
         if frame is None:
             metre = int(np.linalg.norm(terrain.line - pose[[0, 2], 3], axis=-1).argmin())

@@ -30,7 +30,7 @@ def roadside_scene(
     visits.
 
     Args:
-        path: x and y in m, θ in rad, in its first three columns, ``[N, 3]``; the road goes on straight at its end.
+        path: x and y in m, θ in rad, in its first three columns, ``[N, 3]``; the road continues straight at its end.
         rng: source of randomness.
         ground: height of the ground under the car in each row, KITTI's y (down) in m, ``[N]``; by default level,
             1.65 m under a camera at 0.

@@ -59,7 +59,7 @@ class Mover:
     faces: list[list[np.ndarray]]
 
     def at(self, frame: int) -> Box | None:
-        """Returns the car in a frame, or None where it is not there."""
+        """Returns the car in a frame, or None if it does not exist."""
         if not 0 <= frame - self.first < len(self.track):
             return None
         x, z, ahead, up = self.track[frame - self.first]

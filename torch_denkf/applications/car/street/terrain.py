@@ -50,7 +50,7 @@ class Terrain:
         self.line = line
         reach = round(4 * SMOOTH)
         kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / SMOOTH) ** 2)
-        padded = np.pad(heights, reach, mode="reflect", reflect_type="odd")  # goes on with its slope
+        padded = np.pad(heights, reach, mode="reflect", reflect_type="odd")  # continues with its slope
         self.heights = np.convolve(padded, kernel / kernel.sum(), mode="valid")
 
     def around(self, metre: int) -> Relief:

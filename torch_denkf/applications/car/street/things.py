@@ -34,7 +34,7 @@ class Things:
         self._sun = scene.sun / max(np.linalg.norm(scene.sun), 1e-9) * (1 - scene.shade)
 
     def settle(self, relief: Relief, place: np.ndarray) -> None:
-        """Places what is near (x, z) on the ground."""
+        """Places nearby objects at (x, z) on the ground."""
         self.relief = relief
         sight = FAR * np.hypot(1, self.camera.size[1] / (2 * self.camera.fx)) + 40
         near = np.linalg.norm(self.scene.places - place, axis=-1) < sight

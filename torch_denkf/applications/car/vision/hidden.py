@@ -20,7 +20,7 @@ _REACH = 3  # pixels that the continuation looks at
 
 
 def continue_picture(image: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Returns a canonical picture ``[H, W]``, uint8, without the edges of what hides a part of it ``[H, W]``, bool."""
+    """Returns a canonical image ``[H, W]``, uint8, without the edges of an occlusion ``[H, W]``, bool."""
     return cv2.inpaint(image, grown(hidden, _PICTURE_RIM), _REACH, cv2.INPAINT_TELEA)
 
 

@@ -29,7 +29,7 @@ _WHITE, _BLACK = 250, 5  # grey levels at which a pixel counts as too bright, or
 
 
 def static_region(previous: np.ndarray, current: np.ndarray, *, noise: int = 0, cells: int = _CELLS) -> np.ndarray:
-    """Masks what stands still before a moving camera: dirt on the lens, an occlusion, dead pixels.
+    """Masks static pixels before a moving camera: dirt on the lens, an occlusion, dead pixels.
 
     The picture is divided into square cells. A cell is static if none of its pixels changed by more than the noise,
     while more than half of the cells did change. Cells that are too bright in both pictures are left out, because an
@@ -72,7 +72,7 @@ def static_region(previous: np.ndarray, current: np.ndarray, *, noise: int = 0, 
 
 
 def picture_signs(previous: np.ndarray, current: np.ndarray, *, noise: int = 0) -> np.ndarray:
-    """Numbers that are small for two pictures of a sound camera, and large for those of one that fails.
+    """Returns signs of a fault that are small for two images of a working camera, and large for a failing one.
 
     An :class:`torch_denkf.monitoring.InnovationMonitor` watches them besides the innovations, and a
     :class:`torch_denkf.monitoring.SignGate` takes readings out by them; both take from clean data what is large.
@@ -156,7 +156,7 @@ def plane_distance(flow: Tensor, *, height: float = KITTI_HEIGHT) -> Tensor:
 
 
 def flow_signs(plane: Tensor, road: Tensor, distance: Tensor) -> Tensor:
-    """Signs that what was taken for the road is none, such as the back of a car close ahead.
+    """Returns signs that the assumed road is none, such as the back of a car close ahead.
 
     ============ ======================================================================================================
     entry        content

@@ -45,7 +45,7 @@ def read_demos(
     cache: str | Path | bool | None,
     progress: Callable[[int], object],
 ) -> TensorDict:
-    """Demos one behind the other, from the cache or from their files, whose checksums are compared.
+    """Returns consecutive demos, from the cache or from their files, whose checksums are compared.
 
     ======================= ========== ==========================================================================
     key                     shape      content

@@ -105,7 +105,7 @@ def write_demo(root: Path, demo: Demo, failures: int = 0) -> Entry:
 
 
 def what_is_wrong(root: Path, entry: Entry) -> str | None:
-    """Returns None for a file with the manifest's checksum, or else what is wrong, for a message."""
+    """Returns None for a file with the manifest's checksum, or else a message about the difference."""
     try:
         data = (root / entry.file).read_bytes()
     except OSError as error:
@@ -168,7 +168,7 @@ def _check_arrays(archive: zipfile.ZipFile, entry: Entry) -> None:
 
 
 class _OtherShape(ValueError):
-    """An array that is not what the manifest says."""
+    """Raised for an array that differs from the manifest."""
 
 
 def read_demo(root: Path, entry: Entry) -> Demo:
@@ -305,7 +305,7 @@ def append_to_manifest(root: Path, entry: Entry) -> None:
 
 
 def write_options(root: Path, options: dict) -> None:
-    """Writes what all demos of the folder follow from."""
+    """Writes the settings from which all demos of the folder follow."""
     write_text(root / COLLECTION, json.dumps(options, indent=1) + "\n")
 
 

@@ -1,6 +1,6 @@
 """Collects demonstrations of the UR5 table into a folder.
 
-A repeated or killed call goes on with the demos that are missing, cut or changed. What comes out depends neither on
+A repeated or killed call continues with the demos that are missing, cut or changed. What comes out depends neither on
 that nor on the number of processes: demo i follows from the seed and i alone, byte for byte (pictures on the same
 machine and OpenGL library). :class:`torch_denkf.applications.ur5.UR5ExperienceReplay` reads the folder.
 """
@@ -48,7 +48,7 @@ def collect_ur5_demos(
 
     Args:
         root: the folder, made if missing. Another collection's raises an error.
-        demos: how many the folder shall have. A larger number than before goes on where the last one ended.
+        demos: how many the folder shall have. A larger number than before continues where the last one ended.
         size: (H, W) of the pictures.
         frames: random steps of each demo to draw; 0 for all, None for no pictures (no OpenGL is needed then).
         domain: ``"sim"`` or ``"real_like"``, see :class:`torch_denkf.applications.ur5.UR5TableEnv`.
@@ -95,7 +95,7 @@ def collect_ur5_demos(
 
 
 def _missing(root: Path, demos: int, options: Options) -> tuple[list[int], dict[int, Entry]]:
-    """Numbers of the demos to make, and the manifest without them."""
+    """Returns the numbers of the demos to record, and the manifest without them."""
     ours = {"format": FORMAT, **asdict(options)}
     ours |= {"size": list(options.size), "tasks": list(options.tasks)}  # as JSON gives them back
     entries = files.read_manifest(root, skip_damaged=True)
