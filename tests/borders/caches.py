@@ -94,7 +94,7 @@ def _nowhere(name: str, cache: Any, folder: Path) -> TensorDict:
 
 
 def targets() -> Iterator[Target]:
-    """What is kept of each recording, and the folder in which it is."""
+    """Yields damaged cache entries of each recording, and wrong cache folders."""
     for name, (sound, _) in CACHED.items():
         target = partial(Target, "caches", words=("cache",), needs=sound)
         for part in ("largest", "smallest", "description"):

@@ -43,7 +43,7 @@ def _that_picture(result: TensorDict) -> bool:
 
 
 def _frame_masked(row: int, result: TensorDict) -> bool:
-    """Right where one frame counts as missing, and all else is as without damage."""
+    """Tells whether one frame counts as missing, and all else is as without damage."""
     expected = KITTI.reference().clone()
     expected["image"][row], expected["frame_valid"][row] = 0, False
     return same(result, expected, rtol=1e-5, atol=1e-5)
@@ -169,6 +169,6 @@ def _arguments() -> Iterator[Subject]:
 
 
 def targets() -> Iterator[Target]:
-    """All files and arguments."""
+    """Yields all files and arguments."""
     yield from _files()
     yield from targets_of("kitti", *_arguments())

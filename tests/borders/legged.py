@@ -205,7 +205,7 @@ def _robots() -> Iterator[Subject]:
 
 
 def targets() -> Iterator[Target]:
-    """All entries and arguments."""
+    """Yields all entries and arguments."""
     yield from _entries()
     yield from targets_of("legged robots", *_subjects())
     yield from targets_of("legged robots", *_robots(), needs=quadruped.quadruped_env, slow=True)

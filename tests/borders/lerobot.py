@@ -45,7 +45,7 @@ def _rows_kept(result: TensorDict) -> bool:
 
 
 def _row_masked(key: str, result: TensorDict) -> bool:
-    """Right where row 2 of the damaged episode counts as missing in an entry, and all else is as without damage."""
+    """Tells whether row 2 of the damaged episode counts as missing in an entry, and all else is as without damage."""
     expected, row = V2.reference().clone(), LENGTHS[0] + 2
     expected["observed"][row] = False
     if key == "pixels":
@@ -152,6 +152,6 @@ def _arguments() -> Iterator[Subject]:
 
 
 def targets() -> Iterator[Target]:
-    """All files and arguments."""
+    """Yields all files and arguments."""
     yield from _files()
     yield from targets_of("lerobot", *_arguments())

@@ -354,7 +354,7 @@ def _packages() -> Iterator[Subject]:
 
 
 def targets() -> Iterator[Target]:
-    """All files and arguments."""
+    """Yields all files and arguments."""
     npz_of_zeros(1 << 30)  # here, not in each case's process
     yield from _of_checkpoints()
     for name in LOADERS:

@@ -59,7 +59,7 @@ def _noise(name: str, way: str, key: str, sound: Tensor, wrong: d.Wrong) -> Iter
 
 
 def targets() -> Iterator[Target]:
-    """R and Q, shown and hidden and rejected; times, quaternions and rates that are none."""
+    """Yields R and Q, shown and hidden and rejected; times, quaternions and rates that are none."""
     for way in ("step", "sequence"):
         for name in GAUSSIAN + SAMPLED:
             for key in ("r", "q"):

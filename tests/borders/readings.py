@@ -308,7 +308,7 @@ def laid_out(one: Fed, layouts: dict[str, tuple[tuple[str, ...], Use]]) -> Itera
 
 
 def targets() -> Iterator[Target]:
-    """All entries of filters and smoothers."""
+    """Yields all entries of filters and smoothers."""
     for one in (*FILTERS.values(), *SMOOTHERS, *LAGGED):
         yield from readings(one)
     for one in (*FILTERS.values(), *LAGGED):

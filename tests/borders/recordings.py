@@ -169,7 +169,7 @@ def _trajectory(**given: Any) -> Any:
 
 
 def _two(columns: list[str], stream: str, name: str) -> list[Recording]:
-    """Two recordings of the same file, which do not go together."""
+    """Returns two recordings of the same file, which do not go together."""
     first, second = Table(own() / "table.csv", ["x"]), Table(own() / "table.csv", columns)
     return [Recording(state=first), Recording(name=name, **{stream: second})]
 
@@ -231,6 +231,6 @@ def _arguments() -> Iterator[Subject]:
 
 
 def targets() -> Iterator[Target]:
-    """All files and arguments."""
+    """Yields all files and arguments."""
     yield from _files()
     yield from targets_of("recordings", *_arguments())

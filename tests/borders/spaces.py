@@ -104,7 +104,7 @@ def _scored(name: str) -> Iterator[Target]:
 
 
 def targets() -> Iterator[Target]:
-    """Readings, masks and truths on all spaces."""
+    """Yields readings, masks and truths on all spaces."""
     for turn, name in enumerate(SPACES):
         for kind in dict.fromkeys(("EKF", KINDS[turn % len(KINDS)])):
             yield from _on_space(kind, name)

@@ -125,6 +125,6 @@ def _arguments() -> Iterator[Subject]:
 
 
 def targets() -> Iterator[Target]:
-    """All files and arguments."""
+    """Yields all files and arguments."""
     yield from _files()
     yield from targets_of("ur5", *_arguments())

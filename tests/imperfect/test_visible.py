@@ -251,7 +251,7 @@ def test_head_outputs_its_initial_value():
             Visibility(4, **wrong)
 
 
-def test_what_cannot_be_raises():
+def test_missing_visibility_raises():
     with pytest.raises(KeyError, match="visible"):
         Visible(EnsembleAnalysis("etkf"))(
             several(samples=True).exclude(VISIBLE).rename_key_(KEY, ("sensor", "ensemble"))

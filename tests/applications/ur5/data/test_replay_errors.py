@@ -25,7 +25,7 @@ def test_options_out_of_range(root):
     assert len(short.sample()) in (12, 13, 14)
 
 
-def test_a_damaged_line(tmp_path):
+def test_damaged_line_of_the_manifest(tmp_path):
     """A damaged line of the manifest raises; a collection skips it with a warning, and records that demo again."""
     write_folder(tmp_path, [make_demo(number, 8) for number in range(4)])
     lines = (tmp_path / MANIFEST).read_text().splitlines()
