@@ -43,9 +43,9 @@ class Frames:
         time: name of the column with times in that file.
         unit: of these times: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``.
         start: offset in s, added to all times, such as the start of a video on the clock of the other streams.
-        sample: image for a row of the data set: ``"last"``, the last one up to the row's time; or ``"nearest"``, the
-            nearest in time, which may be in the future. Each image appears in one row only; rows without an image are
-            not ``observed``.
+        sample: image for a row of the data set: ``"last"``, the last one up to the row's time, delayed by up to one
+            row; or ``"nearest"``, the nearest in time, which may be in the future, for smoothing. Each image appears in
+            one row only; rows without an image are not ``observed``.
         tolerance: in s; images that are farther away in time count as missing. By default no limit with ``"last"``,
             half a row's time with ``"nearest"``.
 

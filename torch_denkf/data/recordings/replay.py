@@ -124,8 +124,10 @@ class RecordingReplay(EpisodeReplay):
     first row, unless ``span="all"`` keeps the rows before it. The other streams are resampled to these rows by their
     ``sample``:
 
-    * ``"last"``, the default, is a zero-order hold of the last value. It never uses future readings.
-    * ``"nearest"`` and ``"linear"`` use up to one future reading. They suit a ``state`` that is known afterwards.
+    * ``"last"``, the default, is a zero-order hold of the last value. It is causal, and delays readings by up to one
+      row.
+    * ``"nearest"`` uses readings up to half a row ahead. Use it for smoothing: a delay of part of a row is a bias.
+    * ``"linear"`` uses the next reading, too. It suits a ``state`` that is known afterwards.
 
     A reading is *observed* in one row: with ``"last"`` the first row after it arrived, with ``"nearest"`` its nearest.
     A filter with ``observed_key="imu_observed"`` then uses each reading once, and a model that reads the held value,

@@ -65,8 +65,8 @@ class Table:
         offset: in s, added to all times, such as -0.7 for readings that are stamped 0.7 s late.
             :func:`~torch_denkf.data.clock_offsets` estimates it.
         sample: interpolation to the rows of the data set. ``"last"``: the last reading up to the row's time, a
-            zero-order hold. The other two use future readings: ``"nearest"``, the nearest in time; ``"linear"``, linear
-            interpolation (unwrap angles first).
+            zero-order hold, with a delay of up to one row. The other two use future readings: ``"nearest"``, the
+            nearest in time, for smoothing; ``"linear"``, linear interpolation (unwrap angles first).
         tolerance: in s. With ``"last"`` and ``"nearest"``, readings that are farther away count as missing: by default
             no limit with ``"last"``, half a row's time with ``"nearest"``. With ``"linear"``, there is no value between
             readings that are farther apart; by default there is no limit.
