@@ -36,12 +36,12 @@ class MixedUpdate(Around):
 
         Args:
             entries: with the forecast.
-            probability: of the first before the reading is known, ``[*B, 1]``. With 1 the first belief comes out, and
-                with 0 the second, without rounding.
-            share: that after the reading is known.
+            probability: prior probability of the first, ``[*B, 1]``. With 1 the result is exactly the first belief, and
+                with 0 the second.
+            share: posterior probability of the first.
             out: the outputs of the update, the first belief.
             other: the second, under the keys of ``out``.
-            seen: where anything is observed, ``[*B, 1]``; elsewhere the first belief comes out. ``None``: everywhere.
+            seen: mask of elements with an observation, ``[*B, 1]``; the others get the first belief. ``None`` for all.
         """
         first = probability >= 1 if seen is None else (probability >= 1) | ~seen
         mix = self._mixed_moments if self.kind == "moments" else self._mixed_members
@@ -100,7 +100,7 @@ def kind_of_update(analysis: Update, name: str) -> str:
     """Returns the kind of belief that an analysis updates: ``"members"``, ``"moments"`` or ``"particles"``.
 
     Raises:
-        TypeError: if the analysis does not say where its forecast and its reading are; ``name`` is the wrapper's.
+        TypeError: if the keys of the forecast and the reading of the analysis are unknown; ``name`` is the wrapper's.
     """
     wrapped = isinstance(analysis, Around) and not analysis.updates_ensemble
     if isinstance(analysis, Update) and not wrapped and analysis.info_prefix is not None:

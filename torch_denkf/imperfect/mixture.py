@@ -1,12 +1,12 @@
 r"""Mixture of two beliefs, for a reading that may not be about the state, and their responsibilities.
 
-With the probability p the reading is about the state, :math:`y \sim N(h(x), S)`; with 1 - p it is anything, :math:`y
-\sim b`. The belief then is a mixture: with the share
+With the probability p the reading is about the state, :math:`y \sim N(h(x), S)`; with 1 - p about something else,
+:math:`y \sim b`. The belief then is a mixture: with the responsibility
 
 .. math:: q = \frac{p N(y)}{p N(y) + (1 - p) b(y)}
 
-of what the update makes of the reading, and with 1 - q of the forecast. Here it is replaced by what has its mean and
-its covariance.
+as the weight of the updated belief, and 1 - q that of the forecast. It is approximated by a belief with the same mean
+and covariance.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ def responsibility(probability: Tensor, log_own: Tensor, log_other: Tensor) -> T
     """Returns the posterior probability that the reading is about the state.
 
     Args:
-        probability: p, before the reading is known, in [0, 1].
-        log_own: log-density of the reading if it is, ``log N(y)``.
-        log_other: if it is not, ``log b(y)``.
+        probability: prior probability p, in [0, 1].
+        log_own: log-density of a reading about the state, ``log N(y)``.
+        log_other: log-density of another reading, ``log b(y)``.
 
     Returns:
         q, of the same shape; 1 for p = 1 and 0 for p = 0, without a gradient there.
