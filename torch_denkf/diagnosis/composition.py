@@ -15,7 +15,7 @@ __all__ = ["check_composition"]
 
 
 def check_composition(modules: Sequence[Placed], structure: Structure) -> None:
-    """Raises where a filter's modules would lose or overwrite an entry.
+    """Raises if a filter's modules would lose or overwrite an entry.
 
     Args:
         modules: in the order in which they were given.

@@ -108,7 +108,7 @@ class UnreadMasks(Once):
         mask: Tensor,
         name: str,
     ) -> None:
-        """Warns where a table's forward-filled value would be used as a new observation.
+        """Warns if a table's forward-filled value would be used as a new observation.
 
         Whether the filter's masks hide it, too, is looked at where the filter reads no other mask than ``"observed"``.
         """
@@ -125,7 +125,7 @@ class UnreadMasks(Once):
             )
 
     def _of_transforms(self, structure: Structure, env, name: str) -> None:
-        """Warns where a transform drops the inputs of the filter, and marks that in a mask the filter does not read."""
+        """Warns if a transform drops the inputs of the filter, and marks that in a mask the filter does not read."""
         read = {*structure.needed, *structure.optional}
         while isinstance(env, TransformedEnv):
             transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]

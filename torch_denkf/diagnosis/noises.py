@@ -31,7 +31,7 @@ _ROUNDING = 1e-4
 
 
 class WrongNoise(Once):
-    """Raises where the noise of a reading, or a variance of the belief, is negative, and warns of NaN in a sequence.
+    """Raises if the noise of a reading, or a variance of the belief, is negative, and warns of NaN in a sequence.
 
     Noise of missing observations is not checked. ``check_finite=False`` disables all checks.
     """

@@ -146,7 +146,7 @@ def bad_inputs(structure: Structure, entries: Entries, written: Entries) -> str:
 
 
 def _hides(mask: Tensor, value: Tensor) -> bool:
-    """Tells whether a mask ``[*B, 1]`` or ``[*B, O]`` fits a value ``[*B, O]``, ``[*B, E, O]`` or ``[*B, O, O]``."""
+    """Returns True if a mask ``[*B, 1]`` or ``[*B, O]`` fits a value ``[*B, O]``, ``[*B, E, O]`` or ``[*B, O, O]``."""
     batch = mask.shape[:-1]
     return value.shape[: len(batch)] == batch and mask.shape[-1] in (1, value.shape[-1])
 

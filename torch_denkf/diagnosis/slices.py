@@ -27,7 +27,7 @@ _CURE = (
 
 
 class UnmarkedSlices(Once):
-    """Raises where the batch of a loss holds slices of episodes end to end, and nothing marks where they begin."""
+    """Raises if the batch of a loss has concatenated slices of episodes without marks of their beginnings."""
 
     ways = ("data",)
 
