@@ -15,7 +15,7 @@ def rows(seconds: float) -> list[Row]:
         product, flops = matrix_product()
         ours = sequences(batch)
         timings = interleave({**ours, "peak": product}, seconds=seconds)
-        # The peak is measured in the same rounds: a machine that is slow at the time is slow for both.
+        # The peak is measured in the same rounds, so that a slow machine is slow for both.
         peak = flops / (1e-6 * timings.micro("peak"))
         floor = max(operations(batch) / peak, traffic(filter, batch) / (1e9 * measure()["bandwidth_gb_s"]))
         note = f"{operations(batch) / 1e6:.2f} MFLOP per step at {peak / 1e9:.0f} GFLOP/s"
