@@ -69,7 +69,6 @@ def speed() -> Bars:
     """Returns the time of a compiled sequence divided by that of a peer."""
     rows = pd.DataFrame(json.loads((STUDIES / "speed/results/speed.json").read_text()))
     found = rows["name"].str.extract(r"^compiled (?P<what>.+ / .+), B=(?P<size>.+)$").join(rows["ratio"]).dropna()
-    found = found[~found["what"].str.contains("floor")]
     bars = found.pivot(index="what", columns="size", values="ratio").loc[found["what"].unique(), found["size"].unique()]
     return "our time / theirs", bars.add_suffix(" at a time")
 

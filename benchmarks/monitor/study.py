@@ -19,8 +19,6 @@ from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 from torch_denkf.applications.car.kitti.render import render_drives
 
 TASKS = ("ur5", "kitti-real", "kitti-rendered")
-ALARMS = ("auroc", "delay_steps", "false_alarms_per_1000", "error_ratio")
-PATHS = ("m_per_m", "held_v", "held_theta_dot", "m_per_m_gated", "held_v_gated", "held_theta_dot_gated")
 
 
 INVENTED = {"calibration": 16, "validation": 8}  # drives along random roads

@@ -26,7 +26,6 @@ PAIRS = (
     "against_dynamax",
     "against_filterpy",
     "against_dapper",
-    "against_floor",
     "packaged_step",
     "one_row",
     "log_of_attitude",

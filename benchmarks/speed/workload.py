@@ -7,7 +7,6 @@ Transition (5, 32, 32, 64, 64, 5) with dropout, residual; observation (5, 32, 32
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -123,21 +122,3 @@ def weights(filter: Filter) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
 def noise_floor(filter: DEnKF) -> tuple[np.ndarray, np.ndarray]:
     """Returns r^2 - c and c of the noise model, ``[O]`` each."""
     return filter["noise"].variance.numpy().copy(), filter["noise"].floor.numpy().copy()
-
-
-def operations(batch: int) -> int:
-    """Returns the least floating-point operations of a step: products of matrices, and the masks' factors."""
-
-    def network(sizes: tuple[int, ...]) -> int:
-        return sum(2 * rows * columns for rows, columns in pairwise(sizes))
-
-    members = network((STATE, *HIDDEN, STATE)) + network((STATE, *HIDDEN, OBSERVATION)) + sum(HIDDEN)
-    members += 2 * OBSERVATION * (OBSERVATION + STATE) + 2 * OBSERVATION * STATE  # covariances; gain times shift
-    frame = network((OBSERVATION, *NOISE_HIDDEN, OBSERVATION)) + OBSERVATION**3
-    return batch * (MEMBERS * members + frame)
-
-
-def traffic(filter: DEnKF, batch: int) -> int:
-    """Returns the least bytes that a step moves: weights once, ensemble in and out, samples, a byte per mask bit."""
-    ensemble = batch * MEMBERS * (2 * STATE + OBSERVATION) * 4
-    return ensemble + batch * MEMBERS * sum(HIDDEN) + sum(p.numel() * 4 for p in filter.parameters())

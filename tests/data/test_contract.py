@@ -235,7 +235,7 @@ def test_episodes_that_do_not_fit_their_rows():
         Episode("a", 0, 3),
         Episode("b", 4, 2),
     )
-    fails(ValueError, "each of at least a row", rows, Episode("a", 0, 0), Episode("b", 0, 6))
+    fails(ValueError, "each of at least one row", rows, Episode("a", 0, 0), Episode("b", 0, 6))
 
 
 def test_losses_accept_samples():

@@ -13,14 +13,7 @@ from tests.filters.gaussian_for_tests import learned_filter, learned_frames
 from torch_denkf.baselines import IEnKS, LSTMFilter
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.filters import EKF
-from torch_denkf.modules import (
-    ConstantNoise,
-    GaussianPrior,
-    LearnedTransition,
-    MomentPrior,
-    Select,
-    StochasticMLP,
-)
+from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, MomentPrior, Select, StochasticMLP
 
 STATES = 3
 

@@ -48,7 +48,7 @@ def test_ambiguous_forecast_raises_without_forecast_keys():
     with pytest.raises(ValueError, match="forecast_keys="):
         linear_with({"transition": Two()})
     linear_with({"transition": Two()}, forecast_keys={ENSEMBLE: ("forecast", "ensemble")})
-    with pytest.raises(ValueError, match="forecast_keys names"):
+    with pytest.raises(ValueError, match="forecast_keys has"):
         linear_with({"transition": Two()}, forecast_keys={ENSEMBLE: ("nowhere", "ensemble")})
 
 

@@ -533,7 +533,7 @@ def test_what_raises():
     wrong = TensorDict({"a": torch.zeros(3, len(H)), "a_observed": torch.ones(3, 1)}, [3])
     with pytest.raises(TypeError, match=r"a_observed.* must be boolean"):
         FusedFilter(linear, one(delay=1), **moments).sequence(wrong)
-    with pytest.raises(TypeError, match="carries a past already"):
+    with pytest.raises(TypeError, match="already carries a lag window"):
         FixedLag(FusedFilter(linear, one(), **moments, lag=3), 2)
 
 

@@ -219,7 +219,7 @@ def test_the_option_of_particles_comes_close_to_it():
     assert ((out["belief", "mean"] - mean).abs() / std).max() < 0.1
     assert (out["belief", "var"].sqrt() / std - 1).abs().max() < 0.1
     moved = particles["transition"]
-    with pytest.raises(ValueError, match="ResampledTransition holds its motion"):
+    with pytest.raises(ValueError, match="motion inside the ResampledTransition"):
         ParticleFilter(moved, None, Select([0]), initial=particles.initial, sensor_error=known_bias())
 
 

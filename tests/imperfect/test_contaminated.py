@@ -31,7 +31,6 @@ from torch_denkf.modules import (
     EnsembleAnalysis,
     GaussianLikelihood,
     KalmanAnalysis,
-    LearnedLikelihood,
     LinearObservation,
     Select,
     UKFAnalysis,
@@ -359,21 +358,8 @@ def test_share_and_width_come_from_entries_and_from_heads(name):
 
 def test_invalid_arguments_raise():
     inner = EnsembleAnalysis("etkf")
-    for options in (
-        {"share": -0.1},
-        {"share": 1.1},
-        {"share": 0.0, "trainable": True},
-        {"width": 0.0},
-        {"noise": [0.0]},
-        {"share": [0.1, 0.2]},
-        {"width": [2.0, 3.0]},
-        {"noise": 2.0},
-    ):
-        with pytest.raises(ValueError, match=next(iter(options))):
-            Contaminated(inner, **options)
-    for other in (Contaminated(inner), Visible(inner), ParticleAnalysis(), Select([0]), LearnedLikelihood(4, 2)):
-        with pytest.raises(TypeError, match="Contaminated goes around"):
-            Contaminated(other)
+    with pytest.raises(ValueError, match="share"):
+        Contaminated(inner, share=0.0, trainable=True)
     with pytest.raises(ValueError, match="divergence is for"):
         update_of("particles", divergence=0.1)
     with pytest.raises(TypeError, match="share must be a TensorDict module"):

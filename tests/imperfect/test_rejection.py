@@ -359,27 +359,3 @@ def test_unmasked_invalid_value_among_masked_ones_raises():
         RejectReadings({"pose": "seen"}, spaces={"pose": SE2()}, on_bad="raise")(
             of("pose", [0.5, NAN, 2.0], seen=torch.tensor([[True, False, True]]))
         )
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"masks": {}}, ValueError, "masks says the mask of each reading"),
-        ({"masks": ["x"]}, ValueError, "masks says the mask of each reading"),
-        ({"masks": {"x": 3}}, TypeError, "each name in masks and noises is a key"),
-        ({"on_bad": "warn"}, ValueError, 'on_bad is "mask" or "raise"'),
-        ({"by_component": ["y"]}, ValueError, "by_component names 'y', of which masks says no mask"),
-        ({"noises": {"y": "n"}}, ValueError, "noises names 'y'"),
-        ({"spaces": {"y": SE2()}}, ValueError, "spaces names 'y'"),
-        ({"limit": -1.0}, ValueError, "limit must be"),
-        ({"count_key": 3}, TypeError, "count_key of RejectReadings is a key"),
-        ({"noises": ["x"]}, TypeError, "noises is a dict"),
-        ({"spaces": {"x": 3}}, TypeError, "the space of 'x' is a Space"),
-        ({"masks": {"x": "x"}}, ValueError, "got 'x' twice"),
-        ({"count_key": "seen"}, ValueError, "got 'seen' twice"),
-        ({"limits": 3}, TypeError, "RejectReadings takes no argument 'limits'"),
-    ],
-)
-def test_wrong_arguments_are_named(arguments, error, message):
-    with pytest.raises(error, match=message):
-        RejectReadings(**{"masks": {"x": "seen"}, **arguments})

@@ -15,7 +15,6 @@ from torch_denkf.modules import (
     EnsembleAnalysis,
     GaussianLikelihood,
     KalmanAnalysis,
-    LearnedLikelihood,
     LocalEnsembleAnalysis,
     Select,
     UKFAnalysis,
@@ -252,12 +251,8 @@ def test_head_outputs_its_initial_value():
             Visibility(4, **wrong)
 
 
-def test_invalid_arguments_raise():
-    inner = EnsembleAnalysis("etkf")
-    with pytest.raises(ValueError, match="broad"):
-        Visible(inner, broad=1.0)
-    for other in (Visible(inner), ParticleAnalysis(), Select([0]), LearnedLikelihood(4, 2)):
-        with pytest.raises(TypeError, match="Visible goes around"):
-            Visible(other)
+def test_missing_visibility_raises():
     with pytest.raises(KeyError, match="visible"):
-        Visible(inner)(several(samples=True).exclude(VISIBLE).rename_key_(KEY, ("sensor", "ensemble")))
+        Visible(EnsembleAnalysis("etkf"))(
+            several(samples=True).exclude(VISIBLE).rename_key_(KEY, ("sensor", "ensemble"))
+        )

@@ -119,7 +119,7 @@ def test_lag_is_applied_inside_wrappers(name):
     changed = td.copy().set(("sensor", "ensemble"), around.scaled(dict(td.items(True, True)), Call(td.batch_size)))
     expected = UPDATES[name]()(changed).set(("sensor", "ensemble"), td["sensor", "ensemble"])
     assert_equal(around(td), expected)
-    with pytest.raises(TypeError, match="ScaledInnovation does not say what a reading means for earlier states"):
+    with pytest.raises(TypeError, match="ScaledInnovation cannot correct earlier states"):
         LaggedAnalysis(ScaledInnovation(plain, 0.5))
     with pytest.raises(TypeError, match="ScaledInnovation does not say"):
         GatedAnalysis(ScaledInnovation(plain, 0.5), WIDTH)

@@ -117,7 +117,7 @@ def test_the_jacobian_has_a_gradient_unless_it_is_stopped(float64):
 @pytest.mark.parametrize("layer", [nn.Dropout(), FlipoutLinear(3, 3)])
 def test_random_layers_raise(Transition, layer):
     random = LearnedTransition(nn.Sequential(nn.Linear(3, 3), layer))
-    with pytest.raises(ValueError, match=r"deterministic model; LearnedTransition holds random parts \(\['module.1'\]"):
+    with pytest.raises(ValueError, match=r"deterministic model; LearnedTransition has random parts \(\['module.1'\]"):
         Transition(random, constant_noise(3))
 
 
@@ -134,7 +134,7 @@ def test_random_observation_models_raise_or_made_deterministic(Analysis):
 def test_sub_models_that_draw_their_own_noise_raise(Transition):
     matrix, state = torch.eye(3), torch.get_rng_state()
     noisy = NoisyLinear(matrix, matrix)
-    with pytest.raises(ValueError, match=r"NoisyLinear holds random parts \(\['NoisyLinear'\]"):
+    with pytest.raises(ValueError, match=r"NoisyLinear has random parts \(\['NoisyLinear'\]"):
         Transition(noisy, constant_noise(3))
     assert torch.get_rng_state().equal(state)
     Transition(NoisyLinear(matrix), constant_noise(3))

@@ -123,13 +123,13 @@ def test_gradients_equal_finite_differences(float64):
 def test_untrained_parameters_raise_by_name(float64):
     """A radius, a taper and the places that it follows from are constants: no gradient step would move them."""
     radius, taper = nn.Parameter(torch.tensor(2.0)), torch.rand(S, S, requires_grad=True)
-    with pytest.raises(ValueError, match=r"radius asks for a gradient .* Detach it"):
+    with pytest.raises(ValueError, match=r"radius requires a gradient .* Detach it"):
         LocalEnsembleAnalysis.around(PLACES, PLACES, radius)
-    with torch.no_grad(), pytest.raises(ValueError, match="radius asks"):
+    with torch.no_grad(), pytest.raises(ValueError, match="radius requires"):
         LocalEnsembleAnalysis.around(PLACES, PLACES, radius)
     for near in (taper, neighbours_of_taper(taper), neighbours(PLACES.clone().requires_grad_(), PLACES, 2.0)):
-        assert_raises(ValueError, "near asks for a gradient", LocalEnsembleAnalysis, near)
-    assert_raises(ValueError, "taper asks for a gradient", EnsembleAnalysis, "sakov", taper=(torch.ones(S, S), taper))
+        assert_raises(ValueError, "near requires a gradient", LocalEnsembleAnalysis, near)
+    assert_raises(ValueError, "taper requires a gradient", EnsembleAnalysis, "sakov", taper=(torch.ones(S, S), taper))
     td = inputs()
     found = LocalEnsembleAnalysis.around(PLACES, PLACES, radius.detach())(td.clone())["belief", "ensemble"]
     assert found.equal(LocalEnsembleAnalysis.around(PLACES, PLACES, 2.0)(td.clone())["belief", "ensemble"])

@@ -99,10 +99,10 @@ def test_each_of_several_learned_sensors_is_named(kind):
         torch.testing.assert_close(loss(drive)["loss_sensor"], off(drive, component, key).abs().mean())
     loss.set_keys(sensor=None)
     for several in (loss, SensorLoss(filter)):
-        none = r"several sensors, of which none is named \(there are \['camera', 'lidar'\]\).*set_keys\(sensor="
+        none = r"several sensors, of which none is selected \(there are \['camera', 'lidar'\]\).*set_keys\(sensor="
         with pytest.raises(KeyError, match=none):
             several(drive)
-        with pytest.raises(KeyError, match=r"writes the samples .*'lidar'.*: name one of several sensors"):
+        with pytest.raises(KeyError, match=r"writes the samples .*'lidar'.*: select one of several sensors"):
             several(drive.copy().set("target_observation", drive["wheel"]))
 
 
@@ -111,7 +111,7 @@ def test_the_observation_model_is_that_of_the_sensor():
     loss = ObservationLoss(fused("ensemble"))
     loss.set_keys(sensor="wheel")
     drive["target_observation"] = drive["state"][..., 1:] + 2
-    with pytest.raises(KeyError, match=r"several sensors: name one, set_keys\(sensor="):
+    with pytest.raises(KeyError, match=r"several sensors: select one, set_keys\(sensor="):
         ObservationLoss(fused("ensemble", lidar=True))(drive)
     torch.testing.assert_close(loss(drive)["loss_observation"], torch.tensor(4.0))
 

@@ -121,8 +121,8 @@ WRONG = [
     (TypeError, "takes a filter with a mean and a covariance; DEnKF carries", RTSSmoother, linear_denkf),
     (TypeError, "takes a filter with particles", ParticleSmoother, linear_denkf),
     (TypeError, "density of the motion", ParticleSmoother, partial(bootstrap, 5)),
-    (ValueError, "picks none", partial(FixedLag, lag=2), partial(bootstrap, 5, resampling="transport")),
-    (TypeError, "carries a past already", partial(FixedLag, lag=2), lambda: FixedLag(linear_denkf(), 2)),
+    (ValueError, "picks no particles", partial(FixedLag, lag=2), partial(bootstrap, 5, resampling="transport")),
+    (TypeError, "already carries a lag window", partial(FixedLag, lag=2), lambda: FixedLag(linear_denkf(), 2)),
 ]
 
 

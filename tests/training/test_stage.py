@@ -73,20 +73,6 @@ def test_only_trainable_restores_requires_grad():
     assert [p.requires_grad for p in net.parameters()] == before
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"name": "a/b"}, "letters, digits"),
-        ({"updates": 0}, "at least 1"),
-        ({"schedule": "two_cycle"}, "two_cycle"),
-        ({"lengths": {5: 3}}, "update 0"),
-    ],
-)
-def test_mistakes(change, message):
-    with pytest.raises(ValueError, match=message):
-        Stage(**{"name": "fit", "loss": None, "sample": None, "updates": 1, **change})
-
-
 def test_a_name_that_is_no_module_raises():
     net = nn.ModuleDict({"sensor": nn.Linear(1, 1), "motion": nn.Linear(1, 1)})
     stage = Stage("fit", dict, dict, 1, frozen=["sensor"])

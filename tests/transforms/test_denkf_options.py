@@ -164,6 +164,6 @@ def test_a_part_of_a_belief_given_to_reset_raises(float64, given):
     env = env_with(linear_kalman())
     start = env.reset()
     lacking = ({"mean", "cov"} - {given}).pop()
-    with pytest.raises(KeyError, match=rf"reads \('belief', '{lacking}'\), which is missing.*a whole belief"):
+    with pytest.raises(KeyError, match=rf"reads \('belief', '{lacking}'\), which is missing.*a complete belief"):
         env.reset(start.select(("belief", given)))
     assert env.reset(start.set(MEAN, start[MEAN] + 1))[MEAN].equal(start[MEAN])

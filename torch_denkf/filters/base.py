@@ -49,7 +49,7 @@ class Filter(Checked, TensorDictSequential):
     """A Bayesian filter: TensorDict modules in sequence, and an initial belief.
 
     The modules are sorted once, by their keys: those that depend on the belief (transition, observation, analysis) are
-    the step; the others (sensor, noise) read frames alone and, on a sequence, run once on all of them. The entries that
+    the step; the others (sensor, noise) read only frames and, on a sequence, run once on all of them. The entries that
     the step reads before it writes them, and that ``initial`` provides, are the *carry*: ``("belief", "ensemble")`` for
     an ensemble, ``("belief", "mean")`` and ``("belief", "cov")`` for a Kalman filter.
 
@@ -69,9 +69,10 @@ class Filter(Checked, TensorDictSequential):
 
     Args:
         modules: TensorDict modules in order, or one dict of them by name. The name (or number) of a module is its
-            place; its noise is read from, and drawn to, ``("noise", place)``.
+            place; its noise is read from and written to ``("noise", place)``.
         initial: the initial belief, see :mod:`torch_denkf.modules.belief`.
-        control_keys: entries that drive the transition *out of* the time they are stored at, by default the action.
+        control_keys: entries that drive the transition *out of* the time at which they are stored, by default the
+            action.
         init_key: marks the first element of an episode, ``[*B, 1]`` bool, as written by
             :class:`torchrl.envs.InitTracker` and torchrl's ``SliceSampler``; an entry of the same name in a group of
             agents marks it, too.
@@ -90,7 +91,7 @@ class Filter(Checked, TensorDictSequential):
             mean is ``("imu", "belief", "mean")``. Two filters of one environment or policy need one. ``None`` for none.
 
     Raises:
-        ValueError: if no module depends on what ``initial`` provides, or one module overwrites what another wrote
+        ValueError: if no module depends on the outputs of ``initial``, or one module overwrites the output of another
             before it is read; or if ``prefix`` is ``"next"``.
         TypeError: if parameters or constants differ in precision.
 
@@ -150,7 +151,7 @@ class Filter(Checked, TensorDictSequential):
 
     def _set_options(self, control_keys, init_key, forecast_keys, check_finite, keep_noise, **fixed: Any) -> None:
         if fixed["prefix"] == "next":
-            raise ValueError('prefix="next" is where torchrl keeps the next step: give the filter another name')
+            raise ValueError('prefix="next" is reserved by torchrl for the next step: give the filter another prefix')
         self.init_key, self.control_keys = unravel_key(init_key), list(control_keys)
         self.forecast_keys, self.check_finite, self.keep_noise = dict(forecast_keys or {}), check_finite, keep_noise
         self.fixed_options = fixed
@@ -195,7 +196,7 @@ class Filter(Checked, TensorDictSequential):
         """Returns a filter of the same modules with other options, see the class.
 
         Raises:
-            TypeError: if there is no such option, or it is of another kind.
+            TypeError: if there is no such option, or it has the wrong type.
             ValueError: if an option is out of range.
 
         Example:
@@ -217,7 +218,7 @@ class Filter(Checked, TensorDictSequential):
     def with_modules(
         self, modules: Mapping[str, TensorDictModuleBase] | None = None, /, **others: TensorDictModuleBase
     ) -> Filter:
-        """Returns a filter with other modules in some places; all else is shared with this one.
+        """Returns a filter with other modules in some places; all other modules are shared with this one.
 
         Keys, spaces and inflation are those of the new modules, and are not copied from the old ones.
 
@@ -294,7 +295,7 @@ class Filter(Checked, TensorDictSequential):
         Raises:
             TypeError: always.
         """
-        raise TypeError(f"A filter with another module is a new one: filter.with_modules({{{index!r}: module}})")
+        raise TypeError(f"Filters keep their modules; make a new filter: filter.with_modules({{{index!r}: module}})")
 
     def __getitem__(self, index):
         """Returns one module, by number or name, or a plain ``TensorDictSequential`` of several."""
@@ -417,7 +418,7 @@ class Filter(Checked, TensorDictSequential):
             ``tensordict`` (of a dictionary, a new one), with the belief of t.
 
         Raises:
-            KeyError: if an entry is missing, or ``without`` names what no module reads.
+            KeyError: if an entry is missing, or a key in ``without`` is read by no module.
             ValueError: with ``check_finite``, if the new belief is not finite; or if one update uses several readings,
                 and ``without`` names some of them, not all.
         """
@@ -495,7 +496,7 @@ class Filter(Checked, TensorDictSequential):
                 from its prior.
 
         Raises:
-            KeyError: if an entry is missing, or ``without`` names what no module reads.
+            KeyError: if an entry is missing, or a key in ``without`` is read by no module.
         """
         tensordict, structure, steps = self.of_one_robot(tensordict), self.structure, self.steps
         entries, call = self.entries_of(tensordict), Call(tensordict.batch_size)
@@ -517,7 +518,7 @@ class Filter(Checked, TensorDictSequential):
         return self.write(tensordict, own(written, given))
 
     def summarise(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the other entries of the belief, e.g. mean and variance, from its carry."""
+        """Writes the entries of the belief that are computed from its carry, e.g. mean and variance."""
         stored = {key: tensordict.get(self.outer(key), None) for key in self.structure.belief}
         stored = {key: value for key, value in stored.items() if value is not None}
         carry = {key: tensordict.get(self.outer(key)) for key in self.structure.carry}
@@ -550,7 +551,7 @@ class Filter(Checked, TensorDictSequential):
             ``tensordict``, with the outputs.
 
         Raises:
-            ValueError: if there is no time dimension, no step, or ``keep`` names what the filter does not write.
+            ValueError: if there is no time dimension, no step, or the filter does not write a key in ``keep``.
             KeyError: if an entry is missing.
         """
         if detach_every is not None:
@@ -599,7 +600,7 @@ class Filter(Checked, TensorDictSequential):
         return self.finished(Record("sequence", tensordict, size, entries, outputs), given), rows
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns ``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
+        """Returns ``False`` for elements with an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
         size = tensordict.batch_size
         marks = starts_of(tensordict, self.init_key)
         first = torch.zeros(size, dtype=torch.bool, device=device_of(tensordict))
@@ -607,7 +608,7 @@ class Filter(Checked, TensorDictSequential):
         first = first if marks is None else first | marks.reshape(size)
         if any(tensordict.get(self.outer(previous_key(key)), None) is None for key in self.structure.carry):
             return ~first
-        known = tensordict.get(self.outer(HAS_PREVIOUS), None)  # of a policy: rows with a belief before
+        known = tensordict.get(self.outer(HAS_PREVIOUS), None)  # for a policy: rows with a previous belief
         return torch.ones_like(first) if known is None else known.reshape(size)
 
     def like(self) -> Tensor | None:
@@ -615,7 +616,7 @@ class Filter(Checked, TensorDictSequential):
         return next((p for p in chain(self.parameters(), self.buffers()) if p.is_floating_point()), None)
 
     def entries_of(self, tensordict: TensorDictBase, *, one_step: bool = False) -> Entries:
-        """Returns those inputs and noise of the modules that exist; ``one_step`` leaves out those of initial beliefs.
+        """Returns all available inputs and noise of the modules; ``one_step`` leaves out inputs of initial beliefs.
 
         Raises:
             KeyError: if the tensordict has noise that no module draws.
@@ -645,7 +646,7 @@ class Filter(Checked, TensorDictSequential):
         return own(structure.completed(start), entries.values())
 
     def write(self, tensordict: TensorDictBase, written: Entries) -> TensorDictBase:
-        """Writes entries under their outer keys; looks each nested tensordict up once."""
+        """Writes entries under their outer keys, with one look-up for each nested tensordict."""
         owners: dict[tuple, Any] = {}
         for key, value in written.items():
             if self.fixed_options["prefix"] is not None:

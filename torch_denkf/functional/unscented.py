@@ -50,8 +50,8 @@ def unscented_weights(
         alpha: spread of the points.
         beta: extra weight of the central point in the covariance.
         kappa: second scaling parameter of the spread.
-        dtype: of the weights.
-        device: of the weights.
+        dtype: dtype of the weights.
+        device: device of the weights.
 
     Raises:
         ValueError: if c is not positive.
@@ -70,9 +70,9 @@ def unscented_weights(
 def sigma_points(mean: Tensor, cov: Tensor, *, alpha: float = 1.0, kappa: float = 0.5) -> Tensor:
     r"""Returns the mean, and :math:`m \pm \sqrt{c}` times the columns of a root of P (Särkkä 2013, eq. 5.74).
 
-    The covariance may be singular. A component without variance has the mean's value in all points, exactly. Two
+    The covariance may be singular. A component of zero variance has exactly the mean's value in all points. Two
     components count as fully correlated if their correlation is within 10 S times the machine precision of one.
-    Variances are reproduced to rounding. Gradients are finite; a component without variance has none in ``cov``.
+    Variances are reproduced to rounding. Gradients are finite; for a component of zero variance ``cov`` has none.
 
     Args:
         mean: m, ``[*B, S]``.
@@ -105,8 +105,8 @@ def unscented_moments(
     Args:
         points: ``[*B, 2 S + 1, N]``.
         weights: see :func:`unscented_weights`.
-        space: space of numbers and angles; angles are averaged as differences to the central point. ``None`` for
-            numbers.
+        space: space of numbers and angles, if some are angles: they are averaged as differences to the central point.
+            ``None`` for plain numbers.
 
     Returns:
         The mean ``[*B, N]`` and the covariance ``[*B, N, N]``.
@@ -129,12 +129,12 @@ def unscented_anomalies(points: Tensor, images: Tensor, weights: UnscentedWeight
 
     Args:
         points: sigma points of the state, ``[*B, 2 S + 1, S]``.
-        images: the function's values at the points, ``[*B, 2 S + 1, N]``.
+        images: values of the function at the points, ``[*B, 2 S + 1, N]``.
         weights: see :func:`unscented_weights`.
 
     Returns:
         A ``[*B, S, 2 S + 1]``, W ``[2 S + 1, 2 S + 1]`` and B ``[*B, N, 2 S + 1]``: the state's covariance is
-        :math:`A W A^T`, that of state and function :math:`A W B^T`.
+        :math:`A W A^T`, the covariance of state and function :math:`A W B^T`.
 
     Raises:
         ValueError: if there are not as many points as weights.
@@ -145,7 +145,7 @@ def unscented_anomalies(points: Tensor, images: Tensor, weights: UnscentedWeight
         >>> (before @ weights @ after.mT).round(decimals=4)
         tensor([[3.]])
     """
-    # The points are symmetric about their mean, so centring the images does not change W B^T; it only saves digits.
+    # The points are symmetric about their mean, so centring the values does not change W B^T; it only saves digits.
     deviations = _deviations(images, weights, None)[1]
     return (points - points[..., :1, :]).mT, weights.cov.diag_embed(), deviations.mT
 
@@ -167,12 +167,12 @@ def unscented_update(
 
     Args:
         points: sigma points of the prior, ``[*B, 2 S + 1, S]``.
-        predicted: observation of each point, h(point), ``[*B, 2 S + 1, O]``.
+        predicted: predicted observation of each point, h(point), ``[*B, 2 S + 1, O]``.
         observation: y, ``[*B, O]``.
         noise: R, variances ``[*B, O]`` or covariances ``[*B, O, O]``.
         weights: see :func:`unscented_weights`.
         observed: mask ``[*B, 1]`` or ``[*B, O]``, see :func:`torch_denkf.functional.kalman_update`.
-        space: of the observation, made of numbers and angles; ``None`` for numbers.
+        space: space of the observation, made of numbers and angles; ``None`` for plain numbers.
 
     Returns:
         A :class:`torch_denkf.functional.gaussian.GaussianUpdate`.
@@ -231,7 +231,7 @@ def _deviations(points: Tensor, weights: UnscentedWeights, space: Space | None) 
     if points.shape[-2] != len(weights.mean):
         raise ValueError(
             f"there are {points.shape[-2]} points in shape {list(points.shape)} and {len(weights.mean)} weights; "
-            "points are [*B, 2 S + 1, N], and the weights are those of S dimensions"
+            "points are [*B, 2 S + 1, N], and the weights must be for S dimensions"
         )
     center = points[..., :1, :]
     space = check_space("space", space, flat=True)

@@ -1,4 +1,4 @@
-"""Wrappers: modules around another one in its role, and an initial belief with further entries."""
+"""Wrappers around a module in its role, and an initial belief with further entries."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ W = TypeVar("W", bound="Wrapper")
 
 
 class _Inside:
-    """An attribute or method of a wrapper: that of the module inside, unless the wrapper has or sets its own."""
+    """Descriptor of a wrapper that forwards to the module inside, unless the wrapper defines the name itself."""
 
     def __init__(self, kind: type[SubModel], name: str):
         self.kind, self.name = kind, name
@@ -29,16 +29,16 @@ class _Inside:
 
 
 class Wrapper(SubModel):
-    """Wraps another module and takes its place: keys, noise and the noise's name are those of the module inside.
+    """Wraps another module and replaces it: keys, noise and its name are those of the module inside.
 
     A sub-class overrides what it changes, mostly :meth:`on_entries`. :class:`Around` and :class:`AroundInitial` also
-    pass on what the module inside declares in its role, such as the ``reading_keys`` of an update.
+    forward the declarations of the module inside in its role, such as the ``reading_keys`` of an update.
 
     Args:
         module: any TensorDict module.
-        in_keys: of the wrapper; those of the module by default.
-        out_keys: of the wrapper; those of the module by default.
-        optional_keys: of the wrapper; those of the module by default.
+        in_keys: inputs of the wrapper; those of the module by default.
+        out_keys: outputs of the wrapper; those of the module by default.
+        optional_keys: optional inputs of the wrapper; those of the module by default.
         further_keys: inputs of the wrapper in addition to ``in_keys``.
 
     Attributes:
@@ -80,7 +80,7 @@ class Wrapper(SubModel):
 
 
 def passes_on(kind: type[SubModel]) -> Callable[[type[W]], type[W]]:
-    """Lets a class of wrappers pass on all that a role declares, except for what the class defines itself."""
+    """Makes a class of wrappers forward the declarations of a role that the class does not define itself."""
 
     def passing(wrapper: type[W]) -> type[W]:
         for name in vars(kind):
@@ -93,16 +93,16 @@ def passes_on(kind: type[SubModel]) -> Callable[[type[W]], type[W]]:
 
 @passes_on(Update)
 class Around(Wrapper, Update):
-    """Wraps an update, and passes on all that the update declares: a sub-class overrides what it changes.
+    """Wraps an update, and forwards its declarations; a sub-class overrides some of them.
 
-    A wrapper that corrects a lag window, such as that of :class:`~torch_denkf.smoothers.FixedLag`, goes inside, see
-    :meth:`around`.
+    A wrapper that corrects a lag window, such as that of :class:`~torch_denkf.smoothers.FixedLag`, is put inside this
+    one, see :meth:`around`.
 
     Args:
         module: the update inside.
-        in_keys: of the wrapper; those of the update by default.
-        out_keys: likewise.
-        optional_keys: likewise.
+        in_keys: inputs of the wrapper; those of the update by default.
+        out_keys: outputs of the wrapper; those of the update by default.
+        optional_keys: optional inputs of the wrapper; those of the update by default.
 
     Example:
         >>> from tensordict import TensorDict
@@ -128,14 +128,14 @@ class Around(Wrapper, Update):
         tensor([1.])
     """
 
-    updates_ensemble = False  # a lag window around the wrapper would miss what the wrapper changes
+    updates_ensemble = False  # a lag window around the wrapper would bypass its changes
     aligned, on_aligned = Update.aligned, Update.on_aligned
 
     def around(self, update: Update) -> Self:
         """Returns the same wrapper around another update of the same reading, parameters shared.
 
         Args:
-            update: e.g. a :class:`~torch_denkf.smoothers.past.LaggedAnalysis` of the one inside.
+            update: e.g. a :class:`~torch_denkf.smoothers.past.LaggedAnalysis` of the update inside.
         """
         other = copy.copy(self)
         for name in ("_parameters", "_buffers", "_modules"):
@@ -149,7 +149,7 @@ class Around(Wrapper, Update):
 
 @passes_on(Initial)
 class AroundInitial(Wrapper, Initial):
-    """Wraps an initial belief, and passes on all that it declares."""
+    """Wraps an initial belief, and forwards its declarations."""
 
 
 class AugmentedBelief(AroundInitial):
@@ -158,11 +158,11 @@ class AugmentedBelief(AroundInitial):
     Args:
         initial: the initial belief.
         keys: the further entries.
-        begin: their values, in that order, from the belief (its tensors by key) and its batch size. So that the filter
-            can be pickled, it is a function of a module, its options in a :class:`functools.partial`.
+        begin: returns their values, in that order, from the belief (its tensors by key) and its batch size. For
+            pickling, use a function of a module, with options in a :class:`functools.partial`.
         follow_keys: entries of the belief that are computed from the carried ones.
-        follow: their values, in that order, from the carried entries, or from those of ``begin``.
-        nested: whether the noise of ``initial`` has its place inside of this one's: ``("noise", "initial.initial")``.
+        follow: returns their values, in that order, from the carried entries, or from those of ``begin``.
+        nested: whether the noise of ``initial`` is nested in this module's: ``("noise", "initial.initial")``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -197,7 +197,7 @@ class AugmentedBelief(AroundInitial):
         return {**written, **self._following(written)}
 
     def derived(self, carried):
-        """Returns the derived entries of the module inside and of this one."""
+        """Returns the derived entries of the module inside and of this module."""
         return {**role(self.module, Initial).derived(carried), **self._following(carried)}
 
     def _following(self, entries: Entries) -> Entries:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal, TypedDict, TypeGuard
+from typing import TypedDict, TypeGuard, get_args
 
 import torch
 from tensordict import TensorDictBase, unravel_key
@@ -17,7 +17,7 @@ from torch_denkf.modules.around import Around
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.monitoring._calibration import IDENTITY, check_observation_dim, chi_square_table, empirical_quantile
 from torch_denkf.monitoring.chi_square import chi_square_quantile
-from torch_denkf.monitoring.gating import adapt, disbelief
+from torch_denkf.monitoring.gating import Response, adapt, disbelief
 from torch_denkf.monitoring.innovation_tests import interpolate
 from torch_denkf.submodel import Call, Entries, Update
 
@@ -50,7 +50,7 @@ class GateOptions(TypedDict, total=False):
         gate_prefix: prefix of the state, ``"gate"`` by default.
     """
 
-    response: Literal["reject", "student", "huber"]
+    response: Response
     window: int
     rate: float
     freedom: float
@@ -147,7 +147,7 @@ class GatedAnalysis(Around):
         analysis: Update,
         observation_dim: int,
         *,
-        response: Literal["reject", "student", "huber"] = "student",
+        response: Response = "student",
         window: int = 3,
         rate: float = 1e-3,
         freedom: float = 4.0,
@@ -168,8 +168,8 @@ class GatedAnalysis(Around):
         of_ensemble = inside.updates_ensemble
         if by_component and not of_ensemble:
             raise ValueError("by_component is for ensembles: an update of mean and covariance is judged as a whole")
-        if response not in ("reject", "student", "huber"):
-            raise ValueError(f'response is "reject", "student" or "huber"; got {response!r}')
+        if response not in get_args(Response):
+            raise ValueError(f"response is one of {', '.join(get_args(Response))}; got {response!r}")
         check_count("observation_dim", observation_dim)
         check_count("window", window)
         check_count("patience", patience)

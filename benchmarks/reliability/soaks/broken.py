@@ -24,9 +24,12 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from benchmarks.reliability.borders.recorded import V2, made, own, read_demos, read_drive, read_episodes, read_own
 from benchmarks.reliability.case import Case, apart, forked, judge
 from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
+from tests.borders import kitti, ur5
+from tests.borders.folders import made
+from tests.borders.lerobot import V2, read_episodes
+from tests.borders.recordings import own, read_own
 from tests.filters.factories import linear_denkf
 from tests.training.problem import make_trainer
 from torch_denkf.applications.car import with_motion
@@ -99,11 +102,11 @@ large_demos = made(
 
 
 def _drive(folder: Path) -> TensorDict:
-    return read_drive(large_drive(), "a", size=PICTURE, cache=folder)
+    return kitti.read_drive(large_drive(), "a", size=PICTURE, cache=folder)
 
 
 def _motion(folder: Path) -> TensorDict:
-    return with_motion(read_drive(large_drive(), "a", size=PICTURE), cache=folder, keep_images=False)
+    return with_motion(kitti.read_drive(large_drive(), "a", size=PICTURE), cache=folder, keep_images=False)
 
 
 def _checkpoint(folder: Path) -> Any:
@@ -146,7 +149,7 @@ _train = lambda folder: make_trainer(folder / "run", updates=12, progress=False)
 WORKS: dict[str, Work] = {
     "cache of a drive": read(_drive, killed=True, alone=False),
     "cache of a drive's motion": read(_motion),
-    "cache of demos": read(lambda folder: read_demos(large_demos(), cache=folder), killed=True),
+    "cache of demos": read(lambda folder: ur5.read_demos(large_demos(), cache=folder), killed=True),
     "cache of a LeRobot recording": read(lambda folder: read_episodes(V2.sound(), size=(200, 300), cache=folder)),
     "cache of pictures": read(
         lambda folder: read_own(own(), camera="images", replay={"cache": folder, "size": (300, 300)})

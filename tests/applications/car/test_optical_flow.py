@@ -8,11 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
 from tests.applications.car.vision.drives_for_tests import rendered
-from torch_denkf.applications.car import (
-    KITTIReplayEnv,
-    OpticalFlow,
-    with_motion,
-)
+from torch_denkf.applications.car import KITTIReplayEnv, OpticalFlow, with_motion
 from torch_denkf.applications.car.kitti.frames import frames_at
 from torch_denkf.applications.car.vision.motion import image_motion
 

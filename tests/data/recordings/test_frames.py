@@ -54,43 +54,6 @@ def test_truncated_video_is_reported(tmp_path, name):
         assert (left["pixels"].numpy() == np.stack([grey(k).transpose(2, 0, 1) for k in shown])).all()
 
 
-def test_images_after_a_damaged_one_keep_their_times(tmp_path):
-    write_images(tmp_path / "run", [f"{k}.png" for k in range(4)])
-    (tmp_path / "run" / "1.png").write_bytes(b"nothing")
-    images = Images(tmp_path / "run", times=[0.0, 1.0, 3.0, 7.0])
-    with pytest.warns(UserWarning, match="1.png cannot be decoded"):
-        data = RecordingReplay(Recording(camera=images), size=SIZE, cache=None)
-    assert data[:]["time"].squeeze(-1).tolist() == [0, 3, 7]
-
-
-def pipe(file):
-    os.mkfifo(file)
-
-
-@pytest.mark.parametrize(
-    ("name", "make", "match"),
-    [
-        (
-            "0.2.jpg",
-            lambda file: shutil.copy(file.with_name("0.1.png"), file),
-            r"0.2.png and 0.2.jpg are two images of",
-        ),
-        ("0.25.png", pipe, r"0.25.png is no file, but a pipe"),
-        (
-            "0.25.png",
-            lambda file: file.symlink_to("nowhere.png"),
-            r"0.25.png is no file, but a pipe, .* link to nowhere",
-        ),
-        ("0.20.png", lambda file: shutil.copy(file.with_name("0.1.png"), file), r"'time' goes from 0.2 to 0.2 s"),
-    ],
-)
-def test_two_images_of_a_frame_and_what_is_no_file(tmp_path, name, make, match):
-    write_images(tmp_path / "run", [f"{k / 10:.1f}.png" for k in range(5)])
-    make(tmp_path / "run" / name)
-    with pytest.raises(ValueError, match=match):
-        Images(tmp_path / "run").read(SIZE, None, False)
-
-
 def test_names_that_are_no_utf_8(tmp_path):
     """OpenCV crashes on such a name of a video; pictures are read by Python."""
     folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/r\xff"))

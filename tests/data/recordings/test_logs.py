@@ -68,22 +68,6 @@ def test_numbers_that_float32_holds_are_not_warned_of(tmp_path):
     assert_close(rows, torch.tensor(np.stack(list(columns.values()), 1), dtype=torch.float32))
 
 
-@pytest.mark.parametrize(
-    ("origin", "error", "match"),
-    [
-        ({"z": 1.0}, ValueError, r"origin names \['z'\], but .*run.csv is read for \['x'\]"),
-        ({"x": np.nan}, ValueError, "origin of 'x' must be a finite number"),
-        ({"x": "far"}, ValueError, "origin of 'x' must be a finite number.*'far'"),
-        ({"x": [1.0, 2.0]}, ValueError, "origin of 'x' must be a finite number"),
-        (5.0, TypeError, "origin holds numbers by the names of columns"),
-    ],
-)
-def test_origins_that_are_none(tmp_path, origin, error, match):
-    file = write_csv(tmp_path / "run.csv", time=[0.0, 1.0], x=[1.0, 2.0])
-    with pytest.raises(error, match=match):
-        replay(state=Table(file, origin=origin))
-
-
 def fixes(count=60, held=8, seed=0):
     """Returns a random walk at 10 Hz, read every ``held`` rows with unit noise, and repeated in between."""
     random = np.random.default_rng(seed)

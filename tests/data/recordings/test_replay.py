@@ -128,18 +128,6 @@ def test_a_missing_image_moves_no_other_one(tmp_path, names, times):
     assert (data[:]["pixels"].numpy() == np.stack([pixels(k) for k in range(4)])).all()
 
 
-def test_a_damaged_image_blinds_its_row_alone(tmp_path):
-    write_images(tmp_path / "run", [f"{k}.png" for k in range(5)])
-    (tmp_path / "run/2.png").write_bytes((tmp_path / "run/2.png").read_bytes()[:60])
-    write_csv(tmp_path / "state.csv", time=range(5), x=range(5))
-    run = Recording(state=Table(tmp_path / "state.csv"), camera=Images(tmp_path / "run"))
-    with pytest.warns(UserWarning, match=r"run/2.png cannot be decoded; it counts as missing"):
-        rows = open_runs(run, clock="state")[:]
-    assert rows["observed"].flatten().tolist() == [True, True, False, True, True]
-    assert not rows["pixels"][2].any()
-    assert (rows["pixels"][3].numpy() == pixels(3)).all()
-
-
 # Several recordings ---------------------------------------------------------------------------------------------------
 
 

@@ -43,9 +43,9 @@ class Frames:
         time: name of the column of times in that file.
         unit: of these times: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``.
         start: in s, added to all times: when a video began, on the clock of the other streams.
-        sample: which picture a row of the data set gets: ``"last"``, the last one up to then; or ``"nearest"``, the
-            nearest in time, which may lie in the future. A picture is shown in one row alone; rows without one of their
-            own are not ``observed``.
+        sample: which picture a row of the data set gets: ``"last"``, the last one up to then, up to one row late; or
+            ``"nearest"``, the nearest in time, which may lie in the future, and suits smoothing. A picture is shown in
+            one row alone; rows without one of their own are not ``observed``.
         tolerance: in s; pictures that are farther away count as missing. By default, none with ``"last"``, half a
             row's time with ``"nearest"``.
 

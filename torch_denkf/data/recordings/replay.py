@@ -126,8 +126,10 @@ class RecordingReplay(EpisodeReplay):
     ends: ``episodes[k].begin`` is the time of the first. So a pose that is known of an earlier time is not that of the
     first row, unless ``span="all"`` keeps the rows before it. Each other stream comes onto them by its ``sample``:
 
-    * ``"last"``, the default, holds the last value until the next one arrives. It never looks into the future.
-    * ``"nearest"`` and ``"linear"`` do, by up to one reading. They suit a ``state`` that is known afterwards.
+    * ``"last"``, the default, holds the last value until the next one arrives. It is causal, and makes a reading up to
+      one row late.
+    * ``"nearest"`` uses readings up to half a row ahead. For smoothing take it: a delay of part of a row is a bias.
+    * ``"linear"`` uses the next reading, too. It suits a ``state`` that is known afterwards.
 
     A reading is *observed* in one row: with ``"last"`` the first row after it arrived, with ``"nearest"`` its nearest.
     So a filter with ``observed_key="imu_observed"`` does not count one reading twice, and a model that is driven by the

@@ -64,9 +64,10 @@ class Table:
             as ``twist.twist.linear.x``, numbered in arrays.
         offset: in s, added to all times, such as -0.7 for readings that are stamped 0.7 s late. It is found by
             :func:`~torch_denkf.data.clock_offsets`.
-        sample: which reading a row of the data set gets. ``"last"``: the last one up to then, held until the next.
-            These two look into the future: ``"nearest"``, the nearest in time, before or after; ``"linear"``, straight
-            lines between the readings before and after (unwrap angles first).
+        sample: which reading a row of the data set gets. ``"last"``: the last one up to then, held until the next; so a
+            reading is up to one row late. These two use future readings: ``"nearest"``, the nearest in time, before or
+            after, which suits smoothing; ``"linear"``, straight lines between the readings before and after (unwrap
+            angles first).
         tolerance: in s. With ``"last"`` and ``"nearest"``, readings that are farther away count as missing: by
             default, none with ``"last"``, half a row's time with ``"nearest"``. With ``"linear"``, no value between
             readings that are farther apart; by default there always is one.

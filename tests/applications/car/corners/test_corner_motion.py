@@ -10,12 +10,7 @@ from torch.testing import assert_close
 from tests.real_data import KITTI, SHARED
 from torch_denkf.applications.car.corners.camera import StereoCamera
 from torch_denkf.applications.car.corners.drive import corner_replay, read_corner_drive
-from torch_denkf.applications.car.corners.motion import (
-    CornerNoise,
-    corner_motion,
-    corner_motions,
-    started_by_ransac,
-)
+from torch_denkf.applications.car.corners.motion import CornerNoise, corner_motion, corner_motions, started_by_ransac
 from torch_denkf.applications.car.kitti.files import read_poses
 from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
 from torch_denkf.envs import ReplayEnv

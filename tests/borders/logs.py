@@ -18,11 +18,11 @@ import torch
 from hypothesis import strategies as st
 
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.borders.recorded import ALL_ROWS, made
 from benchmarks.reliability.damage import INF, NAN, put
 from benchmarks.reliability.documents import edited
 from benchmarks.reliability.target import Source, Subject, Target, targets_of
-from tests.data.lerobot.lerobot_folder import write_version_2, write_version_3
+from tests.borders.folders import ALL_ROWS, made
+from tests.data.lerobot.lerobot_folder import pictures, write_version_2, write_version_3, write_video
 from tests.data.recordings.own_files import SIZE, write_csv, write_images
 from torch_denkf.data import Images, LeRobotReplay, Recording, RecordingReplay, Table
 from torch_denkf.fusion import message_rows
@@ -241,7 +241,16 @@ def _lost(pattern: str) -> d.Change:
     return lambda root: [file.unlink() for file in sorted(root.glob(pattern))[1:]]
 
 
+VIDEO = "videos/chunk-000/observation.images.top/episode_000001.mkv"
 INFO, EPISODES = "meta/info.json", "meta/episodes.jsonl"
+DATA = "data/chunk-000/episode_000000.parquet"
+
+
+def _half_the_fps(root: Path) -> None:
+    edited(put(("timestamp", 7), NAN))(root / DATA)
+    edited(put("fps", 5))(root / INFO)
+
+
 LOST = {"videos": _lost("videos/**/*.mkv"), "tables": _lost("data/**/*.parquet")}
 #: A changed file, and the word that tells of it.
 CONTRADICTIONS: dict[str, tuple[str, d.Change, str]] = {
@@ -249,11 +258,18 @@ CONTRADICTIONS: dict[str, tuple[str, d.Change, str]] = {
     "an episode of another length": (EPISODES, edited(put((1, "length"), 5)), "metadata"),
     "twice the fps": (INFO, edited(put("fps", 20)), "fps"),
     "half the fps": (INFO, edited(put("fps", 5)), "fps"),
+    "1.3 times the fps": (INFO, edited(put("fps", 13)), "fps"),
     "more episodes in all": (INFO, edited(put("total_episodes", 50)), "total_episodes"),
     "more frames in all": (INFO, edited(put("total_frames", 5000)), "total_frames"),
     "totals of text": (INFO, edited(put("total_episodes", "many")), "total_episodes"),
     "actions": (INFO, _renamed("actions"), "actions"),
     "commands": (INFO, _renamed("observation.command"), "observation.command"),
+    "a video of another size": (
+        VIDEO,
+        lambda file: write_video(file, pictures(1, 9, (24, 32)), "FFV1"),
+        Path(VIDEO).name,
+    ),
+    "half the fps, and a stamp of nan": ("", _half_the_fps, "fps"),
     "videos that are missing": ("", LOST["videos"], "episodes"),
     "tables that are missing": ("", LOST["tables"], "episodes"),
 }
@@ -271,9 +287,12 @@ def _whole(result: Any) -> bool:
 def _of_recordings() -> Iterator[Target]:
     for what, (file, change, word) in CONTRADICTIONS.items():
         yield ROBOT.target(what, change, None, word, file)
+    yield ROBOT.target("a tenth more fps", edited(put("fps", 11)), ROBOT.like(near=1e-6), "fps", INFO)
+    none, newer = edited(put(("length", 1), 0)), "meta/episodes/chunk-000/file-000.parquet"
+    yield NEWER.target("an episode of no length", none, None, "metadata", newer)
     yield ROBOT.target("episodes that are whole", LOST, _whole, "episodes", options={"episodes": [0]})
     large = LARGE.but("(1.0, 1e-07)").each(_large_joints)
-    yield ROBOT.target("large numbers of joints", large, None, "origin", "data/chunk-000/episode_000000.parquet")
+    yield ROBOT.target("large numbers of joints", large, None, "origin", DATA)
     for source, name in ((ROBOT, "version 2"), (NEWER, "version 3")):
         replay = source.arguments(f"LeRobotReplay of {name}", wrong=CHOICES)
         yield from targets_of("logs", replay, needs=source.sound)

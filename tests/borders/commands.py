@@ -11,26 +11,21 @@ from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 from hypothesis import strategies as st
 
 import torch_denkf.cli.command as command_module
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.borders import models, recorded
-from benchmarks.reliability.borders.recorded import (
-    CALIBRATION_FILE,
-    DEMO,
-    DRIVE,
-    IMAGES,
-    MANIFEST,
-    POSE_FILE,
-    TIME_FILE,
-)
 from benchmarks.reliability.case import Refused
 from benchmarks.reliability.damage import gone, put
 from benchmarks.reliability.documents import WORDS, edited
 from benchmarks.reliability.target import Source, Target
+from tests.borders import kitti, models, ur5
+from tests.borders.folders import made
+from tests.borders.kitti import CALIBRATION_FILE, DRIVE, IMAGES, POSE_FILE, TIME_FILE
+from tests.borders.ur5 import DEMO, MANIFEST
 from torch_denkf.applications.car import track
 from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
 from torch_denkf.applications.car.odometry.paths import write_path
@@ -48,10 +43,14 @@ def run(words: Sequence[str]) -> str:
     def again(message: str) -> int:
         raise
 
-    command_module._mistake = again  # of this process alone, as what follows
-    warnings.simplefilter("default")
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with (
+        patch.object(command_module, "_mistake", again),
+        warnings.catch_warnings(),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        warnings.simplefilter("default")
         code = main(list(words))
     if code:
         raise Refused(err.getvalue() + out.getvalue())
@@ -61,7 +60,7 @@ def run(words: Sequence[str]) -> str:
 
 def _write(root: Path) -> None:
     """Writes a drive, demos, a trained filter, and an estimated path."""
-    for source in (recorded.drives(), recorded.demos(), models.FOLDERS["car-odometry"]):
+    for source in (kitti.drives(), ur5.demos(), models.FOLDERS["car-odometry"]):
         d.copied(source, root)
     frames = [cv2.imread(str(file)) for file in sorted((root / "kitti" / IMAGES).iterdir())]
     found = track(load_car_filter(root / "car-odometry"), frames, (41.7, 41.7, 35.5, 11.5), fps=10.0)
@@ -71,11 +70,11 @@ def _write(root: Path) -> None:
 
 def base() -> Path:
     """Returns the folder in which commands are run, with its files."""
-    recorded.drives(), recorded.demos()
+    kitti.drives(), ur5.demos()
     return _work()
 
 
-_work = recorded.made("work", _write)
+_work = made("work", _write)
 #: Commands that succeed.
 COMMANDS: dict[str, str] = {
     "odometry": f"kitti/{IMAGES} --calibration kitti/{CALIBRATION_FILE} --times kitti/{TIME_FILE} "
@@ -158,6 +157,8 @@ OWN: dict[tuple[str, str], d.Wrong] = {
     ("plot", "path"): d.of("nowhere", "kitti"),
     ("collect-ur5", "size"): d.of("0", "-4", "4 4 4", "x"),
     ("collect-ur5", "frames"): WHOLE,
+    ("render-kitti", "frames"): AT_LEAST_ONE | d.of("1"),
+    ("render-kitti", "focal"): POSITIVE | d.of("718.856"),
     ("demo", "root"): d.of("kitti"),
     ("demo", "drive"): d.of("town"),
     ("demo", "height"): d.of("x"),
@@ -202,7 +203,7 @@ def _options(name: str) -> Iterator[Target]:
 def _half_of_the_drive(root: Path) -> None:
     """Removes half of a drive: five frames and five poses remain."""
     d.BYTES.named["cut in half"](root / "kitti" / POSE_FILE)
-    for number in range(5, recorded.FRAMES):
+    for number in range(5, kitti.FRAMES):
         gone(root / "kitti" / IMAGES / f"{number:06d}.png")
 
 
@@ -235,7 +236,7 @@ PATH: dict[str, d.Change] = {
 #: Valid changes of each of three poses.
 POSES: dict[str, d.Change] = {
     **{f"{value} in place {place}": put((1, place), value) for value in WORDS.named.values() for place in (0, 3)},
-    **{f"pose 1 {what}": put(1, change) for what, change in recorded.POSES.items() if what != "an empty line"},
+    **{f"pose 1 {what}": put(1, change) for what, change in kitti.POSES.items() if what != "an empty line"},
     "eleven numbers": put((1, 11), d.MISSING),
     "three poses 1e7 m apart": lambda rows: [[*row[:11], str(1e7 * number)] for number, row in enumerate(rows)],
 }
