@@ -63,7 +63,7 @@ def make_filter(members: int = 200) -> Filter:
 
 
 class Cart:
-    """Stands for your hardware: the true cart, its clock, and its readings."""
+    """Simulates the hardware: the true cart, its clock, and its readings."""
 
     def __init__(self):
         self.time, self.state = 0.0, torch.tensor([0.5, 1.0])
