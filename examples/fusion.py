@@ -68,7 +68,7 @@ def error(out: TensorDict, rows=...) -> float:
 
 @torch.no_grad()
 def run(filter: FusedFilter, data: TensorDict, *lacking: str) -> TensorDict:
-    """Filters the recordings without some sensors: a mask that is False everywhere switches one off."""
+    """Filters the recordings without some sensors, whose observed masks are set to False."""
     data = data.copy()
     for name in lacking:
         data[f"{name}_observed"] = torch.zeros_like(data[f"{name}_observed"])
@@ -113,7 +113,7 @@ def main() -> None:
     print(f"\nIrregular steps, {seconds[1:].min():.2f} to {seconds.max():.2f} s apart:")
     print(f"  {error(run(irregular, some)):.3f}")
 
-    # The laser reads two metres too little while somebody is in its beam, without a mask. The weights are trained by
+    # The laser reads two metres too little while a person is in its beam, without a mask. The weights are trained by
     # the score of the belief; their inputs are the innovations.
     weights = SensorAttention(dict.fromkeys(NOISE, 1))
     learning = make(delay=0, weights=weights)

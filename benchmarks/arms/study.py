@@ -39,8 +39,8 @@ class Study:
     tasks: some_of(ARMS) = tuple(ARMS)
     sources: some_of(SOURCES) = ("encoders",)
     demos: int = 100  # episodes of 200 steps to learn the motion from
-    pictures: int = 24000  # of single poses, to learn the sensor from
-    films: int = 40  # episodes of 60 steps with pictures, to measure the sensor's errors on
+    pictures: int = 24000  # images of single poses, to learn the sensor from
+    films: int = 40  # episodes of 60 steps with images, to measure the sensor's errors on
     episodes: int = 40  # to test on
     steps: int = 200  # of a test episode
     motion_updates: int = 8000
@@ -51,7 +51,7 @@ class Study:
 
 
 def run(env: TransformedEnv, policy: TensorDictModule, steps: int, seed: int) -> TensorDict:
-    """Returns episodes ``[N, T]`` that begin alike for all policies."""
+    """Returns episodes ``[N, T]``; their initial states depend only on the seed."""
     torch.manual_seed(seed)
     env.set_seed(seed)
     with torch.no_grad():
@@ -79,7 +79,7 @@ def poses(arm: Arm, count: int, seed: int) -> TensorDict:
 
 
 def trained(arm: Arm, pixels: bool, study: Study, out: Path) -> DEnKF:
-    """Returns the filter of an arm; the seeds of all that it learns from differ."""
+    """Returns the trained filter of an arm; each part learns from data of another seed."""
     seed = 10_000 * (study.seed + 1)
     torch.manual_seed(study.seed)
     sensor = error = None
@@ -156,7 +156,7 @@ def rows_of(task: str, source: str, study: Study) -> list[dict]:
 
 
 def run_study(study: Study) -> None:
-    """Runs what is not there, and leaves ``table.csv`` and ``table.md`` in the study's folder.
+    """Runs the missing parts, and writes ``table.csv`` and ``table.md`` to the study's folder.
 
     Raises:
         SystemExit: if the folder was begun with other settings, or if dm_control cannot show an arm.

@@ -49,14 +49,14 @@ def run_one(commands: dict[str, type[Callable[[], None]]], arguments: Sequence[s
 
 
 def some_of(names: Iterable[str]) -> Any:
-    """Returns the type of an option that takes some of these names."""
+    """Returns the type of an option that takes several of the names."""
     return tuple[Literal[tuple(names)], ...]
 
 
 def command(study: str) -> str:
     """Returns the command line that is running, for the record: ``python -m benchmarks.<study> ...``.
 
-    Absolute paths are written as seen from the repository's root, so that no folder of this machine is in the record.
+    Absolute paths become relative to the repository's root, so that the record has no folder of this machine.
     """
     return shlex.join(["python", "-m", f"benchmarks.{study}", *(_from_root(word) for word in sys.argv[1:])])
 
@@ -76,5 +76,5 @@ def processor() -> str:
 
 
 def made_by(study: str, more: str = "") -> list[str]:
-    """Returns the last lines of a page: the command, and what is said of it; processor and torch."""
+    """Returns the last lines of a page: the command, followed by ``more``, processor and torch."""
     return [f"* Command: `{command(study)}`{more}.", f"* Hardware: {processor()}; torch {torch.__version__}."]

@@ -32,7 +32,7 @@ def lorenz96_tendency(state: Tensor, forcing: float | Tensor = 8.0) -> Tensor:
     """
     if state.ndim < 1 or state.shape[-1] < 4:
         raise ValueError(f"state must be [..., N] with N >= 4 variables, got {list(state.shape)}")
-    # The circle closed by hand, once: three rolls cost more than the rest of the formula.
+    # One concatenation closes the circle: three rolls cost more than the rest of the formula.
     circle = torch.cat([state[..., -2:], state, state[..., :1]], -1)
     return (circle[..., 3:] - circle[..., :-3]) * circle[..., 1:-2] - state + forcing
 

@@ -1,4 +1,4 @@
-"""Bars for the pages of results, drawn from the studies' rows: ``python -m benchmarks.common.overview``."""
+"""Draws bar charts for the pages of results from the studies' rows: ``python -m benchmarks.common.overview``."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from benchmarks.common.plots import plt, save
 ENDS = ("first", "last")
 STUDIES = Path(__file__).parents[1]
 PAGES = STUDIES.parent / "docs" / "results"
-Bars = tuple[str, pd.DataFrame]  # the axis' label; numbers of each series, by what a row is
+Bars = tuple[str, pd.DataFrame]  # the axis' label; a column for each series, a row for each group of bars
 
 
 def smoothing() -> Bars:
-    """Returns the error of filter and smoother on chaotic systems; methods without a smoother are left out."""
+    """Returns the error of filter and smoother on chaotic systems, without methods that have no smoother."""
     rows = pd.read_csv(STUDIES / "smoothing/results/smoothing.csv").dropna(subset="rmse_smoother")
     lags = rows["lag"].map(", lag {:.0f}".format, na_action="ignore").fillna("")
     names = rows["system"] + ", " + rows["method"] + lags
@@ -36,7 +36,7 @@ def fusion() -> Bars:
 
 
 def monitor() -> Bars:
-    """Returns the end-point error, with and without a gate on the signs."""
+    """Returns the end-point error, with and without the monitor's response."""
     rows = pd.read_csv(STUDIES / "monitor/results/monitor.csv").dropna(subset="m_per_m")
     faults = rows["fault"].map({"none": "no fault", "black-all": "30 % black", "box-all": "a box"})
     names = rows["task"].str.removeprefix("kitti-") + ": " + faults
@@ -66,7 +66,7 @@ def reliability() -> Bars:
 
 
 def speed() -> Bars:
-    """Returns the time of a compiled sequence over that of a peer."""
+    """Returns the time of a compiled sequence divided by that of a peer."""
     rows = pd.DataFrame(json.loads((STUDIES / "speed/results/speed.json").read_text()))
     found = rows["name"].str.extract(r"^compiled (?P<what>.+ / .+), B=(?P<size>.+)$").join(rows["ratio"]).dropna()
     bars = found.pivot(index="what", columns="size", values="ratio").loc[found["what"].unique(), found["size"].unique()]
@@ -91,7 +91,7 @@ def draw(label: str, bars: pd.DataFrame, file: Path) -> None:
 
 
 def main(folder: Path = PAGES) -> None:
-    """Draws each picture into a folder."""
+    """Draws each chart into a folder."""
     for study in DRAWN:
         draw(*study(), folder / f"{study.__name__}.png")
 

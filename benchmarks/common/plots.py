@@ -22,16 +22,16 @@ def draw_frontier(
     time: str = "ms_per_step",
     limit: float | None = None,
 ) -> None:
-    """Draws error against milliseconds per step: one line a filter, a dot for each of its numbers of members.
+    """Draws error against milliseconds per step: a line for each filter, a dot for each ensemble size.
 
     Args:
-        rows: with ``"filter"``, ``"members"``, the error and the time; the number is written next to the first and the
-            last dot of a line.
+        rows: with ``"filter"``, ``"members"``, the error and the time; the first and the last dot of a line are
+            labelled with the members.
         path: PNG.
         error: column of the error.
         label: of its axis.
         time: column of the milliseconds.
-        limit: rows with a larger error are left out; the title says how many.
+        limit: rows with a larger error are not drawn; the title has their count.
 
     Raises:
         ValueError: without rows.
@@ -48,7 +48,7 @@ def draw_frontier(
         for end in (0, -1) if len(own) > 1 else ():
             axis.annotate(str(own[end]["members"]), points[end], (4, 4), textcoords="offset points", fontsize=8)
     errors = [row[error] for row in kept]
-    wide = max(errors) > 2 * min(errors)  # a narrower range has hardly a label on a logarithmic scale
+    wide = max(errors) > 2 * min(errors)  # a logarithmic scale has too few labels in a narrower range
     axis.set(xscale="log", yscale="log" if wide else "linear", xlabel="ms per step, one thread", ylabel=label)
     for scale in (axis.xaxis, axis.yaxis) if wide else (axis.xaxis,):
         scale.set_major_formatter("{x:g}")

@@ -21,7 +21,7 @@ def line(*cells: object) -> str:
 
 
 def head(*titles: object) -> list[str]:
-    """Returns the two lines that a Markdown table begins with."""
+    """Returns the first two lines of a Markdown table."""
     return [line(*titles), "|" + "---|" * len(titles)]
 
 

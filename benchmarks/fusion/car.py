@@ -25,20 +25,20 @@ from torch_denkf.pretrained import from_pretrained
 
 FINER = 5  # filter steps between two frames
 DT, FIX, LATE = KITTI_DT / FINER, 48, 15  # s; steps between two fixes of the GPS, and by which they are late
-CAMERA = torch.tensor([0.6, 0.02])  # m/s and rad/s of the camera's readings in training, and their gain's error
-GAIN, SLIP = 0.05, 0.02  # of the camera and of the wheels, for each drive
+CAMERA = torch.tensor([0.6, 0.02])  # m/s and rad/s, noise of the camera's readings in training
+GAIN, SLIP = 0.05, 0.02  # scale errors of the camera and of the wheels, drawn for each drive
 WHEELS, GPS = torch.tensor([0.3, 0.03]), torch.tensor([1.5, 1.5])  # m/s and rad/s; m
-MIDDLE = 2  # steps from the middle of the time between two frames, to which a reading belongs, to the second one
-START = torch.tensor([0.5, 0.5, 0.02, 1.0, 0.05])  # m, m, rad, m/s, rad/s: how well the filter knows where it starts
-TRAIN, VALIDATION = ("02", "05", "08", "09", "10"), ("03", "04", "07")  # paths without pictures
+MIDDLE = 2  # latency of a reading, which belongs to the time midway between two frames, in steps
+START = torch.tensor([0.5, 0.5, 0.02, 1.0, 0.05])  # m, m, rad, m/s, rad/s: standard deviations of the initial state
+TRAIN, VALIDATION = ("02", "05", "08", "09", "10"), ("03", "04", "07")  # paths without images
 
 
 def readings(states: Tensor, camera: Tensor, seed: int) -> TensorDict:
     """Returns all readings of drives at 50 Hz.
 
     Args:
-        states: truth at 10 Hz, ``[N, T, 5]``: the velocities are those of the step that led there.
-        camera: what it reads of the velocities, ``[N, T, 2]``.
+        states: truth at 10 Hz, ``[N, T, 5]``: the velocities are those of the step before.
+        camera: its readings of the velocities, ``[N, T, 2]``.
         seed: of the simulated sensors.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -84,7 +84,7 @@ def recorded(root: Path, frames: int) -> tuple[Tensor, Tensor]:
 
 
 def driven(root: Path, names: Sequence[str], frames: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Returns windows of true paths, and what a camera might read there."""
+    """Returns windows of true paths, and simulated readings of a camera."""
     parts = []
     for name in names:
         poses = read_poses(root / "poses" / f"{name}.txt")
@@ -108,12 +108,12 @@ def simulated(frames: int, seed: int, count: int = 2) -> tuple[Tensor, Tensor]:
 
 
 def car_task(root: Path | None, *, frames: int = 60, validate: bool = False) -> Task:
-    """Returns the task, on real frames, or on a made-up drive where there are no data.
+    """Returns the task, on real frames, or on a synthetic drive without data.
 
     Args:
         root: folder with ``sequences`` and ``poses``.
         frames: of each recording, 0.103 s apart.
-        validate: whether the recordings to be scored are of other paths without pictures, not of the test's drives.
+        validate: whether to score validation paths with a simulated camera instead of the test's drives.
     """
     train = readings(*(simulated(frames, 1) if root is None else driven(root, TRAIN, frames, 1)), 1)
     if root is None:

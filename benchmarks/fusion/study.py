@@ -30,13 +30,13 @@ WINDOW, BATCH = 200, 36  # steps of a training window, and windows in an update
 
 @dataclass(frozen=True)
 class Study:
-    """Several sensors in one filter, on a UR5 and on KITTI: every subset, and each sensor disturbed and delayed."""
+    """Fuses several sensors on a UR5 and on KITTI: every subset, and each sensor disturbed and delayed."""
 
-    kitti: Path | None = None  # folder with sequences and poses; without it the car's task is left out
+    kitti: Path | None = None  # folder with sequences and poses; without it the car's task is skipped
     out: Path = Path("runs/fusion")
     demos: tuple[int, int] = (24, 6)  # of the UR5, for training and for the test
     seeds: int = 3  # trainings
-    validate: bool = False  # score recordings that are not the test's, to choose by
+    validate: bool = False  # score validation recordings instead of the test's
     processes: int = 1
     smoke: bool = False  # tiny tasks: does it run?
 
@@ -67,7 +67,7 @@ def conditions(task: Task) -> tuple[dict[tuple[str, str], TensorDict], slice]:
 
 @torch.no_grad()
 def rows(task: Task, weights: torch.nn.Module) -> list[dict]:
-    """Returns errors under all conditions, all recordings of all conditions as one batch."""
+    """Returns errors under all conditions; all recordings of all conditions run in one batch."""
     cases, span = conditions(task)
     whole, out = torch.cat(list(cases.values())), []
     for method, network in zip(METHODS, (None, weights), strict=True):
@@ -100,12 +100,12 @@ def run(model, data: TensorDict) -> TensorDict:
 
 
 def rms(error: torch.Tensor) -> float:
-    """Returns the root of the mean square of errors of some components, as a length where they are coordinates."""
+    """Returns the root mean square over all errors and components."""
     return float(error.square().mean().sqrt())
 
 
 def job(name: str, seed: int, study: Study) -> list[dict]:
-    """Returns all of one task, trained with one seed."""
+    """Returns all rows of one task, trained with one seed."""
     if name == "UR5":
         sizes = {"demos": (2, 2), "steps": 3} if study.smoke else {"demos": study.demos}
         task = arm_task(**sizes, validate=study.validate)
@@ -124,7 +124,7 @@ def job(name: str, seed: int, study: Study) -> list[dict]:
 
 
 def page(found: Sequence[dict], study: Study) -> str:
-    """Tables of both tasks: medians over the seeds."""
+    """Returns the tables of both tasks: medians over the seeds."""
 
     def middle(rows: Sequence[dict], column: str = "error") -> str:
         return f"{median(row[column] for row in rows):.3g}"

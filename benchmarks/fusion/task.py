@@ -1,4 +1,4 @@
-"""Describes both tasks, and what can happen to a sensor."""
+"""Describes both tasks, and the faults of a sensor."""
 
 from __future__ import annotations
 
@@ -25,19 +25,18 @@ class Task:
     Attributes:
         name: of the task.
         rate: of the filter's steps, in Hz.
-        offsets: by sensor, what a fault adds, in the reading's units.
+        offsets: by sensor, bias of the fault "offset", in the reading's units.
         noises: by sensor, standard deviations of the readings.
-        failing: sensors from which the faulty one of a training window is drawn; a name that is there twice is drawn
-            twice as often.
+        failing: sensors from which the faulty one of a training window is drawn; a repeated name is drawn more often.
         slope: of the weights before training, see :class:`~torch_denkf.fusion.SensorAttention`.
         updates: of the noise and of the weights.
-        late: by sensor, by how many more steps its readings come late where it is delayed.
+        late: by sensor, additional latency in steps in the tests of delays.
         train: windows ``[N, T]`` on which noise and weights are trained.
         test: recordings ``[N, T]``.
-        parts: what is trained: the modules of the noise.
-        build: makes a filter of these, from the network of its weights and whether it uses delays.
-        heeds: whether the usual filter does.
-        loss: of a filter's output, to be trained on.
+        parts: the trainable modules of the noise.
+        build: makes a filter of these from the network of its weights, and a flag that enables its model of delays.
+        heeds: whether the usual filter models delays.
+        loss: training loss of a filter's output.
         error: of a belief against the truth, ``[N, T, D]``, in ``unit``.
         unit: of the errors.
     """
@@ -66,14 +65,14 @@ class Task:
 
     @property
     def settled(self) -> slice:
-        """Returns the steps that are scored: all but those of the start-up."""
+        """Returns the scored steps: all but those of the start-up."""
         return slice(round(min(STARTUP * self.rate, self.test.shape[1] // 4)), None)
 
 
 def fused_sensors(
     models: Mapping[str, SubModel], parts: Mapping[str, SubModel], delays: Mapping[str, int], weighted: bool, heed: bool
 ) -> dict[str, FusedSensor]:
-    """Returns the sensors of a filter: their models and noises, whether features weigh them, and delays are heeded."""
+    """Returns the sensors of a filter with their models and noises, and optionally with features and delays."""
     return {
         name: FusedSensor(
             model,
@@ -114,7 +113,7 @@ def faulty(
 
 
 def delayed(data: TensorDict, sensor: str, steps: int) -> TensorDict:
-    """Returns the recordings with one sensor's readings so many steps late."""
+    """Returns the recordings with one sensor's readings ``steps`` late."""
     out = data.copy()
     for key in (sensor, f"{sensor}_observed", f"{sensor}_features"):
         out[key] = data[key].roll(steps, 1)
@@ -124,10 +123,10 @@ def delayed(data: TensorDict, sensor: str, steps: int) -> TensorDict:
 
 
 def add_features(data: TensorDict, noises: Mapping[str, Tensor]) -> TensorDict:
-    """Adds what tells of a frozen or a noisy sensor, ``NAME_features`` ``[N, T, O + 1]``.
+    """Adds features ``NAME_features`` ``[N, T, O + 1]`` that detect a frozen or a noisy sensor.
 
-    They are how much each component of its last readings differs, a logarithm of standard deviations, and how many of
-    them are exactly the present one. The sensor's readings are held between the steps at which they are taken.
+    They are the logarithm of the mean change of each component over the last readings, in standard deviations, and the
+    number of last readings that equal the present one exactly. Between readings the features stay the same.
 
     Args:
         data: recordings ``[N, T]``.

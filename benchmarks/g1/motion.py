@@ -14,7 +14,7 @@ AHEAD = 8  # rows of open-loop prediction in training
 
 
 def delayed(actions: Tensor) -> Tensor:
-    """Commands ``[*, T, 2D]`` of sequences ``[*, T, D]``: those of the row, and those of some rows before."""
+    """Returns commands ``[*, T, 2D]`` from sequences ``[*, T, D]``: those of the row, and those of 2 rows before."""
     rows = torch.arange(actions.shape[-2])
     return torch.cat([actions[..., (rows - delay).clamp_min(0), :] for delay in DELAYS], -1)
 
@@ -41,7 +41,7 @@ class Motion(ArmMotion):
         self.pull = nn.Parameter(torch.zeros(len(DELAYS), JOINTS)) if actions else None
 
     def forward(self, features: Tensor) -> Tensor:
-        """Returns states ``[*, 2D]`` of states ``[*, 2D]``, or of states and commands ``[*, 4D]``."""
+        """Returns the next states ``[*, 2D]`` from states ``[*, 2D]``, or from states and commands ``[*, 4D]``."""
         place, rates = features[..., :JOINTS], features[..., JOINTS : self.size]
         parts = [(place - self.loc) / self.scale, (rates / (3 * self.rate)).tanh()]
         wanted = self.damping.sigmoid() * rates

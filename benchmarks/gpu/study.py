@@ -22,16 +22,16 @@ from benchmarks.gpu.parts import LIMITS, PARTS
 
 @dataclass
 class Gpu:
-    """Times filters on a GPU, part by part; what is finished is written at once."""
+    """Times filters on a GPU, part by part; each row is written at once."""
 
     out: Path | None = None  # folder for gpu.jsonl, gpu.json and gpu.md
-    parts: some_of(PARTS) = tuple(PARTS)  # type: ignore[valid-type]  # which parts, in this order
+    parts: some_of(PARTS) = tuple(PARTS)  # type: ignore[valid-type]  # parts to run, in this order
     ways: some_of(WAYS) = ("eager", "graph")  # type: ignore[valid-type]  # "compiled": a minute per row
     device: Literal["cuda", "cpu"] = "cuda"
     seconds: float = 0.3  # duration of a case
     limit: float = 360.0  # seconds in all
     smoke: bool = False  # a short check on a processor
-    inside: bool = False  # this process runs the parts itself
+    inside: bool = False  # run the parts in this process
 
     def __call__(self) -> None:
         """Runs the measurements, and prints the table."""
@@ -79,7 +79,7 @@ class Gpu:
         return rows
 
     def run_apart(self, part: str, left: float) -> list[dict[str, Any]]:
-        """Runs a part in its own process, which a CUDA error ends without the others."""
+        """Runs a part in a separate process, so that a CUDA error does not end the other parts."""
         if left < 5:
             print(f"{part}: not run, no time left", flush=True)
             return []

@@ -1,4 +1,4 @@
-"""Pictures of one drive: path, velocities, errors by length, spread against error."""
+"""Plots of one drive: path, velocities, errors by length, spread against error."""
 
 from __future__ import annotations
 

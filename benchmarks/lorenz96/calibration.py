@@ -1,5 +1,5 @@
-"""A simulated system with a biased, heteroscedastic sensor: is the trained filter better than its sensor, and
-calibrated?
+"""Trains filters on a simulated system with a biased, heteroscedastic sensor, and compares error and calibration of
+several losses.
 
 A particle in the plane, state [x, y, vx, vy]: a spring pulls it to the origin, a cross wind deflects it, random gusts
 push it. Four noisy instruments read it through a saturating curve; one half of the plane is foggy (noise six times

@@ -1,4 +1,4 @@
-"""Balanced dropout masks against independent ones, in the reacher's filter: ``python -m benchmarks.members.masks``."""
+"""Compares balanced with random dropout masks in the reacher's filter: ``python -m benchmarks.members.masks``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MASKS = ("random", "balanced")
 
 @dataclass(frozen=True)
 class Masks:
-    """Compares balanced and random dropout masks in the library's filter whose noise is dropout."""
+    """Compares balanced and random dropout masks in the reacher's filter."""
 
     out: Path | None = None  # folder for masks.md
     members: tuple[int, ...] = (32, 64, 128, 256, 512)

@@ -27,17 +27,17 @@ SETTINGS = ("rate", "margin", "reference", "gate_margin")
 
 @dataclass(frozen=True)
 class Study:
-    """Unannounced faults on the UR5 and on KITTI, with the weights that come with the package."""
+    """Measures detection of unannounced faults on the UR5 and on KITTI, with the package's weights."""
 
     root: Path | None = None  # KITTI's folder with sequences and poses; without it there is no task kitti-real
-    out: Path = Path("runs/monitor")  # also holds demos, rendered drives and readings
+    out: Path = Path("runs/monitor")  # also for demos, rendered drives and readings
     tasks: tuple[Literal["ur5", "kitti-real", "kitti-rendered"], ...] = TASKS
     rendered: tuple[str, ...] = ("00", "03", "04", "05", "07")  # drives along official trajectories, with faults
     frames: int = 600  # of a rendered drive
     draws: int = 3  # of the filter's noise
-    choose: bool = False  # choose margins, rates and references on drives and demos of its own, and test nothing
+    choose: bool = False  # choose margins, rates and references on separate drives and demos, without tests
     processes: int = 1
-    smoke: bool = False  # a tiny run on invented drives: does it run?
+    smoke: bool = False  # a tiny run on synthetic drives: does it run?
 
 
 def invented(study: Study, kind: str) -> tuple[Path, list[str]]:
@@ -71,7 +71,7 @@ def rows_of(study: Study, task: str) -> list[dict]:
 
 
 def trials_of(study: Study, task: str) -> list[dict]:
-    """Returns what is tried for one task on drives or demos that are in no test, and in the last row what is chosen."""
+    """Returns the trials of one task on drives or demos that are in no test; the last row has the choice."""
     if task == "ur5":
         from benchmarks.monitor.arm import chosen_on, own_demos
         from benchmarks.monitor.choice import choose_arm
@@ -93,7 +93,7 @@ def trials_of(study: Study, task: str) -> list[dict]:
 
 
 def choice_page(rows: Sequence[dict], study: Study) -> str:
-    """Everything that was tried, and what is chosen."""
+    """Returns the page of all trials and the chosen settings."""
     lines = ["# Chosen settings", ""]
     lines += head("trial", "setting", "score")
     for row in rows:

@@ -25,7 +25,7 @@ from torch_denkf.applications.car.odometry.filter import VELOCITIES, CarFilter
 from torch_denkf.applications.car.odometry.streams import Drive, all_frames, read_spans
 
 SECOND = 10  # steps
-SLOW = 1.0  # m/s: lower speeds give no scale
+SLOW = 1.0  # m/s: lower speeds are not used to estimate the scale
 NEAREST = 0.05  # share of the true speed at which smaller or negative readings are clamped
 
 

@@ -1,4 +1,4 @@
-"""The filters that are compared: with the true model and an update each, and learned ones."""
+"""The compared filters: with the true model and different updates, and learned ones."""
 
 from __future__ import annotations
 

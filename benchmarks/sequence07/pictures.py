@@ -23,7 +23,7 @@ def draw(paths: Mapping, claims: Mapping, poses: Tensor, steps: Sequence[int], f
 
     Args:
         paths: by condition and filter, ``[T, 7]``.
-        claims: by condition and filter, of relative motions.
+        claims: relative motions with variances, by condition and filter.
         poses: true ones, ``[T, 7]``.
         steps: rows of the relative motions.
         file: PNG.

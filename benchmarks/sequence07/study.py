@@ -24,8 +24,8 @@ from torch_denkf.functional.manifolds import SE3
 from torch_denkf.smoothers import EnRTS, RTSSmoother
 
 LEVEL = 0.9  # of the intervals
-STEPS = (1, 10, 100)  # rows over which a relative motion is claimed
-EVERY = 40  # rows from one start of a relative motion to the next
+STEPS = (1, 10, 100)  # rows of the relative motions
+EVERY = 40  # rows between two starts of relative motions
 HELD = tuple(f"held_{step}" for step in STEPS)
 DRAWS = 5  # of an ensemble
 SPREADS = ("translation_spread", "rotation_spread")  # standard deviation over draws
@@ -34,17 +34,17 @@ SCORES = ("translation", "rotation", *HELD, "ms", *SPREADS)
 
 @dataclass(frozen=True)
 class Study:
-    """Measures how far off a car is that sees stereo corners and turn rates, on KITTI's odometry sequence 07."""
+    """Measures the path error of a car with stereo corners and turn rates, on KITTI's odometry sequence 07."""
 
     data: Path = Path("../shared/data")  # with kitti_inertial/0027.npz and kitti/poses/07.txt
     out: Path | None = None  # folder for sequence07.csv, sequence07.md and sequence07.png
     seed: int = 0
-    ukf: bool = False  # also the unscented filter, whose figures are the extended one's
+    ukf: bool = False  # also the UKF, whose results equal the EKF's
     smoke: bool = False  # a few rows and filters: does it run?
 
 
 class Claim(NamedTuple):
-    """Relative motions that a filter has found, and their variances.
+    """Relative motions by a filter, with their variances and the truth.
 
     Attributes:
         mean: points of SE3, ``[*B, K, 7]``.
@@ -61,21 +61,21 @@ class Claim(NamedTuple):
         return SE3().minus(self.truth, self.mean) / self.var.sqrt()
 
     def held(self, level: float = LEVEL) -> Tensor:
-        """Returns the share of the tangent's components within the intervals of that level, ``[K]``."""
+        """Returns the coverage of the tangent's intervals at a level, ``[K]``."""
         inside = self.away().abs() <= NormalDist().inv_cdf((1 + level) / 2)
         return inside.double().mean(-1).flatten(0, -2).mean(0)
 
 
 def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict, Tensor]:
-    """Returns sequences that start from a pose that is known.
+    """Returns windows that start from a known pose.
 
     Args:
-        data: what a filter reads, ``[C, T]``.
-        states: means of a filter that has read it, ``[C, T, 26]``. A window starts from its twist.
+        data: a filter's inputs, ``[C, T]``.
+        states: means of a filter over the whole drive, ``[C, T, 26]``. A window starts from its twist.
         poses: true poses ``[T, 7]``.
 
     Returns:
-        What a filter reads from each start on, ``[C, W, K]`` with K two more than the last of ``STEPS``, and the true
+        A filter's inputs in each window, ``[C, W, K]`` with K two more than the last of ``STEPS``, and the true
         motions since the start ``[W, K, 7]``.
     """
     length = STEPS[-1] + 2
@@ -84,7 +84,7 @@ def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict
     origin = SPACE.neutral(states).expand(len(states), len(first), -1).clone()
     origin[..., POSE.stop : BIAS.stop] = states[:, first, POSE.stop : BIAS.stop]
     part = prepared(data[:, rows], start=origin)
-    for key in ("motion_observed", "gyro_observed"):  # the start's own reading is in its belief
+    for key in ("motion_observed", "gyro_observed"):  # the first reading is in the initial belief already
         part[key] = part[key].clone()
         part[key][:, :, 0] = False
     true = poses[rows]
@@ -92,7 +92,7 @@ def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict
 
 
 def claimed(out: TensorDict, true: Tensor, prefix: str = "belief") -> Claim:
-    """Returns what a filter claims of windows ``[W, K]``, over each of ``STEPS``."""
+    """Returns a filter's relative motions in windows ``[W, K]``, over each of ``STEPS``."""
     mean, var = pose_of(out, prefix)
     at = torch.tensor(STEPS)
     return Claim(mean[:, at], var[:, at], true[:, at])
@@ -100,14 +100,14 @@ def claimed(out: TensorDict, true: Tensor, prefix: str = "belief") -> Claim:
 
 @torch.no_grad()
 def run(model: Filter, data: TensorDict) -> TensorDict:
-    """Returns what the study needs of what is written, from the same seed."""
+    """Runs a filter with a fixed seed, and returns the entries that the study needs."""
     torch.manual_seed(0)
     wanted = {("belief", "mean"), ("forecast", "mean"), ("forecast", "cov"), ("forecast", "ensemble")}
     return model.sequence(data.clone(), keep=[key for key in model.out_keys if key in wanted])
 
 
 def and_one_more(data: TensorDict) -> TensorDict:
-    """Returns rows ``[C, T + 1]``: one more, in which nothing is read."""
+    """Appends a row without readings: ``[C, T + 1]``."""
     last = data[:, -1:].clone()
     for key in ("motion_observed", "gyro_observed"):
         last[key] = torch.zeros_like(last[key])
@@ -117,9 +117,9 @@ def and_one_more(data: TensorDict) -> TensorDict:
 def filter_rows(
     label: str, kind: str, data: TensorDict, poses: Tensor, smoother: str = "", **options
 ) -> Iterator[tuple[dict, Tensor, Claim]]:
-    """Yields a row for each condition, its path ``[T, 7]`` and its claim, of a filter, and of its smoother if named.
+    """Yields rows, paths ``[T, 7]`` and relative motions for each condition, of a filter and of its smoother if named.
 
-    An ensemble's row is the mean over ``DRAWS``; the path is that of the first.
+    An ensemble's row is the mean over ``DRAWS``; the path is that of the first draw.
     """
     around = EnRTS if kind == "DEnKF" else RTSSmoother
     draws = DRAWS if kind == "DEnKF" else 1

@@ -1,4 +1,4 @@
-"""Two drives of KITTI as rows that a filter reads: sequence 07, and one without poses by which all is chosen."""
+"""Two drives of KITTI as rows of readings: sequence 07, and a drive without poses for the choice of all settings."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def drive(folder: Path, name: str, count: int | None = None) -> Drive:
 
 @cache
 def truth(folder: Path, count: int = ROWS) -> Tensor:
-    """Official poses of sequence 07, ``[T, 7]``, of the left camera."""
+    """Returns the official poses of sequence 07, ``[T, 7]``, of the left camera."""
     poses = torch.as_tensor(read_poses(folder / "kitti" / "poses" / "07.txt"), dtype=torch.float64)[:count]
     return torch.cat([quaternion_of(poses[:, :3, :3]), poses[:, :3, 3]], -1)
 
@@ -81,9 +81,9 @@ def in_condition(rows: TensorDict, condition: Condition, seed: int) -> TensorDic
 def readings(
     folder: Path, name: str, conditions: Sequence[Condition] = ("as it is",), count: int | None = None, seed: int = 0
 ) -> TensorDict:
-    """Returns what a filter reads in each condition, ``[C, T]``: motion with covariance, turn rates, masks, time steps.
+    """Returns a filter's inputs in each condition, ``[C, T]``: motion with covariance, turn rates, masks, time steps.
 
-    The camera triggers regularly, and its stamps tremble by a millisecond: each row is given the median step.
+    The camera triggers regularly, and its stamps have a jitter of a millisecond, so that each row has the median step.
     """
     found = drive(folder, name, count)
     rows = torch.stack([in_condition(found.rows, condition, seed) for condition in conditions])
@@ -98,7 +98,7 @@ def readings(
 
 
 def naive(folder: Path, name: str, condition: Condition, count: int | None = None, seed: int = 0):
-    """OpenCV's pose from corners, refined, with the camera as KITTI calibrates it: motions ``[T, 7]``, and a mask."""
+    """Returns OpenCV's refined motions ``[T, 7]`` from corners with KITTI's calibration, and their observed mask."""
     found = drive(folder, name, count)
     rows, camera = in_condition(found.rows, condition, seed), found.camera
     matrix = np.array([[camera.focal, 0, camera.center[0]], [0, camera.focal, camera.center[1]], [0, 0, 1.0]])

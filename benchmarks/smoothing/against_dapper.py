@@ -11,7 +11,7 @@ from benchmarks.smoothing.systems import SYSTEMS, simulate
 
 
 def installed() -> bool:
-    """Tells whether DAPPER is installed."""
+    """Returns whether DAPPER is installed."""
     return importlib.util.find_spec("dapper") is not None
 
 

@@ -1,4 +1,4 @@
-"""Smoothers behind trained sensors, on recordings: the errors of filter and smoother on the same frames."""
+"""Smoothers with trained sensors, on recordings: the errors of filter and smoother on the same frames."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BELIEF, SMOOTHED = ("belief", "mean"), ("smoothed", "mean")
 
 
 def mean_square(mean: Tensor, truth: Tensor) -> Tensor:
-    """Over the times that have a reading before and ``LAG`` later ones, ``[N, D]``."""
+    """Returns mean square errors ``[N, D]`` over the times with a reading before and ``LAG`` later ones."""
     return (mean - truth)[:, 1:-LAG].square().mean(1)
 
 
@@ -54,7 +54,7 @@ def rows_of(task: Task, group: str, names: str, before: Tensor, after: Tensor, *
 
 @torch.no_grad()
 def ensembles(make: Callable[[], Task], place: int, readings: Path, draws: int) -> list[dict]:
-    """Returns the trained filter with its ensemble smoothers, for one number of members."""
+    """Returns rows of the trained filter with its ensemble smoothers, for one number of members."""
     task, rows = make(), []
     members = task.members[place]
     filter = task.behind(task.model(members))
@@ -85,7 +85,7 @@ def series_of(task: Task, batches: Group) -> dict[str, Series]:
 
 
 def gaussians(make: Callable[[], Task], readings: Path, updates: int) -> list[dict]:
-    """Returns the Kalman filter of the same sensor, its smoother, std and time constant of the sensor's errors."""
+    """Returns rows of the Kalman filter and its smoother, with size and correlations of the sensor's errors."""
     task, rows = make(), []
     groups = {name: series_of(task, each) for name, each in task.groups(task.members[0], readings).items()}
     chosen = list(groups["validation"].values())
@@ -118,7 +118,7 @@ def kalman(model: gaussian.Model, series: Series) -> tuple[Tensor, Tensor]:
 
 
 def correlation(error: Tensor, lag: int) -> Tensor:
-    """Of errors ``[N, T, D]`` with those ``lag`` steps later, ``[N, D]``."""
+    """Returns the correlation of errors ``[N, T, D]`` with those ``lag`` steps later, ``[N, D]``."""
     return (error[:, lag:] * error[:, :-lag]).mean(1) / error.square().mean(1)
 
 
@@ -126,14 +126,14 @@ Jobs = dict[Path, Callable[[], list[dict]]]
 
 
 def jobs(root: Path | None, out: Path, smoke: bool) -> Jobs:
-    """Returns what writes which file, each on its own."""
+    """Returns independent jobs by the file of their rows."""
     made: Jobs = {}
     large: Jobs = {}
     parts, readings = out / "parts", out / "readings"
     for make in tasks(root, out, smoke=smoke):
         task = make()
         for place, members in enumerate(task.members):
-            # A large ensemble's errors hardly move with its noise.
+            # A large ensemble's errors hardly depend on its noise.
             draws = 1 if smoke or place else task.draws
             job = partial(ensembles, make, place, readings, draws)
             (large if place else made)[parts / f"{task.name}-{members}.json"] = job

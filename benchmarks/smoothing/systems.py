@@ -1,4 +1,4 @@
-"""The two systems: their motion as a transition, their truth and readings, one generator a seed."""
+"""The two systems: their motion as a transition, their truth and readings, with one generator per seed."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from torch_denkf.modules import SubModel
 
 @dataclass(frozen=True)
 class System:
-    """A chaotic system, observed completely, every so many small steps.
+    """A chaotic system, whose whole state is observed once in each cycle of small steps.
 
     Attributes:
         step: one small step of states ``[*, N]``.
-        mean: of the first state, ``N`` numbers.
+        mean: of the first state, ``N`` components.
         variance: of each of its components.
         noise: variance of the readings.
         steps: small steps in a cycle.
-        burn_in: cycles before the first that count.
+        burn_in: first cycles, which are not scored.
     """
 
     step: Callable[[Tensor], Tensor]
@@ -34,7 +34,7 @@ class System:
     burn_in: int
 
     def counts_from(self, cycles: int) -> int:
-        """Returns the first cycle of so many that counts: at the latest that in the middle."""
+        """Returns the first scored cycle, at the latest the middle one."""
         return min(self.burn_in, cycles // 2)
 
 
@@ -62,7 +62,7 @@ SYSTEMS = {
 
 
 class Cycle(SubModel):
-    """The motion of members over one cycle."""
+    """Transition of members over one cycle."""
 
     def __init__(self, system: System):
         super().__init__(nn.Identity(), [("belief", "ensemble")], [("forecast", "ensemble")])

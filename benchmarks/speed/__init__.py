@@ -1,1 +1,1 @@
-"""Speed side by side: this library against its peers and a textbook step; ``make bench``."""
+"""Compares the speed of this library with its peers and a textbook step; ``make bench``."""

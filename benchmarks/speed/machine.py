@@ -1,4 +1,4 @@
-"""Measures what the machine can do in the same run: matrix peak and memory bandwidth of one thread."""
+"""Measures matrix peak and memory bandwidth of one thread in the same run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def best(call, repeats: int = 40) -> float:
 
 
 def measure() -> dict:
-    """Peak in GFLOP/s (float32, one thread), bandwidth in GB/s (read and write of a copy), and what was run on.
+    """Returns peak in GFLOP/s (float32, one thread), bandwidth in GB/s (read and write of a copy), and versions.
 
     Both are the best of 40, in processor time.
     """

@@ -1,7 +1,7 @@
-"""The work that all candidates share: Table I without the image sensor, S = 5, O = 2, E = 32, drop rate 26/256.
+"""The workload of all candidates: Table I without the image sensor, S = 5, O = 2, E = 32, drop rate 26/256.
 
 Transition (5, 32, 32, 64, 64, 5) with dropout, residual; observation (5, 32, 32, 64, 64, 2); noise of the observation
-(2, 16, 16, 2); ReLU everywhere; the sensor's samples are given. One set of weights, handed to every peer as numpy.
+(2, 16, 16, 2); ReLU everywhere; the sensor's samples are given. All peers get the same weights as numpy arrays.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from torch_denkf.modules import (
 
 STATE, OBSERVATION, MEMBERS = 5, 2, 32
 HIDDEN, NOISE_HIDDEN = (32, 32, 64, 64), (16, 16)
-RATE = 26 / 256  # 0.1, as a byte has it
+RATE = 26 / 256  # 0.1, rounded to a multiple of 1 / 256
 STD = 0.5  # of the observation noise before training
 PROCESS_STD = 0.1  # of the process noise of filters with a mean and a covariance
 POINTS = {"alpha": 1.0, "beta": 0.0, "kappa": 0.5}  # of the unscented transform
@@ -43,8 +43,8 @@ def make_filter(scheme: str = "sensor") -> DEnKF:
     """Returns the filter, with fixed weights; its gain is small enough that long sequences stay bounded.
 
     Args:
-        scheme: ``"sensor"`` reads samples ``("sensor", "ensemble")``; ``"perturbed"`` one reading a frame, of the
-            same name, ``[*B, O]``.
+        scheme: ``"sensor"`` reads samples ``("sensor", "ensemble")``; ``"perturbed"`` one reading per frame under the
+            same key, ``[*B, O]``.
     """
     torch.manual_seed(0)
     return DEnKF(
@@ -108,7 +108,7 @@ def start(filter: DEnKF, batch: int) -> Tensor:
 
 
 def weights(filter: Filter) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """Weight ``[out, in]`` and bias of every layer of the networks: three, or two where Q and R are constant."""
+    """Returns weight ``[out, in]`` and bias of every layer of the networks: three, or two for constant Q and R."""
     if isinstance(filter, DEnKF):
         networks = {name: filter[name].module for name in ("transition", "observation", "noise")}
     else:  # one module inside the other: the filter's step, the model, its network
@@ -120,5 +120,5 @@ def weights(filter: Filter) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
 
 
 def noise_floor(filter: DEnKF) -> tuple[np.ndarray, np.ndarray]:
-    """r^2 - c and c of the noise model, ``[O]`` each."""
+    """Returns r^2 - c and c of the noise model, ``[O]`` each."""
     return filter["noise"].variance.numpy().copy(), filter["noise"].floor.numpy().copy()
