@@ -52,6 +52,8 @@ class Log(Command):
             say(f"{name}: {len(one.readings.times)} readings, {one.rate:.3g} Hz: {shown}")
             for text in one.oddities():
                 say(f"  {text}")
+        if others := [name for one in streams.values() for name in one.others]:
+            say(f"in no stream, since they never change, or not with a sensor's: {', '.join(others)}")
         tables = {name: one.readings for name, one in streams.items()}
         delays = delays_between(tables)
         offsets = solved(delays, tables) if delays else {}

@@ -26,8 +26,18 @@ _BELIEVED = 0.99  # of a reading's distance: beyond, it is none that the noise e
 
 
 def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]:
-    """Says of each sensor how often it is believed, its bias, its delay, its noise and its drift, as a table."""
-    heads = ("sensor", "reads", "readings", "believed", "bias", "residual", "noise as given", "noise as learned")
+    """Says of each sensor its outliers, how often it is believed, its bias, noise, drift and delay, as a table."""
+    heads = (
+        "sensor",
+        "reads",
+        "readings",
+        "outliers",
+        "believed",
+        "bias",
+        "residual",
+        "noise as given",
+        "noise as learned",
+    )
     lines = [f"| {' | '.join(heads)} | drift | offset |", "|" + "---|" * (len(heads) + 2)]
     for sensor in model.config.sensors:
         for group in sensor.groups:
@@ -55,10 +65,9 @@ def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]
             cells = [kept, (residual - bias).std(0), said, given * scale, drift]
             texts = ["; ".join(each if isinstance(each, str) else f"{each:.3g}" for each in cell) for cell in cells]
             reads = ", ".join(STATES[place] for place in places)
-            lines.append(
-                f"| {name} ({sensor.topic}) | {reads} | {int(seen.sum())} | {share:.1%} | {' | '.join(texts)} | "
-                f"{offset:+.2f} s |"
-            )
+            far = log.outliers[sensor.name] if 0 in places else 0
+            head = f"| {name} ({sensor.topic}) | {reads} | {int(seen.sum())} | {far} | {share:.1%} |"
+            lines.append(f"{head} {' | '.join(texts)} | {offset:+.2f} s |")
     return lines
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torch_denkf.data.earth import to_local
+from torch_denkf.data.recordings.outliers import fixes_of, outlying
 from torch_denkf.data.recordings.quantities import find, in_radians, quantity
 from torch_denkf.data.recordings.replay import Recording
 from torch_denkf.data.recordings.tables import Readings, Table
@@ -217,14 +217,10 @@ def _signals(table: Readings) -> dict[str, _Signal]:
         times, values = times[new], values[new]
     ones, out = np.ones(len(times)), {}
     speed = find(columns, "speed")
-    places = find(columns, "latitude", "longitude")
-    if places:
-        fixes = values[:, places]
-        fixes = to_local(fixes, np.median(fixes, 0))
-    elif places := find(columns, "east", "north"):
-        fixes = values[:, places]
-    if places:
-        out["heading"] = out["way"] = _Signal(times, fixes, ones)
+    fixes = fixes_of(columns, values)
+    if fixes is not None:
+        sound = ~outlying(times, fixes)
+        out["heading"] = out["way"] = _Signal(times[sound], fixes[sound], ones[sound])
     if speed:
         out["way"] = _Signal(times, _integral(times, values[:, speed[0]]), ones)
     if heading := find(columns, "heading"):
