@@ -5,7 +5,7 @@ import pytest
 
 from tests.data.recordings.cart import cart
 from torch_denkf.cli.main import main
-from torch_denkf.data.recordings.offsets import delays_between
+from torch_denkf.data.recordings.offsets import delays_between, solved
 from torch_denkf.data.recordings.outliers import outlying, without_outliers
 from torch_denkf.data.recordings.tables import Readings
 
@@ -39,12 +39,23 @@ def test_a_repeated_outlier_is_one():
     assert without_outliers(speeds) == (speeds, 0)
 
 
-def test_outliers_invent_no_delay(tmp_path, capsys):
-    """Within 1.96 standard deviations of none, with the wheel; the log's description counts the outliers."""
-    _, fixes, wrong, wheel = cart(120, 0.1)
+@pytest.mark.parametrize("seed", range(4))
+def test_outliers_and_gaps_invent_no_delay(seed):
+    """Wheel and fixes of one clock: none within three standard deviations, which are small enough to say something.
+
+    Across a gap of 15 s of a bend the chord is much shorter than the way.
+    """
+    _, fixes, _, wheel = cart(120, 0.1, seed, gaps=[(60, 75)])
     places, speeds = Readings(fixes[:, 0], fixes[:, 1:], ("x", "y")), Readings(wheel[:, 0], wheel[:, 1:], ("speed",))
-    (delay,) = delays_between({"fixes": places, "wheel": speeds})
-    assert abs(delay.seconds) < 1.96 * delay.std < 0.2
+    tables = {"fixes": places, "wheel": speeds}
+    offset = solved(delays_between(tables), tables)["fixes"]
+    assert not offset.sure
+    assert abs(offset.seconds) < 0.2
+    assert offset.std < 0.1
+
+
+def test_outliers_are_counted(tmp_path, capsys):
+    _, fixes, wrong, _ = cart(30, 0.1)
     np.savetxt(tmp_path / "log.csv", fixes, delimiter=",", header="t,x,y", comments="")
     assert main(["log", str(tmp_path / "log.csv")]) == 0
     assert f"{wrong.sum()} outliers, fixes that are far from all around them" in capsys.readouterr().out

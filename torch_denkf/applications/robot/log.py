@@ -114,8 +114,8 @@ def read_log(file: Path | str, config: Config, streams: Mapping[str, Stream]) ->
     tables = {topic: table for topic, (table, _) in screened.items()}
     delays: list[Delay] = delays_between(tables)
     offsets = solved(delays, tables) if delays else {}
-    # What a delay's interval holds zero of is none; a sensor whose delay is given has that.
-    offsets = {name: one for name, one in offsets.items() if abs(one.seconds) > 1.96 * one.std}
+    # A delay that may be chance is none; a sensor whose delay is given has that.
+    offsets = {name: one for name, one in offsets.items() if one.sure}
     origin = None
     for table in tables.values():
         if origin is None and (places := find(table.columns, "latitude", "longitude")):

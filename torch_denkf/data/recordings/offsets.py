@@ -22,6 +22,7 @@ _SPANS = (1.0, 2.0)  # s: over which changes of heading, and ways, are compared:
 _STEP = 0.02  # s: of the search
 _LEAST = 30  # comparisons
 _AGREE = 0.6  # correlation: streams that agree less have nothing in common
+_NOISY = 0.9  # correlation: of slow robots the noise of fixes is much of a short way
 _BLOCK = 4.0  # spans, after which errors are forgotten
 _BETTER = 0.7  # of its standard deviation: the longer span is taken where it is so much better, not by chance
 _STEADY = 0.02  # the variation of a signal that says nothing
@@ -37,6 +38,11 @@ class ClockOffset(NamedTuple):
 
     seconds: float
     std: float
+
+    @property
+    def sure(self) -> bool:
+        """Returns True beyond three standard deviations: of some streams one is soon beyond two by chance."""
+        return abs(self.seconds) > 3 * self.std
 
 
 class Delay(NamedTuple):
@@ -161,7 +167,8 @@ def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[De
                 best = int(np.argmax(sizes))
                 limit = most / 3**best
                 found = tried[best]
-                if what == "heading" or pair[1].level.ndim == 1:  # a chord of some seconds is shorter than a way
+                # A chord of some seconds is shorter than a way, which matters less than much noise.
+                if what == "heading" or pair[1].level.ndim == 1 or sizes[best] < _NOISY:
                     longer = _delay(*pair, what, limit, _SPANS[1])
                     if found is not None and longer is not None:
                         # The better one by chance: what their intervals do not explain counts, too.
@@ -249,6 +256,8 @@ def _delay(
     last = np.append(end, len(end))[end] if corners else end  # a span later than the end
     until = np.append(late.times, np.inf)[last]
     begin = np.flatnonzero((late.times > early.times[0] + most) & (until < early.times[-1] - most))
+    took = until[begin] - late.times[begin]
+    begin = begin[took < 2 * np.median(took)] if len(begin) else begin  # across a gap a chord is shorter than a way
     end, last = end[begin], last[begin]
     if len(begin) < _LEAST:
         return None
